@@ -1,0 +1,122 @@
+"""The `pans` command: finds the commands by entry point, runs one, turns errors into exit codes.
+
+Owns argument parsing of the top level, `--json`, `--debug` and the exit codes of the contract; never does a command's work.
+`main` returns the exit status. Only the invoked command's module is imported, so that `pans run` never pays for the trainer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from . import __version__
+from .errors import PansError, UsageError
+
+EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One subcommand: `configure` adds its arguments, `run` does the work and returns the exit code."""
+
+    help: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def say(text: str) -> None:
+    """Print for people, on stderr: stdout belongs to the JSON object or the answer itself."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -> None:
+    """Print one JSON object when `--json` was given, else `text`; both on stdout."""
+    if args.json:
+        print(json.dumps(payload, allow_nan=False, default=_plain), flush=True)
+    elif text:
+        print(text, flush=True)
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return value.tolist()
+    return str(value)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `pans` with `argv` (default: the process's arguments) and return the exit code of the contract."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    commands = {point.name: point for point in entry_points(group="pans.commands")}
+    wanted = next((word for word in words if not word.startswith("-")), None)
+    if wanted is None or wanted not in commands:
+        return _top_level(words, wanted, commands)
+    try:
+        command = _load(commands[wanted])
+    except PansError as error:
+        return _failed(error, "--debug" in words)
+    parser = argparse.ArgumentParser(prog=f"pans {wanted}", description=command.help)
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, everything else on stderr")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    command.configure(parser)
+    rest = list(words)
+    rest.remove(wanted)
+    args = parser.parse_args(rest)
+    try:
+        return command.run(args)
+    except PansError as error:
+        return _failed(error, args.debug)
+    except KeyboardInterrupt:
+        say("interrupted")
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output went away: nothing more can be said to it
+        return EXIT_FINE
+
+
+def _load(point: EntryPoint) -> Command:
+    try:
+        command = point.load()
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").split(".")[0]
+        extra = {"torch": "train", "onnx": "train", "matplotlib": "plot", "h5py": "export"}.get(missing)
+        if extra is None:
+            raise
+        raise UsageError(
+            f"`pans {point.name}` needs the package {missing}, which is not installed",
+            remedy=f"pip install 'pans-runtime[{extra}]'",
+        ) from error
+    if not isinstance(command, Command):
+        raise UsageError(f"entry point {point.value} is a {type(command).__name__}, not a pans.runtime.cli.Command")
+    return command
+
+
+def _failed(error: PansError, debug: bool) -> int:
+    if debug:
+        raise error
+    say(f"pans: {error}")
+    return error.exit_code
+
+
+def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, EntryPoint]) -> int:
+    if "--version" in words and wanted is None:
+        print(f"pans {__version__}")
+        return EXIT_FINE
+    if wanted is not None:
+        near = [name for name in commands if name.startswith(wanted[:2])]
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        say(f"pans: unknown command {wanted!r}\n  remedy: {hint}`pans` lists the commands")
+        return EXIT_USAGE
+    print(f"pans {__version__}: decide on a handful of photons, on time\n\nusage: pans COMMAND [options]\n")
+    for name in sorted(commands):
+        try:
+            summary = _load(commands[name]).help
+        except UsageError as error:
+            summary = f"({error.remedy})"
+        print(f"  {name:<10} {summary}")
+    print("\n`pans COMMAND --help` lists a command's options. Start with `pans demo`.")
+    return EXIT_FINE

@@ -1,0 +1,60 @@
+"""The one exception tree. Each class knows the exit code that the command line returns for it.
+
+    PansError                 2   anything this project raises on purpose
+    ├── UsageError            2   a command or an argument that cannot be meant
+    ├── ConfigError           2   a profile, calibration, scene or plan file that says something impossible
+    ├── PlanError             2   what is asked for cannot be done by this hardware (the numbers are in the message)
+    ├── DamagedFileError      2   a bundle or recording that is truncated, altered or inconsistent
+    ├── LinkError             3   the device cannot be reached, or went away
+    │   └── DeviceError       3   the device answered, and refused
+    └── TimingError           4   the timing contract was broken and going on would be a lie
+
+A message says what, found, allowed and where; `remedy` is the next step. Damaged bytes, lost frames and late deadlines are
+measurements, not exceptions: they are counted, flagged and reported.
+"""
+
+
+class PansError(Exception):
+    """Base of all errors raised on purpose; `remedy` is one sentence that says what to do next ("" if nothing helps)."""
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, remedy: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f"{self.message}\n  remedy: {self.remedy}" if self.remedy else self.message
+
+
+class UsageError(PansError):
+    """A command or an argument that cannot be meant."""
+
+
+class ConfigError(PansError):
+    """A profile, calibration or scene that says something impossible; the message starts with file:line:col."""
+
+
+class PlanError(PansError):
+    """What is asked for cannot be done by this hardware; the message holds the numbers."""
+
+
+class DamagedFileError(PansError):
+    """A bundle or recording that is truncated, altered, oversized or inconsistent."""
+
+
+class LinkError(PansError):
+    """The device cannot be reached, or went away."""
+
+    exit_code = 3
+
+
+class DeviceError(LinkError):
+    """The device answered, and refused."""
+
+
+class TimingError(PansError):
+    """The timing contract was broken and going on would be a lie."""
+
+    exit_code = 4
