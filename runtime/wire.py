@@ -108,7 +108,7 @@ _LAYOUTS: dict[str, str] = {
     "STATUS": "<BBHIIQQ",
     "CLICKS": "<IIQQIHHI",
     "FRAMES": "<IIQQIHHI",
-    "MARK": "<IIhHQQ",
+    "MARK": "<IIhHQQf",
     "LOAD_PATTERN": "<HHII",
     "LOAD_PLAN": "<BBHIIIIQHHI",
     "PLAN_SLOT": "<QHH",
@@ -229,13 +229,18 @@ class FrameBlock(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """From `exposure_index` on, object `object_index` stands before the detector; `truth` is its class where known, else -1."""
+    """From `exposure_index` on, object `object_index` stands before the detector.
+
+    `truth` is its class and `photons` the expected photoelectrons of one shot on it, where the instrument knows them (a simulator
+    does); else -1 and NaN.
+    """
 
     seq: int
     object_index: int
     truth: int
     exposure_index: int
     tick: int
+    photons: float
 
 
 # ---------------------------------------------------------------------------------------------------------------- framing
@@ -512,5 +517,5 @@ def encode_mark(mark: Mark, session: int) -> bytes:
 
 def decode_mark(payload: bytes) -> Mark:
     """Decode MARK."""
-    seq, object_index, truth, _, exposure_index, tick = _fields("MARK", payload)
-    return Mark(seq, object_index, truth, exposure_index, tick)
+    seq, object_index, truth, _, *rest = _fields("MARK", payload)
+    return Mark(seq, object_index, truth, *rest)
