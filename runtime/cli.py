@@ -60,7 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except PansError as error:
         return _failed(error, "--debug" in words)
     parser = argparse.ArgumentParser(prog=f"pans {wanted}", description=command.help)
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, everything else on stderr")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object on stdout, everything else on stderr"
+    )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     command.configure(parser)
     rest = list(words)

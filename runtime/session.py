@@ -1,0 +1,170 @@
+"""The host's end of a session, sans-I/O: handshake, commands until acknowledged, window and lease.
+
+Owns command ids and retransmission; never opens a port, reads a clock or keeps clicks. Frames and times go in through `on_frame`
+and `poll`; bytes to send come out of `take_output`. Failures that end the session raise LinkError or DeviceError.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from . import wire
+from .errors import DeviceError, LinkError
+from .wire import AckStatus, Frame, MessageType, Opcode
+
+NS_PER_MS = 1_000_000
+HELLO_EVERY_NS = 200 * NS_PER_MS
+HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
+COMMAND_WINDOW = 8
+RETRY_FIRST_NS = 250 * NS_PER_MS
+RETRY_LONGEST_NS = 2_000 * NS_PER_MS
+RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
+
+
+@dataclass(slots=True)
+class SessionCounters:
+    """What the session has seen and sent."""
+
+    retransmissions: int = 0
+    wrong_session: int = 0
+    malformed: int = 0
+    unknown_type: int = 0
+
+
+class HostSession:
+    """One session with one device; `nonce` must be fresh (not 0) for each."""
+
+    def __init__(self, nonce: int) -> None:
+        if not 0 < nonce < 1 << 32:
+            raise ValueError(f"nonce must be in 1..2**32-1, found {nonce}")
+        self.nonce = nonce
+        self.welcome: wire.Welcome | None = None
+        self.status: wire.Status | None = None
+        self.pongs: deque[tuple[wire.Pong, int]] = deque(maxlen=256)
+        self.counters = SessionCounters()
+        self._output: list[bytes] = []
+        self._hello_due_ns: int | None = None
+        self._hello_started_ns = 0
+        self._next_id = 1
+        self._waiting: deque[tuple[int, bytes]] = deque()  # not sent yet
+        self._unacknowledged: deque[tuple[int, bytes]] = deque()
+        self._retry_due_ns = 0
+        self._retry_after_ns = RETRY_FIRST_NS
+        self._oldest_ns = 0
+        self._probe_id = 0
+
+    # -- what the host wants -------------------------------------------------------------------------------------------
+
+    def start(self, now_ns: int) -> None:
+        """Open the session: HELLO is sent and repeated until the device answers."""
+        self._hello_started_ns = self._hello_due_ns = now_ns
+        self.poll(now_ns)
+
+    def submit(self, opcode: Opcode, body: bytes = b"") -> int:
+        """Queue a command and return its id; it is sent by the next `poll` that finds room in the window."""
+        command_id = self._next_id
+        self._next_id += 1
+        self._waiting.append((command_id, wire.encode_command(command_id, opcode, body, self.nonce)))
+        return command_id
+
+    def probe(self, now_ns: int) -> None:
+        """Send one clock probe stamped with `now_ns`."""
+        self._probe_id = (self._probe_id + 1) & 0xFFFFFFFF
+        self._output.append(wire.encode_ping(self._probe_id, now_ns, self.nonce))
+
+    def grant(self, stream_limit: int, lease_ms: int) -> None:
+        """Move the receive window and renew the lease."""
+        self._output.append(wire.encode_grant(wire.Grant(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
+
+    @property
+    def settled(self) -> bool:
+        """True when every submitted command has been acknowledged."""
+        return not self._waiting and not self._unacknowledged
+
+    def take_output(self) -> bytes:
+        """Return the bytes to send now, and forget them."""
+        data = b"".join(self._output)
+        self._output.clear()
+        return data
+
+    # -- what time brings ----------------------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> None:
+        """Send what is due: HELLO, queued commands, retransmissions; LinkError when the device has been silent too long."""
+        if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
+            if now_ns - self._hello_started_ns > HELLO_GIVE_UP_NS:
+                raise LinkError(
+                    f"no WELCOME within {HELLO_GIVE_UP_NS // NS_PER_MS} ms",
+                    remedy="check that the device runs firmware of protocol 1 and that the port is the right one",
+                )
+            self._output.append(wire.encode_hello(self.nonce))
+            self._hello_due_ns = now_ns + HELLO_EVERY_NS
+        if self.welcome is None:
+            return
+        while self._waiting and len(self._unacknowledged) < COMMAND_WINDOW:
+            if not self._unacknowledged:
+                self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS
+                self._retry_due_ns = now_ns + RETRY_FIRST_NS
+            command = self._waiting.popleft()
+            self._unacknowledged.append(command)
+            self._output.append(command[1])
+        if self._unacknowledged and now_ns >= self._retry_due_ns:
+            self._retry(now_ns)
+
+    def _retry(self, now_ns: int) -> None:
+        if now_ns - self._oldest_ns > RETRY_GIVE_UP_NS:
+            raise LinkError(
+                f"command {self._unacknowledged[0][0]} was not acknowledged within {RETRY_GIVE_UP_NS // NS_PER_MS} ms",
+                remedy="check the link; `pans doctor` looks at the port",
+            )
+        self._output.extend(frame for _, frame in self._unacknowledged)
+        self.counters.retransmissions += len(self._unacknowledged)
+        self._retry_after_ns = min(2 * self._retry_after_ns, RETRY_LONGEST_NS)
+        self._retry_due_ns = now_ns + self._retry_after_ns
+
+    # -- what the device says ------------------------------------------------------------------------------------------
+
+    def on_frame(self, frame: Frame, now_ns: int) -> bool:
+        """Digest one frame; return True when it is a stream message, which is the caller's to handle."""
+        if frame.session != self.nonce:
+            self.counters.wrong_session += 1
+            return False
+        if frame.type >= MessageType.CLICKS:
+            return frame.type <= MessageType.MARK
+        try:
+            self._digest(frame, now_ns)
+        except wire.MalformedMessage:
+            self.counters.malformed += 1
+        return False
+
+    def _digest(self, frame: Frame, now_ns: int) -> None:
+        if frame.type == MessageType.PONG:
+            self.pongs.append((wire.decode_pong(frame.payload), now_ns))
+        elif frame.type == MessageType.ACK:
+            self._on_ack(wire.decode_ack(frame.payload), now_ns)
+        elif frame.type == MessageType.STATUS:
+            self.status = wire.decode_status(frame.payload)
+        elif frame.type == MessageType.WELCOME:
+            self._on_welcome(wire.decode_welcome(frame.payload))
+        else:
+            self.counters.unknown_type += 1
+
+    def _on_welcome(self, welcome: wire.Welcome) -> None:
+        if (welcome.schema, welcome.protocol) != (wire.SCHEMA, wire.PROTOCOL_VERSION):
+            raise DeviceError(
+                f"the device speaks protocol {welcome.protocol} (schema {welcome.schema:#010x}), "
+                f"this runtime {wire.PROTOCOL_VERSION} (schema {wire.SCHEMA:#010x})",
+                remedy="install the firmware and the runtime of the same release",
+            )
+        self.welcome = welcome
+        self._hello_due_ns = None
+
+    def _on_ack(self, ack: wire.Ack, now_ns: int) -> None:
+        while self._unacknowledged and self._unacknowledged[0][0] <= ack.last_id:
+            acknowledged, _ = self._unacknowledged.popleft()
+            self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS
+            self._retry_due_ns = now_ns + RETRY_FIRST_NS
+            if acknowledged == ack.refused_id:
+                name = AckStatus(ack.status).name if ack.status in set(AckStatus) else str(ack.status)
+                raise DeviceError(f"the device refused command {ack.refused_id} ({name}): {ack.text}")
