@@ -1,0 +1,152 @@
+"""The click law: the probability that one exposure clicks, given the photoelectrons that reach the detector.
+
+Owns the formulas and their stable forms; never samples clicks (the simulator does) and never models what links exposures
+(dead time, afterpulsing). All calls return float64 arrays of the shape of their input.
+
+With mu = photoelectrons + dark_per_exposure, Poisson counts k are read with Gaussian noise sigma against a threshold theta:
+`1 - p = exp(-mu) * sum_k c_k mu^k`, `c_k = Phi((theta - k)/sigma)/k!`. Without read noise and with theta in (0, 1] this is
+the thresholded Poisson law of the paper, `p = 1 - exp(-mu)`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from .profile import Profile
+
+F64 = NDArray[np.float64]
+_TINY = 1e-300  # below this a coefficient would be subnormal; it is negligible long before
+
+
+@dataclass(frozen=True, slots=True)
+class ClickLaw:
+    """Dark photoelectrons per exposure, read noise and threshold in photoelectrons."""
+
+    dark_per_exposure: float = 0.0
+    read_noise_e: float = 0.0
+    threshold_e: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.dark_per_exposure < math.inf:
+            raise ValueError(f"dark_per_exposure must be finite and at least 0, found {self.dark_per_exposure}")
+        if not 0 <= self.read_noise_e <= 10:
+            raise ValueError(f"read_noise_e must be from 0 to 10, found {self.read_noise_e}")
+        if not 0 < self.threshold_e <= 20:
+            raise ValueError(f"threshold_e must be above 0 and at most 20, found {self.threshold_e}")
+
+
+def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
+    """The law of one exposure of `exposure_us` microseconds on this profile's detector."""
+    detector = profile.detector
+    return ClickLaw(detector.dark_rate_hz * exposure_us * 1e-6, detector.read_noise_e, detector.threshold_e)
+
+
+def survival_coefficients(law: ClickLaw) -> F64:
+    """The c_k of `1 - p = exp(-mu) * sum_k c_k mu^k`, float64 (n,), up to the last that is not negligible."""
+    coefficients: list[float] = []
+    k = 0
+    while (below := _below(law, k)) > _TINY and k < 150:  # 150! is still a float
+        coefficients.append(below / math.factorial(k))
+        k += 1
+    return np.array(coefficients)
+
+
+def click_probability(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
+    """p for `photoelectrons` (any shape, per exposure, at least 0); accurate to a few ulp also where p is tiny."""
+    mu = _mean(law, photoelectrons)
+    if _is_plain(law):
+        return np.asarray(-np.expm1(-mu))
+    log_miss = _log_survival(law, mu)
+    return np.where(log_miss < -math.log(2), -np.expm1(log_miss), _small_p(law, mu, log_miss))
+
+
+def log_no_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
+    """log(1 - p) for `photoelectrons` (any shape); finite for every finite input."""
+    mu = _mean(law, photoelectrons)
+    if _is_plain(law):
+        return np.asarray(-mu)
+    log_miss = _log_survival(law, mu)
+    return np.where(log_miss < -math.log(2), log_miss, np.log1p(-_small_p(law, mu, log_miss)))
+
+
+def log_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
+    """log p for `photoelectrons` (any shape); -inf where no click can happen (no light, dark counts or read noise)."""
+    mu = _mean(law, photoelectrons)
+    log_miss = -mu if _is_plain(law) else _log_survival(law, mu)
+    small = -np.expm1(-mu) if _is_plain(law) else _small_p(law, mu, log_miss)
+    with np.errstate(divide="ignore"):
+        return np.where(log_miss < -math.log(2), np.log1p(-np.exp(log_miss)), np.log(small))
+
+
+def object_transmission(
+    profile: Profile | None, images: NDArray[np.uint8], dtype: DTypeLike = np.float64
+) -> NDArray[np.floating]:
+    """Transmission in [1/contrast, 1] of 8-bit `images` (any shape) on the profile's object modulator; same shape.
+
+    Without a profile, or without a modulator in it, black is 0 and white is 1. A modulator of fewer than 256 levels rounds
+    to its own.
+    """
+    if images.dtype != np.uint8:
+        raise ValueError(f"images must be uint8 (0 is black, 255 is white), found {images.dtype}")
+    gray = np.arange(256) / 255.0
+    modulator = None if profile is None else profile.object_modulator
+    if modulator is not None:
+        if modulator.levels < 256:
+            gray = np.rint(gray * (modulator.levels - 1)) / (modulator.levels - 1)
+        darkest = 1.0 / modulator.contrast
+        gray = darkest + (1.0 - darkest) * gray
+    table = gray.astype(dtype)
+    return np.asarray(table[images])
+
+
+def _is_plain(law: ClickLaw) -> bool:
+    return law.read_noise_e == 0 and law.threshold_e <= 1
+
+
+def _mean(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
+    mu = np.asarray(photoelectrons, dtype=np.float64) + law.dark_per_exposure
+    if mu.size and not (mu.min() >= law.dark_per_exposure and mu.max() < math.inf):  # also false for nan
+        low, high = mu.min() - law.dark_per_exposure, mu.max() - law.dark_per_exposure
+        raise ValueError(f"photoelectrons must be finite and at least 0, found {low:g} to {high:g}")
+    return mu
+
+
+def _above(law: ClickLaw, k: int) -> float:
+    """P(reading >= threshold | k photoelectrons)."""
+    if law.read_noise_e == 0:
+        return float(k >= law.threshold_e)
+    return 0.5 * math.erfc((law.threshold_e - k) / (law.read_noise_e * math.sqrt(2)))
+
+
+def _below(law: ClickLaw, k: int) -> float:
+    if law.read_noise_e == 0:
+        return float(k < law.threshold_e)
+    return 0.5 * math.erfc((k - law.threshold_e) / (law.read_noise_e * math.sqrt(2)))
+
+
+def _log_survival(law: ClickLaw, mu: F64) -> F64:
+    """log(1 - p), accurate in absolute terms: summed in log space, as mu^k overflows and exp(-mu) underflows."""
+    log_c = np.log(survival_coefficients(law))
+    with np.errstate(divide="ignore"):
+        log_mu = np.log(mu)
+    total = np.full(mu.shape, log_c[0])
+    for k in range(1, len(log_c)):
+        total = np.logaddexp(total, log_c[k] + k * log_mu)
+    return np.minimum(total - mu, 0.0)
+
+
+def _small_p(law: ClickLaw, mu: F64, log_miss: F64) -> F64:
+    """p = exp(-mu) sum_k Q((theta - k)/sigma) mu^k/k!, right where it is below 1/2: all terms are positive, nothing cancels."""
+    mu = np.where(log_miss < -math.log(2), 0.0, mu)
+    term = np.exp(-mu)
+    total = _above(law, 0) * term
+    k = 0
+    while k < law.threshold_e or np.any(term > 1e-18 * total):
+        k += 1
+        term = term * (mu / k)
+        total = total + _above(law, k) * term
+    return np.asarray(total)
