@@ -1,0 +1,44 @@
+"""Slow oracles for the decision back ends: plain loops over Python numbers, one object at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+
+def word_of(clicks: Sequence[int]) -> int:
+    """The table row of single clicks: bit i is pattern i."""
+    word = 0
+    for pattern, click in enumerate(clicks):
+        if click:
+            word += 2**pattern
+    return word
+
+
+def winner(scores: Sequence[float]) -> tuple[int, float]:
+    """The lowest label with the largest score, and its softmax probability."""
+    best = 0
+    for label in range(1, len(scores)):
+        if scores[label] > scores[best]:
+            best = label
+    return best, 1.0 / math.fsum(math.exp(score - scores[best]) for score in scores)
+
+
+def label_words(labels: Sequence[int], words: Sequence[int], out: list[int]) -> int:
+    """The kernel of the same name."""
+    for position, word in enumerate(words):
+        if word >= len(labels):
+            return position
+        out[position] = labels[word]
+    return -1
+
+
+def affine_scores(
+    counts: Sequence[int], shots: int, weights: Sequence[Sequence[float]], bias: Sequence[float]
+) -> list[float]:
+    """Scores of an affine head: weights (d_f, classes), bias (classes)."""
+    result = []
+    for label in range(len(bias)):
+        terms = [counts[pattern] / shots * weights[pattern][label] for pattern in range(len(counts))]
+        result.append(math.fsum(terms) + bias[label])
+    return result
