@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from .profile import Profile
 
 F64 = NDArray[np.float64]
-_TINY = 1e-300  # below this a coefficient would be subnormal; it is negligible long before
+_TINY = 1e-300  # Phi below this is negligible at any mean that a float can hold, and would soon be subnormal
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +33,10 @@ class ClickLaw:
     def __post_init__(self) -> None:
         if not 0 <= self.dark_per_exposure < math.inf:
             raise ValueError(f"dark_per_exposure must be finite and at least 0, found {self.dark_per_exposure}")
-        if not 0 <= self.read_noise_e <= 10:
-            raise ValueError(f"read_noise_e must be from 0 to 10, found {self.read_noise_e}")
-        if not 0 < self.threshold_e <= 20:
-            raise ValueError(f"threshold_e must be above 0 and at most 20, found {self.threshold_e}")
+        if not 0 <= self.read_noise_e <= 3:
+            raise ValueError(f"read_noise_e must be from 0 to 3, found {self.read_noise_e}")
+        if not 0 < self.threshold_e <= 10:
+            raise ValueError(f"threshold_e must be above 0 and at most 10, found {self.threshold_e}")
 
 
 def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
@@ -47,12 +47,8 @@ def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
 
 def survival_coefficients(law: ClickLaw) -> F64:
     """The c_k of `1 - p = exp(-mu) * sum_k c_k mu^k`, float64 (n,), up to the last that is not negligible."""
-    coefficients: list[float] = []
-    k = 0
-    while (below := _below(law, k)) > _TINY and k < 150:  # 150! is still a float
-        coefficients.append(below / math.factorial(k))
-        k += 1
-    return np.array(coefficients)
+    coefficients = np.exp(_log_coefficients(law))
+    return coefficients[coefficients > _TINY]
 
 
 def click_probability(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
@@ -128,9 +124,17 @@ def _below(law: ClickLaw, k: int) -> float:
     return 0.5 * math.erfc((k - law.threshold_e) / (law.read_noise_e * math.sqrt(2)))
 
 
+def _log_coefficients(law: ClickLaw) -> F64:
+    """log c_k: the last ones matter at large means, though c_k itself is no float any more."""
+    logs: list[float] = []
+    while (below := _below(law, len(logs))) > _TINY:
+        logs.append(math.log(below) - math.lgamma(len(logs) + 1))
+    return np.array(logs)
+
+
 def _log_survival(law: ClickLaw, mu: F64) -> F64:
     """log(1 - p), accurate in absolute terms: summed in log space, as mu^k overflows and exp(-mu) underflows."""
-    log_c = np.log(survival_coefficients(law))
+    log_c = _log_coefficients(law)
     with np.errstate(divide="ignore"):
         log_mu = np.log(mu)
     total = np.full(mu.shape, log_c[0])
