@@ -1,0 +1,42 @@
+"""Where device time comes from: the device's imperfect clock, and what a shell needs of a device.
+
+Owns the conversion host nanoseconds <-> device ticks of the simulator (the truth that the host's clock model has to find);
+never reads a clock. Conversions are exact integer arithmetic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+DEFAULT_OFFSET_TICKS = 123_456_789
+DEFAULT_DRIFT_PPM = 20.0
+_E18 = 10**18
+
+
+class SteppedDevice(Protocol):
+    """What a shell drives: an `Instrument`, or a wrapper that damages the bytes on their way in and out of one."""
+
+    @property
+    def session(self) -> int: ...
+
+    def step(self, tick: int, data: bytes) -> bytes: ...
+
+    def next_event_tick(self) -> int | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceClock:
+    """tick = offset_ticks + host_s * tick_hz * (1 + drift), drift in parts per billion."""
+
+    tick_hz: int
+    offset_ticks: int = DEFAULT_OFFSET_TICKS
+    drift_ppb: int = round(DEFAULT_DRIFT_PPM * 1000)
+
+    def tick_at(self, host_ns: int) -> int:
+        """The tick that the device counts at `host_ns`."""
+        return self.offset_ticks + host_ns * self.tick_hz * (10**9 + self.drift_ppb) // _E18
+
+    def host_ns_at(self, tick: int) -> int:
+        """The first nanosecond at which the device counts `tick`."""
+        return -(-(tick - self.offset_ticks) * _E18 // (self.tick_hz * (10**9 + self.drift_ppb)))

@@ -1,0 +1,73 @@
+"""`pans simulate`: a stand-alone simulated instrument behind a pseudo-terminal or TCP.
+
+Owns the command's arguments and its way to end; never the instrument. The first line on stdout is the device URL.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+from typing import NoReturn
+
+from pans.runtime.cli import Command, emit, say
+
+from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS
+from .serve import DEFAULT_SCENE, SimOptions, build_instrument, check_options
+from .shell import open_port, serve
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
+    parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark or a .npz file")
+    parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
+    parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
+    parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
+    parser.add_argument("--drift-ppm", type=float, default=DEFAULT_DRIFT_PPM, help="rate error of the device's clock")
+    parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started this one")
+
+
+def _run(args: argparse.Namespace) -> int:
+    options = check_options(
+        SimOptions(args.profile, args.scene, args.seed, offset=args.offset, drift_ppm=args.drift_ppm)
+    )
+    instrument, clock = build_instrument(options, time.perf_counter_ns())
+    port = open_port(args.listen)
+    signal.signal(signal.SIGTERM, _leave)
+    orphaned = _watch_stdin() if args.until_stdin_closes else threading.Event()
+    payload = {"device": port.url, "profile": args.profile, "scene": args.scene, "seed": args.seed, "simulated": True}
+    try:
+        emit(args, payload, port.url)
+        if not args.until_stdin_closes:
+            say(f"SIMULATED instrument {args.profile} before scene {args.scene}; Ctrl-C ends it")
+        serve(instrument, clock, port, orphaned.is_set)
+    finally:
+        port.close()
+    return 0
+
+
+def _watch_stdin() -> threading.Event:
+    """Return an event that is set when the starting process closes our standard input, by dying at the latest."""
+    closed = threading.Event()
+
+    def watch() -> None:
+        try:
+            while os.read(sys.stdin.fileno(), 4096):
+                pass
+        except OSError:
+            pass
+        closed.set()
+
+    threading.Thread(target=watch, name="pans-sim-stdin", daemon=True).start()
+    return closed
+
+
+def _leave(signum: int, frame: FrameType | None) -> NoReturn:
+    raise SystemExit(0)
+
+
+SIMULATE = Command("run a simulated instrument that other programs open as an ordinary device", _configure, _run)

@@ -1,0 +1,57 @@
+"""The instrument in process, in virtual time: a link whose clock moves only while the host waits.
+
+Owns virtual time; never sleeps, starts a thread or reads a clock, so that a run is the same bit for bit on every machine and
+an hour takes seconds. `VirtualLink` is an ordinary Link (pans.runtime.link).
+"""
+
+from __future__ import annotations
+
+from pans.runtime.errors import LinkError
+
+from .clockwork import DeviceClock, SteppedDevice
+
+START_NS = 1_000_000_000
+NS_PER_S = 1_000_000_000
+
+
+class VirtualLink:
+    """A link to a stepped device; `read` advances time to the next emission or the time-out, whichever is first."""
+
+    simulated = True
+    virtual = True
+
+    def __init__(self, device: SteppedDevice, clock: DeviceClock, name: str) -> None:
+        self.name = name
+        self.device = device
+        self.clock = clock
+        self._now_ns = START_NS
+        self._arrived = b""
+        self._closed = False
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what the device has sent, advancing time to its next emission, but by at most `timeout_s`."""
+        self._check_open()
+        deadline_ns = self._now_ns + max(0, round(timeout_s * NS_PER_S))
+        while not self._arrived and self._now_ns < deadline_ns:
+            due = self.device.next_event_tick()
+            self._now_ns = deadline_ns if due is None else min(deadline_ns, self.clock.host_ns_at(due))
+            self._arrived = self.device.step(self.clock.tick_at(self._now_ns), b"")
+        data, self._arrived = self._arrived, b""
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Hand `data` to the device at the present virtual time."""
+        self._check_open()
+        self._arrived += self.device.step(self.clock.tick_at(self._now_ns), bytes(data))
+
+    def now_ns(self) -> int:
+        """Virtual host time in nanoseconds."""
+        return self._now_ns
+
+    def close(self) -> None:
+        """End the link; idempotent."""
+        self._closed = True
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LinkError(f"{self.name} is closed")
