@@ -96,11 +96,13 @@ class Instrument:
         self._run: Measurement | None = None
         self._lease_tick: int | None = None
         self._status_tick: int | None = None
+        self._stream_limit = 0
         self._forget_stream()
 
     def _forget_stream(self) -> None:
+        """Start numbering anew; the receive window stays, since the host may grant just before it arms."""
         self._buffer.clear()
-        self._sequence = self._stream_limit = self._drops = self._exposures_ended = 0
+        self._sequence = self._drops = self._exposures_ended = 0
 
     @property
     def tick(self) -> int:

@@ -118,8 +118,8 @@ class Profile:
 @dataclass(frozen=True, slots=True)
 class _Key:
     kind: str  # "text", "whole", "number"
-    low: float = -math.inf
-    high: float = math.inf
+    low: float = 0.0
+    high: float = 0.0
     above: bool = False  # low itself is not allowed
     required: bool = True
     infinite: bool = False  # inf is a meaning, not a mistake
@@ -135,8 +135,8 @@ class _Key:
         """Whether a value of the right type is an allowed one; nan is in no range."""
         if self.kind == "text":
             return value in self.choices if self.choices else bool(value.strip())
-        if value == math.inf and not self.infinite:
-            return False
+        if value == math.inf:
+            return self.infinite
         return bool(self.low < value <= self.high or (value == self.low and not self.above))
 
     @property
@@ -144,13 +144,9 @@ class _Key:
         if self.kind == "text":
             return " or ".join(f'"{choice}"' for choice in self.choices) or "text in quotes, not empty"
         noun = "a whole number" if self.kind == "whole" else "a number"
-        if math.isinf(self.high):
-            limits = f"{'above' if self.above else 'of at least'} {self.low:.10g}"
-        elif self.above:
-            limits = f"above {self.low:.10g} and at most {self.high:.10g}"
-        else:
-            limits = f"from {self.low:.10g} to {self.high:.10g}"
-        return f"{noun} {limits}{' (inf is allowed)' if self.infinite else ''}"
+        low, high = f"{self.low:.12g}", f"{self.high:.12g}"
+        limits = f"above {low} and at most {high}" if self.above else f"from {low} to {high}"
+        return f"{noun} {limits}{', or inf' if self.infinite else ''}"
 
 
 _PROBABILITY = _Key("number", 0, 1, required=False)
@@ -171,7 +167,7 @@ _SCHEMA: dict[str, dict[str, _Key]] = {
         "peak_photoelectrons_hz": _Key("number", 0, 1e15, above=True),
     },
     "object": {
-        "contrast": _Key("number", 1, above=True, infinite=True),
+        "contrast": _Key("number", 1, 1e12, above=True, infinite=True),
         "levels": _Key("whole", 2, 65536),
     },
     "detector": {

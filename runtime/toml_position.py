@@ -33,6 +33,8 @@ def read_toml(text: str, where: str) -> tuple[dict[str, Any], Mapping[KeyPath, P
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise _not_toml(error, text, where) from error
+    except ValueError as error:  # Python refuses to read a number of thousands of digits
+        raise ConfigError(f"{where}:1:1: not valid TOML: {str(error).split(';')[0]}") from error
     except RecursionError as error:
         raise ConfigError(f"{where}:1:1: the TOML is nested too deeply") from error
     return tables, key_positions(text)
