@@ -9,9 +9,12 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import struct
+import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from .errors import DamagedFileError, UsageError
 
@@ -110,3 +113,86 @@ def sync_folder(folder: Path) -> None:
         pass  # some network file systems refuse; the file itself is on the disk
     finally:
         os.close(handle)
+
+
+# ---- chained blocks: an append-only file in which every byte is covered, readable up to where it was cut ----
+
+FILE_PROLOGUE = struct.Struct("<8sII")  # magic, version, CRC-32 of both
+_BLOCK_HEADER = struct.Struct("<IIB3xI")  # payload length, block index, kind, CRC-32 of these 12 bytes
+_CRC = struct.Struct("<I")
+BLOCK_OVERHEAD = _BLOCK_HEADER.size + _CRC.size
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One whole block; `end` is the file offset behind it, `chain` the checksum that seeds the next block."""
+
+    index: int
+    kind: int
+    payload: bytes
+    end: int
+    chain: int
+
+
+def file_prologue(magic: bytes, version: int) -> tuple[bytes, int]:
+    """Return the first 16 bytes of a block file and the checksum that seeds its first block."""
+    start = FILE_PROLOGUE.pack(magic, version, 0)[:-4]
+    chain = zlib.crc32(start)
+    return start + _CRC.pack(chain), chain
+
+
+def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
+    """Return the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
+    if data[: len(magic)] != magic[: len(data)]:
+        raise DamagedFileError(f"{where}: it starts with {data[:8]!a}, expected {magic!a}")
+    if len(data) < FILE_PROLOGUE.size:
+        raise DamagedFileError(f"{where}: cut after {len(data)} bytes, nothing of it can be read")
+    _, found, crc = FILE_PROLOGUE.unpack_from(data)
+    if zlib.crc32(data[: FILE_PROLOGUE.size - 4]) != crc:
+        raise DamagedFileError(f"{where}: altered within its first {FILE_PROLOGUE.size} bytes")
+    if found != version:
+        remedy = "use the pans-runtime that wrote it"
+        raise DamagedFileError(f"{where}: format version {found}, allowed: {version}", remedy=remedy)
+    return crc
+
+
+def block_bytes(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
+    """Return a block's bytes and the next chain value; each CRC is seeded with the one before it, so order is covered."""
+    start = _BLOCK_HEADER.pack(len(payload), index, kind, 0)[:-4]
+    header_crc = zlib.crc32(start, chain)
+    payload_crc = zlib.crc32(payload, header_crc)
+    return b"".join([start, _CRC.pack(header_crc), payload, _CRC.pack(payload_crc)]), payload_crc
+
+
+def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int], where: str) -> Block | None:
+    """Return the block at the file's position, or None where the file was cut (or ends); DamagedFileError if altered.
+
+    `limits` maps each allowed kind to its largest payload in bytes; nothing is read beyond it.
+    """
+    place = f"{where}: block {index} at byte {file.tell()}"
+    head = file.read(_BLOCK_HEADER.size)
+    if len(head) < _BLOCK_HEADER.size:
+        return None
+    length, found_index, kind, header_crc = _BLOCK_HEADER.unpack(head)
+    if zlib.crc32(head[:-4], chain) != header_crc:
+        if not any(head) and _only_zeros_follow(file):
+            return None  # a power cut after the file had grown, before its data reached the disk
+        raise DamagedFileError(f"{place}: altered or out of order (its header does not fit its checksum)")
+    if found_index != index or any(head[9:12]) or kind not in limits:
+        raise DamagedFileError(f"{place}: index {found_index}, kind {kind}, allowed: index {index}, a known kind")
+    if length > limits[kind]:
+        raise DamagedFileError(f"{place}: {length} bytes of kind {kind}, allowed at most {limits[kind]}")
+    payload, tail = file.read(length), file.read(_CRC.size)
+    if len(payload) < length or len(tail) < _CRC.size:
+        return None
+    payload_crc = zlib.crc32(payload, header_crc)
+    if _CRC.unpack(tail)[0] != payload_crc:
+        raise DamagedFileError(f"{place}: altered (its payload of {length} bytes does not fit its checksum)")
+    return Block(index, kind, payload, file.tell(), payload_crc)
+
+
+def _only_zeros_follow(file: BinaryIO) -> bool:
+    while chunk := file.read(MIB):
+        if chunk.count(0) != len(chunk):
+            return False
+    return True

@@ -1,0 +1,271 @@
+"""Append-only recordings: everything a run saw and decided, in one file that survives a power cut.
+
+Owns the writing, in bounded batches; reading is in recording.py and offered here too. Never decides what is worth keeping
+and never converts a time. `Recorder.close` returns the SHA-256 of the decision log, which a replay must give again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .clock import CLOCK_DTYPE
+from .container import MIB, block_bytes, canonical_json, file_prologue, sync_folder
+from .errors import PansError, UsageError
+from .record_format import (
+    DECISION_DTYPE,
+    FORMAT_VERSION,
+    LIMITS,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_MAX_BYTES,
+    TIMING_DTYPE,
+    DecisionFlag,
+    Kind,
+    decision_log_sha256,
+)
+from .recording import Recording, read_recording
+
+__all__ = [
+    "DECISION_DTYPE",
+    "TIMING_DTYPE",
+    "DecisionFlag",
+    "Kind",
+    "Recorder",
+    "Recording",
+    "decision_log_sha256",
+    "read_recording",
+]
+
+_MESSAGE_BUFFER_BYTES = MIB // 4
+_EVENT_BUFFER_BYTES = MIB // 16
+_BUFFER_ROWS = 4096
+
+
+class _Rows:
+    """A preallocated table of `_BUFFER_ROWS` rows that is emptied into a block."""
+
+    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
+        self.kind = kind
+        self.rows = np.zeros(_BUFFER_ROWS, dtype=dtype)
+        self.used = 0
+
+    def add(self, row: Sequence[Any]) -> bool:
+        """Store one row; True when the table is full."""
+        self.rows[self.used] = row
+        self.used += 1
+        return self.used == len(self.rows)
+
+    def take(self) -> bytes:
+        data = self.rows[: self.used].tobytes()
+        self.used = 0
+        return data
+
+
+class _Bytes:
+    """A preallocated byte buffer that is emptied into a block."""
+
+    def __init__(self, kind: Kind, size: int) -> None:
+        self.kind = kind
+        self.data = bytearray(size)
+        self.used = 0
+
+    def room(self) -> int:
+        return len(self.data) - self.used
+
+    def add(self, piece: bytes | bytearray | memoryview) -> None:
+        self.data[self.used : self.used + len(piece)] = piece
+        self.used += len(piece)
+
+    def take(self) -> bytes:
+        data = bytes(memoryview(self.data)[: self.used])
+        self.used = 0
+        return data
+
+
+class Recorder:
+    """Writes one recording; one thread at a time. Adding buffers, a full buffer is written at once, `flush` writes the rest.
+
+    Left by an exception or not closed at all, the recording has no END block and reads as incomplete, which it is.
+    """
+
+    def __init__(
+        self, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
+    ) -> None:
+        """Create `path` (UsageError if it exists, unless `overwrite`) and write header and bundle to it.
+
+        `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
+        """
+        self.path = Path(path)
+        self._messages = _Bytes(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
+        self._commands = _Bytes(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._events = _Bytes(Kind.EVENTS, _EVENT_BUFFER_BYTES)
+        self._decisions = _Rows(Kind.DECISIONS, DECISION_DTYPE)
+        self._timings = _Rows(Kind.TIMINGS, TIMING_DTYPE)
+        self._log_hash = hashlib.sha256()
+        self._n_decisions = 0
+        self._n_blocks = 0
+        facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
+        facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
+        text = canonical_json({**facts, **header})
+        self._file = _create(self.path, overwrite)
+        start, self._chain = file_prologue(MAGIC, FORMAT_VERSION)
+        self._end = 0
+        self._write(start)
+        self._write_block(Kind.HEADER, text)
+        if bundle:
+            self._write_block(Kind.BUNDLE, bundle)
+        self.sync()
+        sync_folder(self.path.parent)
+
+    @classmethod
+    def open(
+        cls, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
+    ) -> Recorder:
+        """Start a recording at `path`; the same as calling the class."""
+        return cls(path, header, bundle=bundle, overwrite=overwrite)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+        except PansError:
+            if error is None:
+                raise
+        finally:
+            self._file.close()
+
+    def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
+        self._add_bytes(self._messages, host_ns, data)
+
+    def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
+        self._add_bytes(self._commands, host_ns, data)
+
+    def add_decision(self, record: Sequence[Any]) -> None:
+        """Keep one decision: a tuple in the order of DECISION_DTYPE."""
+        if self._decisions.add(record):
+            self._empty(self._decisions)
+
+    def add_timing(self, record: Sequence[Any]) -> None:
+        """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
+        if self._timings.add(record):
+            self._empty(self._timings)
+
+    def add_event(self, event: Mapping[str, Any]) -> None:
+        """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
+        line = canonical_json(event) + b"\n"
+        if len(line) > len(self._events.data):
+            raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(self._events.data)}")
+        if len(line) > self._events.room():
+            self._empty(self._events)
+        self._events.add(line)
+
+    def add_clock(self, samples: NDArray[np.void]) -> None:
+        """Write clock samples, CLOCK_DTYPE (n,) of clock.py; rare, hence not buffered."""
+        for start in range(0, len(samples), _BUFFER_ROWS):
+            part = np.ascontiguousarray(samples[start : start + _BUFFER_ROWS], dtype=CLOCK_DTYPE)
+            self._write_block(Kind.CLOCK, part.tobytes())
+
+    def flush(self) -> None:
+        """Write everything that is buffered to the file; it then survives the death of this process."""
+        for buffer in (self._commands, self._messages, self._decisions, self._timings, self._events):
+            if buffer.used:
+                self._empty(buffer)
+
+    def sync(self) -> None:
+        """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
+        self.flush()
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def close(self, summary: Mapping[str, Any]) -> str:
+        """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log."""
+        self.flush()
+        digest = self._log_hash.hexdigest()
+        end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
+        self._write_block(Kind.END, canonical_json(end))
+        self.sync()
+        self._file.close()
+        return digest
+
+    def _add_bytes(self, buffer: _Bytes, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        if len(data) > MESSAGE_MAX_BYTES:
+            raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
+        needed = MESSAGE.size + len(data)
+        if needed > buffer.room():
+            self._empty(buffer)
+        if needed > buffer.room():
+            self._write_block(buffer.kind, MESSAGE.pack(host_ns, len(data)) + bytes(data))
+            return
+        MESSAGE.pack_into(buffer.data, buffer.used, host_ns, len(data))
+        buffer.used += MESSAGE.size
+        buffer.add(data)
+
+    def _empty(self, buffer: _Rows | _Bytes) -> None:
+        if not buffer.used:
+            return
+        count, payload = buffer.used, buffer.take()
+        self._write_block(buffer.kind, payload)
+        if buffer.kind == Kind.DECISIONS:
+            self._log_hash.update(payload)
+            self._n_decisions += count
+
+    def _write_block(self, kind: Kind, payload: bytes) -> None:
+        if len(payload) > LIMITS[kind]:
+            raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
+        data, chain = block_bytes(kind, self._n_blocks, self._chain, payload)
+        self._write(data)
+        self._chain = chain
+        self._n_blocks += 1
+
+    def _write(self, data: bytes) -> None:
+        if self._file.closed:
+            raise UsageError(f"{self.path}: this recording is closed")
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            raise self._broken(error) from error
+        self._end += len(data)
+
+    def _broken(self, error: OSError) -> PansError:
+        """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
+        with suppress(OSError):  # otherwise the reader stops at the torn block by itself
+            self._file.truncate(self._end)
+        self._file.close()
+        reason = error.strerror or str(error)
+        return PansError(
+            f"{self.path}: the recording stops after {self._end} bytes: {reason}",
+            remedy="make room on the disk; what was written before is readable",
+        )
+
+
+def _create(path: Path, overwrite: bool) -> Any:
+    try:
+        if overwrite:
+            path.unlink(missing_ok=True)
+        return open(path, "xb", buffering=0)  # one write per block, nothing half written behind our back
+    except FileExistsError as error:
+        raise UsageError(f"{path}: exists already", remedy="choose another name, or allow overwriting") from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
