@@ -74,27 +74,27 @@ class PatternMemory:
 
     def load(self, chunk: PatternChunk) -> None:
         """Store one chunk, or raise `Refused`."""
-        _require(chunk.index < self.capacity, lambda: f"pattern {chunk.index}: memory holds {self.capacity}")
+        _require(chunk.pattern < self.capacity, lambda: f"pattern {chunk.pattern}: memory holds {self.capacity}")
         allowed = min(self.max_pixels, MAX_PATTERN_PIXELS)
         _require(chunk.n_pixels <= allowed, lambda: f"pattern of {chunk.n_pixels} pixels: allowed {allowed}")
         top = int(chunk.levels.max())
         _require(top < self.levels, lambda: f"level {top}: the projector has 0..{self.levels - 1}")
-        pattern = self._patterns.get(chunk.index)
+        pattern = self._patterns.get(chunk.pattern)
         if chunk.first_pixel == 0:
             pattern = self._new(chunk)
         if pattern is None or chunk.first_pixel != pattern.filled or chunk.n_pixels != len(pattern.levels):
             expected = f"{pattern.filled} of {len(pattern.levels)}" if pattern else "0"
             found = f"{chunk.first_pixel} of {chunk.n_pixels}"
-            raise Refused(AckStatus.OUT_OF_RANGE, f"pattern {chunk.index}: pixel {found}, expected {expected}")
+            raise Refused(AckStatus.OUT_OF_RANGE, f"pattern {chunk.pattern}: pixel {found}, expected {expected}")
         pattern.levels[pattern.filled : pattern.filled + len(chunk.levels)] = chunk.levels
         pattern.filled += len(chunk.levels)
         self.revision += 1
 
     def _new(self, chunk: PatternChunk) -> _Pattern:
-        held = sum(pattern.levels.nbytes for index, pattern in self._patterns.items() if index != chunk.index)
+        held = sum(pattern.levels.nbytes for index, pattern in self._patterns.items() if index != chunk.pattern)
         wanted = held + 2 * chunk.n_pixels
         _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
-        pattern = self._patterns[chunk.index] = _Pattern(np.zeros(chunk.n_pixels, np.uint16))
+        pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, np.uint16))
         return pattern
 
     def stack(self, n_patterns: int) -> NDArray[np.uint16]:

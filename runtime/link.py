@@ -167,6 +167,11 @@ class LinkReader:
             self._thread = threading.Thread(target=self._pump, name="pans-link-reader", daemon=True)
             self._thread.start()
 
+    @property
+    def thread_id(self) -> int | None:
+        """Native id of the reading thread, for the scheduler; None without one."""
+        return None if self._thread is None else self._thread.native_id
+
     def wait(self, timeout_s: float) -> list[Chunk]:
         """Return the chunks that are there, waiting at most `timeout_s` for the first; LinkError when the reader has died."""
         if self._thread is None:

@@ -24,15 +24,16 @@ from numpy.typing import NDArray
 
 from .errors import PlanError, UsageError
 from .profile import Profile
+from .wire import DARK_PATTERN as DARK_PATTERN
 
 if TYPE_CHECKING:
     from .bundle import Bundle
 
-DARK_PATTERN = 0xFFFF
 NO_SHOT = 0xFFFF  # shot number of a dark slot
 ORDERS = ("auto", "pattern-major", "shot-major")
 MAX_SLOTS = 1 << 20  # of one cycle; more would be 16 MB of plan on the wire
 MAX_BLOCK_EXPOSURES = 1024  # keeps a click block near 2 kB
+MAX_BLOCK_BYTES = 16384  # and a block of wide frames far below the longest message
 _MAX_SHOTS = 0xFFFE
 _U32 = 0xFFFF_FFFF
 
@@ -245,7 +246,7 @@ def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) 
         period=period,
         shots_per_cycle=1,
         cycles_per_object=shots,
-        block=_block(len(patterns), period, ticks),
+        block=_block(len(patterns), period, ticks, MAX_BLOCK_EXPOSURES),
         ticks=ticks,
     )
 
@@ -272,6 +273,7 @@ def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Tick
 
 def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) -> Plan:
     frames = _interleave(np.arange(shots), dark)
+    word_bytes = -(-n // 8) + 8  # a word is rounded up, by less than 8 bytes
     return _plan(
         profile,
         n,
@@ -282,7 +284,7 @@ def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) ->
         period=ticks.spacing,
         shots_per_cycle=shots,
         cycles_per_object=1,
-        block=_block(len(frames), ticks.spacing, ticks),
+        block=_block(len(frames), ticks.spacing, ticks, min(MAX_BLOCK_EXPOSURES, MAX_BLOCK_BYTES // word_bytes)),
         ticks=ticks,
     )
 
@@ -335,9 +337,9 @@ def _check_slots(slots: int, remedy: str) -> None:
         raise PlanError(f"one cycle would have {slots} slots, allowed are {MAX_SLOTS}", remedy=remedy)
 
 
-def _block(slots: int, period: int, ticks: _Ticks) -> int:
+def _block(slots: int, period: int, ticks: _Ticks, most: int) -> int:
     """Exposures per block: blocks of about equal size that last at most a quarter of the decision deadline."""
-    return _even_blocks(slots, max(1, min(MAX_BLOCK_EXPOSURES, int(ticks.block // period))))
+    return _even_blocks(slots, max(1, min(most, int(ticks.block // period))))
 
 
 def _even_blocks(exposures: int, most: int) -> int:

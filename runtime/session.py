@@ -17,6 +17,7 @@ NS_PER_MS = 1_000_000
 HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
+STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS
 RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
@@ -126,17 +127,18 @@ class HostSession:
     # -- what the device says ------------------------------------------------------------------------------------------
 
     def on_frame(self, frame: Frame, now_ns: int) -> bool:
-        """Digest one frame; return True when it is a stream message, which is the caller's to handle."""
+        """Digest one frame; return True when the core should see it too (stream messages, and STATUS)."""
         if frame.session != self.nonce:
             self.counters.wrong_session += 1
             return False
-        if frame.type >= MessageType.CLICKS:
-            return frame.type <= MessageType.MARK
+        if frame.type in STREAM_TYPES:
+            return True
         try:
             self._digest(frame, now_ns)
         except wire.MalformedMessage:
             self.counters.malformed += 1
-        return False
+            return False
+        return frame.type == MessageType.STATUS
 
     def _digest(self, frame: Frame, now_ns: int) -> None:
         if frame.type == MessageType.PONG:

@@ -278,11 +278,24 @@ def _crc_seed(message_type: int) -> int:
     return 0 if message_type in _UNSEEDED else SCHEMA
 
 
+def pack_body(frame: Frame) -> bytes:
+    """Return header and payload as they stood inside the frame: what a recording keeps."""
+    return _HEADER.pack(frame.type, frame.flags, 0, frame.session) + frame.payload
+
+
+def unpack_body(body: bytes) -> Frame:
+    """Invert `pack_body`; MalformedMessage when there is no whole header."""
+    if len(body) < _HEADER.size:
+        raise MalformedMessage(f"a message has {len(body)} bytes, at least {_HEADER.size} expected")
+    message_type, flags, _, session = _HEADER.unpack_from(body)
+    return Frame(message_type, flags, session, body[_HEADER.size :])
+
+
 def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0) -> bytes:
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise MalformedMessage(f"payload has {len(payload)} bytes, allowed {MAX_PAYLOAD_BYTES}")
-    body = _HEADER.pack(message_type, flags, 0, session) + payload
+    body = pack_body(Frame(message_type, flags, session, payload))
     crc = zlib.crc32(body, _crc_seed(message_type))
     # A run that ends exactly at a 254-byte boundary would cost one code byte more; cobs_encode keeps the plain form.
     return cobs_encode(body + crc.to_bytes(4, "little")) + b"\0"
@@ -347,8 +360,7 @@ class FrameDecoder:
             counters.crc_errors += 1
         else:
             counters.frames += 1
-            message_type, flags, _, session = _HEADER.unpack_from(body)
-            return Frame(message_type, flags, session, body[_HEADER.size : -4])
+            return unpack_body(body[:-4])
         counters.bytes_discarded += len(raw) + 1
         return None
 
@@ -481,13 +493,14 @@ def encode_clicks(block: ClickBlock, session: int) -> bytes:
 
 def decode_clicks(payload: bytes) -> ClickBlock:
     """Decode CLICKS; the arrays are fresh copies."""
-    *start, count, _, object_index = _fields("CLICKS", payload, exact=False)
+    seq, drops, tick, first, period, count, _, object_index = _fields("CLICKS", payload, exact=False)
     expected = BLOCK_HEADER_BYTES + 2 * count + (count + 7) // 8
     if count == 0 or len(payload) != expected:
         raise MalformedMessage(f"CLICKS of {count} exposures has {len(payload)} bytes, expected {expected}")
     patterns = np.frombuffer(payload, "<u2", count, BLOCK_HEADER_BYTES).astype(np.uint16)
     packed = np.frombuffer(payload, np.uint8, -1, BLOCK_HEADER_BYTES + 2 * count)
-    return ClickBlock(*start, object_index, patterns, np.unpackbits(packed, count=count, bitorder="little"))
+    bits = np.unpackbits(packed, count=count, bitorder="little")
+    return ClickBlock(seq, drops, tick, first, period, object_index, patterns, bits)
 
 
 def encode_frames(block: FrameBlock, session: int) -> bytes:
@@ -499,14 +512,14 @@ def encode_frames(block: FrameBlock, session: int) -> bytes:
 
 def decode_frames(payload: bytes) -> FrameBlock:
     """Decode FRAMES; `words` is a read-only view of the payload."""
-    *start, count, word_bytes, object_index = _fields("FRAMES", payload, exact=False)
+    seq, drops, tick, first, period, count, word_bytes, object_index = _fields("FRAMES", payload, exact=False)
     expected = BLOCK_HEADER_BYTES + count * word_bytes
     if count == 0 or word_bytes == 0 or len(payload) != expected:
         raise MalformedMessage(
             f"FRAMES of {count} words of {word_bytes} bytes has {len(payload)} bytes, expected {expected}"
         )
     words = np.frombuffer(payload, np.uint8, count * word_bytes, BLOCK_HEADER_BYTES)
-    return FrameBlock(*start, object_index, words.reshape(count, word_bytes))
+    return FrameBlock(seq, drops, tick, first, period, object_index, words.reshape(count, word_bytes))
 
 
 def encode_mark(mark: Mark, session: int) -> bytes:

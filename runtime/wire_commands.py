@@ -22,7 +22,7 @@ MAX_SLOTS_PER_CHUNK = 1024
 class PatternChunk(NamedTuple):
     """Part of one pattern: levels uint16 (n,) of the pixels from `first_pixel` on, of `n_pixels` in the whole pattern."""
 
-    index: int
+    pattern: int
     first_pixel: int
     n_pixels: int
     levels: U16
@@ -61,18 +61,18 @@ class Gate(NamedTuple):
 
 def pack_pattern(chunk: PatternChunk) -> bytes:
     """Return the body of LOAD_PATTERN."""
-    head = _STRUCT["LOAD_PATTERN"].pack(chunk.index, 0, chunk.first_pixel, chunk.n_pixels)
+    head = _STRUCT["LOAD_PATTERN"].pack(chunk.pattern, 0, chunk.first_pixel, chunk.n_pixels)
     return head + chunk.levels.astype("<u2").tobytes()
 
 
 def unpack_pattern(body: bytes) -> PatternChunk:
     """Invert `pack_pattern`."""
-    index, _, first_pixel, n_pixels = _fields("LOAD_PATTERN", body, exact=False)
+    pattern, _, first_pixel, n_pixels = _fields("LOAD_PATTERN", body, exact=False)
     rest = len(body) - _STRUCT["LOAD_PATTERN"].size
     if rest == 0 or rest % 2 or rest // 2 > MAX_PIXELS_PER_CHUNK or first_pixel + rest // 2 > n_pixels:
         raise MalformedMessage(f"LOAD_PATTERN holds {rest} bytes of levels from pixel {first_pixel} of {n_pixels}")
     levels = np.frombuffer(body, "<u2", rest // 2, _STRUCT["LOAD_PATTERN"].size).astype(np.uint16)
-    return PatternChunk(index, first_pixel, n_pixels, levels)
+    return PatternChunk(pattern, first_pixel, n_pixels, levels)
 
 
 def pack_plan(chunk: PlanChunk) -> bytes:

@@ -1,0 +1,316 @@
+"""`pans run` and `pans demo`: from a bundle and a device URL to decisions, a recording and a summary.
+
+Owns the commands' arguments, the files they leave and their exit codes; the run itself is loop.py's. `demo` is `run` with the
+shipped bundle, the shipped scene and the simulated instrument at real pace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.resources
+import platform
+import shlex
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from . import __version__
+from .cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
+from .errors import UsageError
+from .link import open_link
+from .profile import Profile, load_profile
+
+T = TypeVar("T")
+DEMO_BUNDLE = "fashion10.pans"
+DEMO_PROFILE = "oled-qcmos"
+DEMO_SCENE = "fashion200"
+DEMO_OBJECTS = 200
+DEMO_TRIALS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What one call of the command is to do, resolved."""
+
+    bundle_path: Path
+    device: str
+    profile: Profile
+    out: Path
+    shots: int
+    trials: int
+    decisions: int
+    seconds: float
+    deadline_us: float
+    order: str
+    dark_slots: int
+    backend: str
+    realtime: bool
+    record: Path | None
+    command: str
+
+
+def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
+    parser.add_argument("--shots", type=int, default=1, metavar="K", help="shots per decision (default 1)")
+    parser.add_argument(
+        "--trials", type=int, default=trials, metavar="N", help=f"decisions per object (default {trials})"
+    )
+    parser.add_argument("--seconds", type=float, default=0.0, help="stop after this time")
+    parser.add_argument("--deadline-us", type=float, default=0.0, help="decision deadline (default: the profile's)")
+    parser.add_argument(
+        "--order", default="auto", choices=("auto", "pattern-major", "shot-major"), help="pattern order"
+    )
+    parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
+    parser.add_argument("--backend", default="auto", choices=("auto", "table", "onnx"), help="decision back end")
+    parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
+    parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
+
+
+def _configure_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", type=Path, help="a trained bundle (.pans)")
+    parser.add_argument(
+        "--device", required=True, help="device URL, for example serial:/dev/ttyACM0 or sim:ideal?pace=fast"
+    )
+    parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
+    parser.add_argument("--record", type=Path, help="recording to write (default: run.pansrec in --out)")
+    parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
+    _configure_common(parser, trials=1)
+
+
+def _configure_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated detector (default 1)")
+    parser.add_argument(
+        "--pace", default="real", choices=("real", "fast"), help="real time in a process of its own, or virtual"
+    )
+    parser.add_argument("--profile", default=DEMO_PROFILE, help=f"hardware profile (default {DEMO_PROFILE})")
+    _configure_common(parser, trials=DEMO_TRIALS)
+
+
+def _run(args: argparse.Namespace) -> int:
+    profile = args.profile or _profile_of(args.device)
+    out = args.out or (args.record.parent if args.record else Path("pans-run"))
+    return _execute(args, _job(args, args.bundle, args.device, profile, out, args.decisions, args.record))
+
+
+def _demo(args: argparse.Namespace) -> int:
+    device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
+    bundle = Path(str(importlib.resources.files("pans.runtime") / "shipped" / DEMO_BUNDLE))
+    decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials
+    return _execute(args, _job(args, bundle, device, args.profile, args.out or Path("pans-demo"), decisions, None))
+
+
+def _job(
+    args: argparse.Namespace, bundle: Path, device: str, profile: str, out: Path, decisions: int, record: Path | None
+) -> Job:
+    for name in ("shots", "trials"):
+        if getattr(args, name) < 1:
+            raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
+    if args.seconds < 0 or decisions < 0 or args.deadline_us < 0 or args.dark_slots < 0:
+        raise UsageError("--seconds, --decisions, --deadline-us and --dark-slots must not be negative")
+    loaded = load_profile(profile)
+    return Job(
+        bundle_path=bundle,
+        device=device,
+        profile=loaded,
+        out=out,
+        shots=args.shots,
+        trials=args.trials,
+        decisions=decisions,
+        seconds=args.seconds,
+        deadline_us=args.deadline_us or loaded.timing.decision_deadline_us,
+        order=args.order,
+        dark_slots=args.dark_slots,
+        backend=args.backend,
+        realtime=not args.no_realtime,
+        record=record,
+        command=shlex.join(["pans", *sys.argv[1:]]),
+    )
+
+
+def _profile_of(device: str) -> str:
+    """A `sim:PROFILE?...` URL names its profile; a real instrument's must be given."""
+    if device.startswith("sim:"):
+        return device[4:].partition("?")[0]
+    raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
+
+
+class _Background(Generic[T]):
+    """Runs one call in a thread, so that a port can open while the compiled kernels load."""
+
+    def __init__(self, call: Callable[[], T]) -> None:
+        self._call = call
+        self._value: list[T] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        try:
+            self._value.append(self._call())
+        except BaseException as error:  # raised again by `result`, in the thread that waits for it
+            self._error = error
+
+    def result(self) -> T:
+        """Wait for the call; return its value or raise its error."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._value[0]
+
+
+def _execute(args: argparse.Namespace, job: Job) -> int:
+    started_ns = process_start_ns()
+    opening = _Background(lambda: open_link(job.device))
+    try:
+        from .bundle import load_bundle
+        from .container import read_file
+        from .decide import make_decider
+        from .live import live_view
+        from .loop import RunConfig, run_live
+        from .plan import build_plan
+        from .record import Recorder
+        from .report import summarise, write_markdown
+
+        bundle, bundle_sha256 = load_bundle(job.bundle_path)
+        plan = build_plan(
+            job.profile,
+            bundle,
+            shots_per_object=job.shots * job.trials,
+            dark_slots_per_cycle=job.dark_slots,
+            order=job.order,
+        )
+        decider = make_decider(bundle, shots=job.shots, backend=job.backend)
+        n_objects = -(-job.decisions // job.trials)
+        config = RunConfig(
+            job.shots,
+            n_objects * plan.cycles_per_object,
+            job.seconds,
+            job.deadline_us,
+            job.profile.timing.lease_ms,
+            job.realtime,
+        )
+        job.out.mkdir(parents=True, exist_ok=True)
+        recording = job.record or job.out / "run.pansrec"
+        expected = n_objects * job.trials
+        header = _header(job, bundle_sha256, decider.name, n_objects)
+    except BaseException:
+        _close_quietly(opening)
+        raise
+    link = opening.result()
+    with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
+        title = f"{bundle.name} on {job.profile.name}"
+        with live_view(title, bundle.classes, expected, link.simulated) as watch:
+            result = run_live(link, job.profile, bundle, plan, decider, config, recorder, watch, started_ns)
+        summary = summarise(result, illumination=bundle.illumination() * job.shots, expected_decisions=expected)
+        result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
+    page = job.out / "summary.md"
+    facts = {
+        "bundle": f"{bundle.name} ({job.bundle_path.name}, SHA-256 {bundle_sha256[:16]}…)",
+        "device": f"{job.device} (firmware {result.device.get('firmware', 'unknown')})",
+        "profile": f"{job.profile.name}: {job.profile.description}",
+        "decision back end": decider.name,
+        "recording": f"{recording} (decision log SHA-256 {result.decisions_sha256[:16]}…; `pans replay` recomputes it)",
+        "command": f"`{job.command}`",
+        "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
+    }
+    write_markdown(page, summary, facts, result.tally, bundle.classes)
+    payload = {
+        **summary,
+        "recording": str(recording),
+        "report": str(page),
+        "shots": job.shots,
+        "seed": getattr(args, "seed", None),
+    }
+    emit(args, payload, _closing_words(payload))
+    return _exit_code(summary)
+
+
+def process_start_ns() -> int:
+    """Return when this process started on the scale of time.perf_counter_ns (Linux), or now where that is not known."""
+    now_ns = time.perf_counter_ns()
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        ticks_hz = 100  # USER_HZ: fixed at 100 in the ABI of Linux
+        age_s = float(Path("/proc/uptime").read_text().split()[0]) - int(fields[19]) / ticks_hz
+        return now_ns - round(max(age_s, 0.0) * 1e9)
+    except (OSError, ValueError, IndexError):
+        return now_ns
+
+
+def _close_quietly(opening: _Background[Any]) -> None:
+    try:
+        opening.result().close()
+    except Exception as error:
+        say(f"pans: besides, the device could not be opened: {error}")
+
+
+def _header(job: Job, bundle_sha256: str, backend: str, n_objects: int) -> dict[str, Any]:
+    """What a recording must say to be understood alone; units are in the keys."""
+    import numba
+    import numpy
+    import onnxruntime
+
+    return {
+        "bundle_sha256": bundle_sha256,
+        "command": job.command,
+        "device_url": job.device,
+        "simulated": job.device.startswith("sim:"),
+        "profile": {"name": job.profile.name, "sha256": job.profile.sha256, "toml": job.profile.text},
+        "config": {
+            "shots": job.shots,
+            "trials": job.trials,
+            "objects": n_objects,
+            "seconds": job.seconds,
+            "deadline_us": job.deadline_us,
+            "order": job.order,
+            "dark_slots_per_cycle": job.dark_slots,
+            "backend": backend,
+            "tick_hz": job.profile.clock.tick_hz,
+            "realtime_requested": job.realtime,
+        },
+        "versions": {
+            "pans": __version__,
+            "python": platform.python_version(),
+            "numpy": numpy.__version__,
+            "numba": numba.__version__,
+            "onnxruntime": onnxruntime.__version__,
+            "platform": platform.platform(),
+        },
+    }
+
+
+def _closing_words(summary: dict[str, Any]) -> str:
+    banner = "SIMULATED · " if summary["simulated"] else ""
+    accuracy = "unknown" if summary["accuracy"] is None else f"{summary['accuracy']:.2%}"
+    clicks = summary["clicks_mean"] or 0.0
+    photons = "unknown" if summary["photons_mean"] is None else f"{summary['photons_mean']:.2f}"
+    latency = summary["latency_us"]
+    lines = [
+        f"{banner}{summary['verdict']}: {summary['decisions']} decisions ({summary['objects']} objects × {summary['trials']} trials)",
+        f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary['illumination']:.1f} each",
+        f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
+        f"max {latency['max']:.0f} us; late {summary['late']}, lost {summary['lost']}",
+        *(f"  fault         {fault}" for fault in summary["faults"]),
+        f"  recording     {summary['recording']}",
+        f"  report        {summary['report']}",
+    ]
+    return "\n".join(lines)
+
+
+def _exit_code(summary: dict[str, Any]) -> int:
+    if summary["ended"] == "interrupted":
+        return EXIT_INTERRUPTED
+    if summary["late"] or summary["lost"]:
+        return EXIT_TIMING
+    return EXIT_FINE if summary["verdict"] == "PASS" else EXIT_ALERT
+
+
+RUN = Command("decide on a device's clicks with a trained bundle, live", _configure_run, _run)
+DEMO = Command(
+    "the main job with nothing but the package: a simulated instrument, real images, timed decisions",
+    _configure_demo,
+    _demo,
+)

@@ -1,0 +1,151 @@
+"""The deterministic core: one stream frame in, decisions and events out; no I/O, no clock, no randomness.
+
+A live run, a replay and a simulation all drive this class with the same frames, so that a recording gives the same decisions bit
+for bit. `Core.step` returns an `Output`; a window that overlaps a gap gives a decision that is flagged and abstains, never a guess.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any, NamedTuple
+
+from .decide import Decider
+from .ingest import Gap, StreamTracker
+from .plan import Plan
+from .record import DecisionFlag
+from .window import DecisionWindows, Window
+from .wire import (
+    NO_OBJECT,
+    UNKNOWN_TRUTH,
+    ClickBlock,
+    DeviceState,
+    Frame,
+    MalformedMessage,
+    Mark,
+    MessageType,
+    StateReason,
+    decode_status,
+)
+
+NO_LABEL = 0xFFFF
+MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
+
+
+class Decision(NamedTuple):
+    """One row of the decision log, in the order of record.DECISION_DTYPE; `probability` is the winning class's softmax."""
+
+    number: int
+    tick: int
+    exposure_index: int
+    object: int
+    shot: int
+    clicks: int
+    label: int
+    truth: int
+    flags: int
+    probability: float
+    counts_crc: int
+
+
+class Output(NamedTuple):
+    """What one step produced; `block_end_tick` is the end of the last exposure seen, None if the frame held no exposures."""
+
+    decisions: list[Decision]
+    events: list[dict[str, Any]]
+    block_end_tick: int | None
+
+
+class Core:
+    """Stream tracker, windows and back end joined up, for one run of `n_cycles` cycles (0: until stopped) from `start_tick` on."""
+
+    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int) -> None:
+        self.start_tick = 0
+        self.completed = False
+        self.tracker = StreamTracker()
+        self.windows = DecisionWindows(plan, decider.n_features, shots)
+        self.shots = shots
+        self.marks: dict[int, Mark] = {}
+        self.n_decisions = 0
+        self.n_abstained = 0
+        self._decider = decider
+        self._exposure_ticks = plan.exposure_ticks
+        self._end_exposure = n_cycles * plan.slots_per_cycle if n_cycles else 1 << 63
+
+    def step(self, frame: Frame) -> Output:
+        """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
+        if frame.type == MessageType.STATUS:
+            return self._on_status(frame)
+        message, gap = self.tracker.accept(frame)
+        if message is None:
+            return Output([], [], None)
+        if isinstance(message, Mark):
+            self._remember(message)
+            return Output([], [], None)
+        events = [] if gap is None else [_gap_event(gap)]
+        n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
+        if message.exposure_index + n_exposures > self._end_exposure:
+            self.tracker.counters.malformed += 1
+            return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
+        end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
+        decisions = self._missed(message.exposure_index, message.tick)
+        decisions += [self._decide(window, end_tick) for window in self.windows.push(message)]
+        return Output(decisions, events, end_tick)
+
+    def warm_up(self) -> None:
+        """Run every compiled kernel of the hot path once, before arming."""
+        self.windows.warm_up()
+
+    def _on_status(self, frame: Frame) -> Output:
+        """When the device says that the plan is done, settle what will never be complete."""
+        try:
+            status = decode_status(frame.payload)
+        except MalformedMessage:
+            return Output([], [], None)
+        done = (status.state, status.reason) == (DeviceState.IDLE, StateReason.COMPLETED)
+        if self.completed or not done or status.tick < self.start_tick:  # an earlier run's news
+            return Output([], [], None)
+        self.completed = True
+        end = min(status.next_exposure, self._end_exposure)
+        gap = self.tracker.finish(end, status.drops)
+        return Output(self._missed(end, status.tick), [] if gap is None else [_gap_event(gap)], None)
+
+    def _remember(self, mark: Mark) -> None:
+        self.marks.pop(mark.object_index, None)
+        self.marks[mark.object_index] = mark
+        if len(self.marks) > MAX_MARKS:
+            del self.marks[next(iter(self.marks))]  # the one that was set longest ago
+
+    def _missed(self, exposure_index: int, tick: int) -> list[Decision]:
+        return [self._decide(window, tick) for window in self.windows.skip_to(exposure_index)]
+
+    def _decide(self, window: Window, tick: int) -> Decision:
+        flags, label, probability = DecisionFlag(0), NO_LABEL, 0.0
+        if window.missing:
+            flags |= DecisionFlag.GAP
+        if window.wrong:
+            flags |= DecisionFlag.WRONG_PATTERN
+        if flags:
+            flags |= DecisionFlag.ABSTAINED
+            self.n_abstained += 1
+        else:
+            label, probability = self._decider.decide(window.counts, self.shots)
+        mark = self.marks.get(window.object_index)
+        decision = Decision(
+            number=self.n_decisions,
+            tick=tick,
+            exposure_index=window.last_exposure,
+            object=window.object_index,
+            shot=window.first_shot,
+            clicks=int(window.counts.sum()),
+            label=label,
+            truth=UNKNOWN_TRUTH if mark is None or window.object_index == NO_OBJECT else mark.truth,
+            flags=int(flags),
+            probability=probability,
+            counts_crc=zlib.crc32(window.counts.tobytes()),
+        )
+        self.n_decisions += 1
+        return decision
+
+
+def _gap_event(gap: Gap) -> dict[str, Any]:
+    return {"kind": "gap", **gap._asdict()}

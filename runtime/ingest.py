@@ -1,0 +1,102 @@
+"""Stream messages -> blocks in order, with every gap made visible.
+
+Owns the stream's sequence and the loss accounting; never retransmits, never decides. `StreamTracker.accept` returns the block or
+mark of a stream frame (None when it is damaged or repeated) and the gap before it (None when there is none).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from . import wire
+from .wire import ClickBlock, Frame, FrameBlock, Mark, MessageType
+
+SEQUENCE = 1 << 32
+HALF_SEQUENCE = 1 << 31
+
+
+class Gap(NamedTuple):
+    """Exposures that will never arrive: from `first_exposure` on, `exposures` of them, `dropped_by_device` of those on the device."""
+
+    first_exposure: int
+    exposures: int
+    messages: int
+    dropped_by_device: int
+
+
+@dataclass(slots=True)
+class StreamCounters:
+    """Totals since ARM. `lost_exposures` includes those that the device dropped."""
+
+    messages: int = 0
+    exposures: int = 0
+    gaps: int = 0
+    lost_messages: int = 0
+    lost_exposures: int = 0
+    device_drops: int = 0
+    repeated: int = 0
+    malformed: int = 0
+
+
+class StreamTracker:
+    """Follows one stream from ARM on; sequence numbers and drop counters may wrap."""
+
+    def __init__(self) -> None:
+        self.counters = StreamCounters()
+        self.next_seq = 0
+        self.next_exposure = 0
+        self._drops = 0
+        self._lost_messages = 0  # since the last click block: reported with the next gap in the exposures
+
+    def accept(self, frame: Frame) -> tuple[ClickBlock | FrameBlock | Mark | None, Gap | None]:
+        """Take one stream frame; see the module's docstring."""
+        try:
+            message = _decode(frame)
+        except wire.MalformedMessage:
+            self.counters.malformed += 1
+            return None, None
+        ahead = (message.seq - self.next_seq) % SEQUENCE
+        if ahead >= HALF_SEQUENCE:  # seen before, or overtaken: a late photon is useless
+            self.counters.repeated += 1
+            return None, None
+        self._lost_messages += ahead
+        self.counters.lost_messages += ahead
+        self.counters.messages += 1
+        self.next_seq = (message.seq + 1) % SEQUENCE
+        if isinstance(message, Mark):
+            return message, None
+        n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
+        if message.exposure_index < self.next_exposure:  # a device that counts backwards: never let it rewrite the past
+            self.counters.malformed += 1
+            return None, None
+        gap = self._gap_before(message.exposure_index, message.drops)
+        self.next_exposure = message.exposure_index + n_exposures
+        self.counters.exposures += n_exposures
+        return message, gap
+
+    def finish(self, next_exposure: int, drops: int) -> Gap | None:
+        """Close the stream: the device says it stopped before `next_exposure`; return the gap at the end, if any."""
+        return self._gap_before(next_exposure, drops) if next_exposure > self.next_exposure else None
+
+    def _gap_before(self, exposure_index: int, drops: int) -> Gap | None:
+        missing = exposure_index - self.next_exposure
+        dropped = (drops - self._drops) % SEQUENCE
+        self._drops = drops
+        self.counters.device_drops += dropped
+        lost_messages, self._lost_messages = self._lost_messages, 0
+        if missing == 0:
+            return None
+        self.counters.gaps += 1
+        self.counters.lost_exposures += missing
+        return Gap(self.next_exposure, missing, lost_messages, min(dropped, missing))
+
+
+def _decode(frame: Frame) -> ClickBlock | FrameBlock | Mark:
+    if frame.type == MessageType.CLICKS:
+        return wire.decode_clicks(frame.payload)
+    if frame.type == MessageType.FRAMES:
+        return wire.decode_frames(frame.payload)
+    if frame.type == MessageType.MARK:
+        return wire.decode_mark(frame.payload)
+    raise wire.MalformedMessage(f"type {frame.type:#04x} is no stream message")

@@ -1,0 +1,154 @@
+"""The summary of a run: the JSON of the contract, the verdict, and a Markdown page for people.
+
+Owns how results are worded; never measures. `summarise` returns the JSON object, `write_markdown` writes the page beside and
+renames it. A simulated run says SIMULATED in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from .container import replace_file
+from .loop import RunResult
+from .tally import RunTally
+
+
+def summarise(result: RunResult, *, illumination: float, expected_decisions: int) -> dict[str, Any]:
+    """Return the run's figures under the contract's keys; `illumination` is per decision, in photoelectrons per unit transmission."""
+    tally, timing = result.tally, result.timing
+    faults = find_faults(result, expected_decisions)
+    return {
+        **tally.summary(),
+        "illumination": illumination,
+        "late": timing.late,
+        "late_blame": timing.blame,
+        "lost": result.stream["lost_exposures"],
+        "latency_us": timing.total.summary(),
+        "stage_latency_us": {name: histogram.summary() for name, histogram in timing.stages.items()},
+        "deadline_us": timing.deadline_ns / 1000,
+        "clock": result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
+        "slot_jitter_us": result.slot_jitter_us,
+        "wrong_patterns": result.wrong_patterns,
+        "dark": asdict(result.dark),
+        "stream": result.stream,
+        "link": result.decoder,
+        "realtime": result.realtime,
+        "device": _plain_device(result.device),
+        "armed_after_s": result.armed_after_s,
+        "seconds": result.seconds,
+        "ended": result.ended,
+        "decisions_sha256": result.decisions_sha256,
+        "simulated": bool(result.device.get("simulated")),
+        "verdict": "FAIL" if faults else "PASS",
+        "faults": faults,
+    }
+
+
+def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
+    """Return one sentence for each way in which the run broke its promise; empty means PASS."""
+    tally, timing, stream = result.tally, result.timing, result.stream
+    faults = []
+    if timing.late:
+        blame = ", ".join(f"{stage} {count}" for stage, count in sorted(timing.blame.items()))
+        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (slowest stage: {blame})")
+    if stream["lost_exposures"]:
+        faults.append(
+            f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "
+            f"{stream['device_drops']} of them dropped by the device"
+        )
+    if result.wrong_patterns:
+        faults.append(f"{result.wrong_patterns} exposures showed another pattern than planned")
+    if tally.abstained:
+        faults.append(f"{tally.abstained} decisions abstained")
+    if expected_decisions and tally.decisions != expected_decisions:
+        faults.append(f"{tally.decisions} of {expected_decisions} decisions were made; the run ended: {result.ended}")
+    if result.dark.alarm:
+        faults.append(result.dark.alarm)
+    return faults
+
+
+def write_markdown(
+    path: Path, summary: Mapping[str, Any], facts: Mapping[str, Any], tally: RunTally, classes: Sequence[str]
+) -> None:
+    """Write the summary page; `facts` are name -> text lines about what was run (bundle, profile, device, command)."""
+    simulated = " (SIMULATED)" if summary["simulated"] else ""
+    lines = [f"# Run of {facts.get('bundle', 'a bundle')}{simulated}", ""]
+    if summary["simulated"]:
+        lines += ["> **SIMULATED**: the clicks come from a simulated instrument, not from light.", ""]
+    lines += [f"**{summary['verdict']}**" + "".join(f"\n- {fault}" for fault in summary["faults"]), ""]
+    lines += [*_figures(summary), "", *_timing(summary), "", *_confusion(tally, classes), "", "## What was run", ""]
+    lines += [f"- {name}: {text}" for name, text in facts.items()]
+    replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def _figures(summary: Mapping[str, Any]) -> list[str]:
+    rows = [
+        ("accuracy", _percent(summary["accuracy"])),
+        ("spread over trials (standard deviation)", _percent(summary["accuracy_std_trials"])),
+        ("spread over objects (standard error)", _percent(summary["accuracy_stderr_objects"])),
+        ("objects × trials", f"{summary['objects']} × {summary['trials']}"),
+        ("decisions (abstained)", f"{summary['decisions']} ({summary['abstained']})"),
+        ("clicks per decision", _number(summary["clicks_mean"])),
+        ("photons per decision (expected photoelectrons)", _number(summary["photons_mean"])),
+        ("illumination per decision (sum of pattern intensities)", _number(summary["illumination"])),
+        (
+            "dark clicks per dark exposure",
+            f"{summary['dark']['clicks']} in {summary['dark']['exposures']}, 95 % interval "
+            f"{summary['dark']['low']:.2g} to {summary['dark']['high']:.2g}, profile {summary['dark']['expected']:.2g}",
+        ),
+    ]
+    return ["## Results", "", "| figure | value |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in rows)]
+
+
+def _timing(summary: Mapping[str, Any]) -> list[str]:
+    head = [
+        "## Timing",
+        "",
+        "Microseconds; from the end of the last exposure (device clock) to the decision, and by stage.",
+        "",
+    ]
+    table = ["| stage | p50 | p99 | p99.9 | max |", "| --- | --- | --- | --- | --- |"]
+    stages = {"**exposure end to decision**": summary["latency_us"], **summary["stage_latency_us"]}
+    for name, row in stages.items():
+        table.append(f"| {name} | {row['p50']:.0f} | {row['p99']:.0f} | {row['p999']:.0f} | {row['max']:.0f} |")
+    granted = (
+        ", ".join(f"{what}: {answer}" for what, answer in summary["realtime"].items())
+        or "virtual time: nothing asked for"
+    )
+    tail = [
+        "",
+        f"- deadline {summary['deadline_us']:.0f} us: {summary['late']} late; {summary['lost']} exposures lost",
+        f"- clock: uncertainty at most {summary['clock']['worst_uncertainty_us']:.0f} us, "
+        f"drift {summary['clock'].get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary['slot_jitter_us']:.1f} us",
+        f"- armed {summary['armed_after_s']:.2f} s after the start; measured for {summary['seconds']:.1f} s; ended: {summary['ended']}",
+        f"- real-time set-up: {granted}",
+    ]
+    return head + table + tail
+
+
+def _confusion(tally: RunTally, classes: Sequence[str]) -> list[str]:
+    if tally.accuracy is None:
+        return []
+    head = ["## Decisions by class", "", "Rows: truth; columns: decision.", "", "| | " + " | ".join(classes) + " |"]
+    rule = "| --- |" + " --- |" * len(classes)
+    body = [
+        f"| **{name}** | " + " | ".join(str(n) if n else "·" for n in row) + " |"
+        for name, row in zip(classes, tally.confusion)
+    ]
+    return [*head, rule, *body]
+
+
+def _percent(value: float | None) -> str:
+    return "unknown" if value is None else f"{100 * value:.2f} %"
+
+
+def _number(value: float | None) -> str:
+    return "unknown (the instrument does not know)" if value is None or math.isnan(value) else f"{value:.3f}"
+
+
+def _plain_device(device: Mapping[str, Any]) -> dict[str, Any]:
+    return {str(key): value for key, value in device.items() if isinstance(value, (str, int, float, bool))}

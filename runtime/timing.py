@@ -1,0 +1,154 @@
+"""The timing contract: latency histograms per stage, deadlines, and the real-time set-up of the process.
+
+Owns how time is judged, never what is done about it. Latencies count from the device's tick, not from when the host got around to
+looking, so a stalled host cannot hide its own delay (coordinated omission). `LatencyHistogram.summary` returns microseconds;
+`arm_realtime` returns what was asked for against what was granted.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+SUB_BITS = 5  # 32 steps per octave: a quantile is at most 3.2 % above the true value
+N_BUCKETS = 64 << SUB_BITS
+SWITCH_INTERVAL_S = 0.0005
+FIFO_PRIORITY = 10
+MCL_CURRENT, MCL_FUTURE = 1, 2
+
+
+class LatencyHistogram:
+    """Log-linear counts of durations in ns; integer, exact maximum, no allocation in `add`."""
+
+    def __init__(self) -> None:
+        self.counts = [0] * N_BUCKETS
+        self.total = 0
+        self.max_ns = 0
+
+    def add(self, duration_ns: int) -> None:
+        """Count one duration; negative ones (clock uncertainty) count as 0."""
+        value = duration_ns if duration_ns > 0 else 0
+        shift = max(value.bit_length() - SUB_BITS - 1, 0)
+        self.counts[(shift << SUB_BITS) + (value >> shift)] += 1
+        self.total += 1
+        if value > self.max_ns:
+            self.max_ns = value
+
+    def quantile_ns(self, q: float) -> int:
+        """Return the upper edge of the bucket that holds quantile `q` (never above the exact maximum); 0 without data."""
+        wanted = max(1, -int(-q * self.total // 1))
+        seen = 0
+        for bucket, count in enumerate(self.counts):
+            seen += count
+            if count and seen >= wanted:
+                return min(_upper_edge(bucket), self.max_ns)
+        return 0
+
+    def summary(self) -> dict[str, float]:
+        """Return {p50, p99, p999, max} in microseconds."""
+        edges = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+        return {name: self.quantile_ns(q) / 1000 for name, q in edges.items()} | {"max": self.max_ns / 1000}
+
+
+def _upper_edge(bucket: int) -> int:
+    if bucket < 2 << SUB_BITS:
+        return bucket
+    shift = (bucket >> SUB_BITS) - 1
+    return ((bucket - (shift << SUB_BITS) + 1) << shift) - 1
+
+
+STAGES = ("link", "decode", "decide", "record")
+
+
+@dataclass(slots=True)
+class TimingLedger:
+    """Latencies per stage and in total, late decisions and the stage that each one is blamed on.
+
+    link: end of the last exposure (device tick, converted) -> bytes read; decode: -> message ready; decide: -> decision made;
+    record: -> handed to the recorder. A decision is late when its total, less the clock's uncertainty, exceeds the deadline.
+    """
+
+    deadline_ns: int
+    total: LatencyHistogram = field(default_factory=LatencyHistogram)
+    stages: dict[str, LatencyHistogram] = field(default_factory=lambda: {name: LatencyHistogram() for name in STAGES})
+    late: int = 0
+    blame: dict[str, int] = field(default_factory=dict)
+    worst_uncertainty_ns: int = 0
+
+    def judge(self, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> bool:
+        """Take the times of (device end, arrival, decoded, decided, recorded); return True when the decision is late."""
+        steps = [later - earlier for earlier, later in pairwise(marks_ns)]
+        for name, step in zip(STAGES, steps):
+            self.stages[name].add(step)
+        latency = marks_ns[3] - marks_ns[0]
+        self.total.add(latency)
+        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, uncertainty_ns)
+        if latency - uncertainty_ns <= self.deadline_ns:
+            return False
+        self.late += 1
+        slowest = max(range(3), key=lambda stage: steps[stage])
+        self.blame[STAGES[slowest]] = self.blame.get(STAGES[slowest], 0) + 1
+        return True
+
+
+@contextmanager
+def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
+    """Ask for a steady process while the loop runs; yield {what: "granted" or the reason why not}, undo it afterwards.
+
+    The garbage collector is frozen and switched off in any case: a collection costs milliseconds with numba loaded. With `wanted`,
+    SCHED_FIFO (for this thread and `other_threads`, by native id) and locked memory are asked for; both need privileges, and
+    neither is needed to be correct.
+    """
+    granted: dict[str, Any] = {}
+    interval = sys.getswitchinterval()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    granted["gc_off"] = "granted"
+    granted["switch_interval_s"] = SWITCH_INTERVAL_S
+    threads = [0, *other_threads]
+    if wanted:
+        granted["sched_fifo"] = _request_fifo(threads)
+        granted["mlockall"] = _request_mlockall()
+    try:
+        yield granted
+    finally:
+        sys.setswitchinterval(interval)
+        gc.enable()
+        gc.unfreeze()
+        if granted.get("sched_fifo") == "granted":
+            _set_scheduler(threads, "SCHED_OTHER", 0)
+        if granted.get("mlockall") == "granted":
+            ctypes.CDLL(None).munlockall()
+
+
+def _request_fifo(threads: Sequence[int]) -> str:
+    if not hasattr(os, "sched_setscheduler"):
+        return "this system has no SCHED_FIFO"
+    try:
+        _set_scheduler(threads, "SCHED_FIFO", FIFO_PRIORITY)
+    except OSError as error:
+        return f"refused: {error.strerror}"
+    return "granted"
+
+
+def _set_scheduler(threads: Sequence[int], policy: str, priority: int) -> None:
+    for thread in threads:
+        os.sched_setscheduler(thread, getattr(os, policy), os.sched_param(priority))
+
+
+def _request_mlockall() -> str:
+    if sys.platform != "linux":
+        return "not asked for on this system"
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(MCL_CURRENT | MCL_FUTURE) == 0:
+        return "granted"
+    return f"refused: {os.strerror(ctypes.get_errno())}"
