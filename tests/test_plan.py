@@ -12,6 +12,7 @@ from pans.runtime.bundle import Bundle, make_bundle
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.plan import DARK_PATTERN, MAX_BLOCK_EXPOSURES, NO_SHOT, Plan, build_plan, exposure_us
 from pans.runtime.profile import Profile, load_profile
+from pans.runtime.wire import MAX_PAYLOAD_BYTES
 
 OLED, DMD, WDM, IDEAL = (load_profile(name) for name in ("oled-qcmos", "dmd-spad", "wdm-snspd", "ideal"))
 
@@ -164,6 +165,17 @@ def test_blocks_do_not_outgrow_a_message():
     plan = build_plan(IDEAL, bundle_for(IDEAL, 2, 10.0), shots_per_object=5000, order="pattern-major")
     assert max(len(block) for block in blocks_of(plan)) == 1000
     assert len(blocks_of(plan)) == 15
+
+
+def test_a_block_of_wide_frames_fits_into_a_message():
+    wide = replace(
+        WDM, detector=replace(WDM.detector, channels=4096), projector=replace(WDM.projector, pattern_memory=4096)
+    )
+    wide = replace(wide, timing=replace(wide.timing, decision_deadline_us=1e6))
+    plan = build_plan(wide, bundle_for(wide, 4096, 1.0), shots_per_object=5000)
+    assert 20 <= plan.block_exposures <= MAX_PAYLOAD_BYTES // 512
+    narrow = build_plan(wide, bundle_for(wide, 8, 1.0), shots_per_object=5000)
+    assert narrow.block_exposures == 1001  # 5001 frames in five blocks
 
 
 def refusal(profile: Profile, bundle: Bundle, **asked: object) -> PlanError:
