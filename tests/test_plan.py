@@ -230,6 +230,11 @@ def test_refuses_light_that_is_too_bright_and_names_the_filter():
     assert "optical density 1.00" in error.remedy
 
 
+@pytest.mark.parametrize("exposure", [599.9, 3000.1])
+def test_refuses_what_is_only_just_out_of_range(exposure):
+    assert f"takes {exposure} us" in refusal(OLED, bundle_for(OLED, 2, exposure)).message
+
+
 def test_the_ends_of_the_exposure_range_are_allowed():
     for profile in (OLED, DMD, WDM, IDEAL):
         for exposure in (profile.exposure.min_us, profile.exposure.max_us):

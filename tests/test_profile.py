@@ -136,6 +136,8 @@ def test_only_contrast_may_be_infinite():
         ("detector.dark_rate_hz", "dark_rate_hz = -0.1", ["from 0 to", "found -0.1"]),
         ("detector.dark_rate_hz", "dark_rate_hz = inf", ["found inf"]),
         ("detector.dark_rate_hz", "dark_rate_hz = [1.0]", ["found a list"]),
+        ("detector.channels", "channels = true", ["a whole number", "found the boolean true"]),
+        ("detector.efficiency", "efficiency = true", ["a number", "found the boolean true"]),
         ("detector.channels", "channels = 4", ["must be 1 in sequential mode", "found 4"]),
         ("exposure.min_us", "min_us = 2000.0", ["at most exposure.max_us = 1000", "found 2000"]),
         ("exposure.min_us", "min_us = 9.0", ["at least 10 ticks = 10 us", "found 9"]),
