@@ -110,7 +110,8 @@ def make_bundle(
     """
     try:
         quantised = _as_levels(pattern_levels, levels)
-        given = None if table is None else np.array(table, dtype=np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
+            given = None if table is None else np.array(table, dtype=np.float32)
         means, scores, given = _evaluate_back_end(head_onnx, given, len(quantised), len(classes))
         bundle = Bundle(
             name=name,

@@ -18,6 +18,7 @@ from .container import FILE_MAX_BYTES, MIB
 MAGIC = b"PANSRECD"
 FORMAT_VERSION = 1
 MESSAGE_MAX_BYTES = MIB
+NO_LABEL = 0xFFFF  # the label of a decision that abstained
 MESSAGE = struct.Struct("<qI")
 
 
