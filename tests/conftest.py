@@ -1,0 +1,22 @@
+"""Fixtures that several test files share; what needs data or torch says so when it is skipped."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if os.environ.get("PANS_DATA"):
+        return
+    skip = pytest.mark.skip(reason="needs the IDX data sets: set PANS_DATA to the folder that holds mnist/ and fashion-mnist/")
+    for item in items:
+        if "data" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    return Path(os.environ["PANS_DATA"])
