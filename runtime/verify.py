@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bundle import MAGIC as BUNDLE_MAGIC
 from .bundle import Bundle, golden_violation, load_bundle, parse_bundle, word_means
+from .bundle_format import MAGIC as BUNDLE_MAGIC
 from .decide import make_decider
 from .errors import ConfigError, DamagedFileError, PansError, UsageError
 from .profile import load_profile, parse_profile, shipped_profiles

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.runtime import bundle as bundle_module
+from pans.runtime import bundle_format
 from pans.runtime.bundle import Bundle, bundle_bytes, load_bundle, make_bundle, parse_bundle, word_means, write_bundle
 from pans.runtime.errors import DamagedFileError, UsageError
 
@@ -212,7 +212,7 @@ def test_limits_come_before_allocation(tmp_path: Path, monkeypatch: pytest.Monke
         file.truncate((256 << 20) + 1)  # sparse
     with pytest.raises(DamagedFileError, match="allowed at most"):
         load_bundle(huge)
-    monkeypatch.setattr(bundle_module, "FILE_MAX_BYTES", 100)
+    monkeypatch.setattr(bundle_format, "FILE_MAX_BYTES", 100)
     with pytest.raises(UsageError, match="allowed"):
         bundle_bytes(small_bundle())
 

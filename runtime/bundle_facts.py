@@ -1,0 +1,174 @@
+"""What a bundle is, and what makes one impossible: facts, limits, consistency, golden vectors.
+
+Owns the checks that a made and a read bundle share; never touches a file. The checks raise ValueError with what, found and
+allowed, for the caller to say where.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .head import HEAD_MAX_BYTES
+
+ENCODERS = ("active",)
+FEATURES_MAX = 4096
+PIXELS_MAX = 1 << 22
+LEVELS_MAX = 65536
+CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
+TEXT_MAX_CHARACTERS = 200
+TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
+GOLDEN_MAX = 4096
+GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """What a run needs to know of a trained sensor; its arrays are read-only. `make_bundle` makes one."""
+
+    name: str
+    task: str
+    classes: tuple[str, ...]
+    encoder: str
+    image_shape: tuple[int, int]
+    levels: int
+    pattern_levels: NDArray[np.uint16]  # (d_f, pixels), each below `levels`
+    photons_per_level: float  # photoelectrons per exposure, per level, per unit transmission
+    head_onnx: bytes | None  # float32 (n, d_f) click means in [0, 1] -> float32 (n, classes) scores
+    table: NDArray[np.float32] | None  # (2**d_f, classes); bit i of the row index is the click of pattern i
+    golden_means: NDArray[np.float32]  # (g, d_f)
+    golden_scores: NDArray[np.float32]  # (g, classes)
+    provenance: Mapping[str, Any]
+
+    @property
+    def n_features(self) -> int:
+        """Number of patterns, d_f."""
+        return int(self.pattern_levels.shape[0])
+
+    @property
+    def n_pixels(self) -> int:
+        """Number of pixels of one pattern."""
+        return int(self.pattern_levels.shape[1])
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes."""
+        return len(self.classes)
+
+    def patterns(self) -> NDArray[np.float64]:
+        """Return the patterns (d_f, pixels), float64, in photoelectrons per exposure per unit transmission."""
+        return self.pattern_levels.astype(np.float64) * self.photons_per_level
+
+    def illumination(self) -> float:
+        """Return the sum of all pattern intensities of one shot, in photoelectrons per unit transmission."""
+        return int(self.pattern_levels.sum(dtype=np.uint64)) * self.photons_per_level
+
+
+def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32]) -> str:
+    """Return what differs between scores (g, classes) and the golden ones, or "" if nothing does.
+
+    Scores agree within 1e-5 * max(1, |score|), and the decision is the same wherever the golden margin exceeds that.
+    """
+    if found.shape != golden.shape:
+        return f"scores of shape {found.shape}, expected {golden.shape}"
+    wanted = golden.astype(np.float64)
+    scale = np.maximum(1.0, np.abs(wanted))
+    error = np.abs(found.astype(np.float64) - wanted) / scale
+    if not np.all(error <= GOLDEN_TOLERANCE):  # a NaN fails too
+        row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
+        worst = float(error[row].max())
+        return f"the scores of vector {row} are off by {worst:.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
+    ranked = np.sort(wanted, axis=1)
+    clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale.max(axis=1)
+    differs = clear & (found.argmax(axis=1) != golden.argmax(axis=1))
+    if differs.any():
+        row = int(np.argmax(differs))
+        return f"the decision for vector {row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
+    return ""
+
+
+def row_index(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Table rows of means that are all 0 or 1."""
+    return means.astype(np.int64) @ (1 << np.arange(means.shape[1], dtype=np.int64))
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
+def demand(holds: bool, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
+def _check_text(text: Any, what: str) -> None:
+    fine = isinstance(text, str) and 0 < len(text) <= TEXT_MAX_CHARACTERS and text.isprintable()
+    demand(fine, f"{what} is {ascii(text)[:80]}, allowed: 1 to {TEXT_MAX_CHARACTERS} printable characters")
+
+
+def check_table_shape(shape: Sequence[int], n_features: int, n_classes: int) -> None:
+    demand(n_features <= TABLE_FEATURES_MAX, f"a table for {n_features} patterns, allowed at most {TABLE_FEATURES_MAX}")
+    wanted = (1 << n_features, n_classes)
+    demand(tuple(shape) == wanted, f"the table has shape {tuple(shape)}, allowed: (2**d_f, classes) = {wanted}")
+
+
+def _check_facts(bundle: Bundle) -> None:
+    _check_text(bundle.name, "name")
+    _check_text(bundle.task, "task")
+    demand(bundle.encoder in ENCODERS, f"encoder is {ascii(bundle.encoder)[:80]}, allowed: {', '.join(ENCODERS)}")
+    n_classes = len(bundle.classes)
+    demand(2 <= n_classes <= CLASSES_MAX, f"{n_classes} classes, allowed: 2 to {CLASSES_MAX}")
+    for name in bundle.classes:
+        _check_text(name, "a class name")
+    demand(len(set(bundle.classes)) == n_classes, "two classes have the same name, allowed: each name once")
+    demand(2 <= bundle.levels <= LEVELS_MAX, f"levels is {bundle.levels}, allowed: 2 to {LEVELS_MAX}")
+    scale = bundle.photons_per_level
+    demand(math.isfinite(scale) and scale > 0, f"photons_per_level is {scale}, allowed: finite and above 0")
+
+
+def check_bundle(bundle: Bundle) -> None:
+    """Raise ValueError at the first thing that is impossible in itself or does not fit the rest."""
+    _check_facts(bundle)
+    d_f, pixels = bundle.pattern_levels.shape
+    height, width = bundle.image_shape
+    demand(1 <= d_f <= FEATURES_MAX, f"{d_f} patterns, allowed: 1 to {FEATURES_MAX}")
+    demand(1 <= pixels <= PIXELS_MAX, f"{pixels} pixels, allowed: 1 to {PIXELS_MAX}")
+    fits = height > 0 and width > 0 and height * width == pixels
+    demand(fits, f"image_shape is {height}x{width}, but a pattern has {pixels} pixels")
+    top = int(bundle.pattern_levels.max())
+    demand(top < bundle.levels, f"a pattern level is {top}, allowed: 0 to {bundle.levels - 1}")
+    demand(
+        bundle.head_onnx is not None or bundle.table is not None, "neither a head nor a table, allowed: either or both"
+    )
+    if bundle.head_onnx is not None:
+        size = len(bundle.head_onnx)
+        demand(0 < size <= HEAD_MAX_BYTES, f"the head has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+    if bundle.table is not None:
+        check_table_shape(bundle.table.shape, d_f, bundle.n_classes)
+        demand(bool(np.isfinite(bundle.table).all()), "the table holds scores that are not finite")
+    _check_golden(bundle)
+
+
+def _check_golden(bundle: Bundle) -> None:
+    means, scores = bundle.golden_means, bundle.golden_scores
+    count = means.shape[0]
+    demand(1 <= count <= GOLDEN_MAX, f"{count} golden vectors, allowed: 1 to {GOLDEN_MAX}")
+    demand(
+        means.shape == (count, bundle.n_features), f"golden_means has shape {means.shape}, d_f is {bundle.n_features}"
+    )
+    wanted = (count, bundle.n_classes)
+    demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
+    demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
+    demand(bool(np.isfinite(scores).all()), "the golden scores are not finite (does the head answer NaN?)")
+    if bundle.table is not None:
+        binary = ((means == 0) | (means == 1)).all(axis=1)
+        found = bundle.table[row_index(means[binary])]
+        difference = golden_violation(found, scores[binary])
+        demand(not difference, f"the table does not answer the golden vectors: {difference}")
