@@ -18,7 +18,7 @@ from .errors import DamagedFileError
 
 HEAD_MAX_BYTES = 64 << 20
 _BATCH_ROWS = 65536
-_NESTING_MAX = 32
+_NESTING_MAX = 128  # protobuf messages within messages
 _REMEDY = (
     "export the head again: one float32 input (n, patterns), first output float32 (n, classes), weights inside the file"
 )
@@ -63,6 +63,16 @@ def open_head(head_onnx: bytes, n_features: int, n_classes: int, where: str) -> 
     """Return a session that maps float32 (n, n_features) to float32 (n, n_classes); DamagedFileError if it does not."""
     _refuse_external_data(head_onnx, where)
     session = _session(head_onnx, where)
+    try:
+        head = _describe(session, n_features, n_classes, where)
+    except UnicodeDecodeError as error:
+        raise _damaged(where, "a name in it is not UTF-8") from error
+    _try_out(head, where)
+    return head
+
+
+def _describe(session: Any, n_features: int, n_classes: int, where: str) -> OnnxHead:
+    """Check what the model declares of its inputs and outputs."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if len(inputs) != 1 or not outputs:
         names = ", ".join(_plain(item.name) for item in inputs)
@@ -73,20 +83,11 @@ def open_head(head_onnx: bytes, n_features: int, n_classes: int, where: str) -> 
     for item in (source, result):
         if item.type != "tensor(float)":
             raise _damaged(where, f"{_plain(item.name)} is a {item.type}, allowed: tensor(float)")
-    shape = list(source.shape)
-    fits = (
-        len(shape) == 2 and (not isinstance(shape[0], int) or shape[0] == 1) and shape[1] in _free_or(shape, n_features)
-    )
-    if not fits:
+    shape = list(source.shape)  # an int is fixed; a name or None is free
+    fixed = [n if isinstance(n, int) else None for n in shape]
+    if len(fixed) != 2 or fixed[0] not in (None, 1) or fixed[1] not in (None, n_features):
         raise _damaged(where, f"the input has the shape {_plain(shape)}, allowed: (n or 1, {n_features})")
-    head = OnnxHead(session, source.name, result.name, n_features, n_classes, shape[0] == 1)
-    _try_out(head, where)
-    return head
-
-
-def _free_or(shape: list[Any], wanted: int) -> tuple[Any, ...]:
-    """The values that the second dimension may have: the wanted one, or whatever symbol leaves it open."""
-    return (wanted,) if isinstance(shape[1], int) else (shape[1],)
+    return OnnxHead(session, source.name, result.name, n_features, n_classes, shape[0] == 1)
 
 
 def _session(head_onnx: bytes, where: str) -> Any:
@@ -102,7 +103,10 @@ def _session(head_onnx: bytes, where: str) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     try:
-        return onnxruntime.InferenceSession(head_onnx, options, providers=["CPUExecutionProvider"])
+        # its own fall-back would try the same again and print about it on stdout, where our JSON belongs
+        return onnxruntime.InferenceSession(
+            head_onnx, options, providers=["CPUExecutionProvider"], enable_fallback=False
+        )
     except Exception as error:  # onnxruntime raises a dozen unrelated classes
         raise _damaged(where, f"onnxruntime refuses it: {_plain(error)}") from error
 
@@ -135,8 +139,8 @@ def _refuse_external_data(model: bytes, where: str) -> None:
     pending: list[tuple[str, memoryview, int]] = [("model", memoryview(model), 0)]
     while pending:
         kind, data, depth = pending.pop()
-        if depth > _NESTING_MAX * 4:
-            raise _damaged(where, f"graphs nested more than {_NESTING_MAX} deep")
+        if depth > _NESTING_MAX:
+            raise _damaged(where, f"messages nested more than {_NESTING_MAX} deep")
         for number, value in _fields(data, where):
             external = number == _TENSOR_EXTERNAL_DATA or (number == _TENSOR_DATA_LOCATION and value != 0)
             if kind == "tensor" and external:
