@@ -292,6 +292,7 @@ def hostile_heads() -> dict[str, tuple[bytes, str]]:
         ),
         "a name that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"means", b"\xf0eans"), "ONNX head"),
         "an initial that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"n", b"\xad"), "ONNX head"),
+        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "refuses it"),
         "unknown operator": (head([helper.make_node("Teleport", ["x"], ["y"])], [x], [y]), "onnxruntime"),
     }
 
@@ -309,7 +310,7 @@ def hostile_heads() -> dict[str, tuple[bytes, str]]:
             "fixed batch of two",
         ),
         *("doubles", "labels for scores", "two inputs", "rows mixed", "weights elsewhere", "unknown operator"),
-        *("a name that is no text", "an initial that is no text"),
+        *("a name that is no text", "an initial that is no text", "an operator that is no text"),
     ],
 )
 def test_hostile_heads_are_refused_with_the_reason(kind: str, capfd: pytest.CaptureFixture[str]) -> None:
