@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -109,7 +110,7 @@ def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, 
         print(f"pans {__version__}")
         return EXIT_FINE
     if wanted is not None:
-        near = [name for name in commands if name.startswith(wanted[:2])]
+        near = get_close_matches(wanted, commands, n=2)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         say(f"pans: unknown command {wanted!r}\n  remedy: {hint}`pans` lists the commands")
         return EXIT_USAGE
@@ -119,6 +120,8 @@ def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, 
             summary = _load(commands[name]).help
         except UsageError as error:
             summary = f"({error.remedy})"
+        except Exception as error:  # one package's broken command must not hide all the others
+            summary = f"(cannot be loaded: {error})"
         print(f"  {name:<10} {summary}")
     print("\n`pans COMMAND --help` lists a command's options. Start with `pans demo`.")
     return EXIT_FINE

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from . import __version__
-from .cli import EXIT_ALERT, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
+from .cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
 from .errors import UsageError
 from .link import open_link
 from .profile import Profile, load_profile
@@ -303,6 +303,8 @@ def _closing_words(summary: dict[str, Any]) -> str:
 def _exit_code(summary: dict[str, Any]) -> int:
     if summary["ended"] == "interrupted":
         return EXIT_INTERRUPTED
+    if summary["link_lost"]:
+        return EXIT_DEVICE
     if summary["late"] or summary["lost"]:
         return EXIT_TIMING
     return EXIT_FINE if summary["verdict"] == "PASS" else EXIT_ALERT

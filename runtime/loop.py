@@ -3,7 +3,7 @@
     handshake -> check -> upload -> clock -> [arm] -> pump -> core.step -> judge the timing -> record -> show -> ... -> stop -> close
 
 Owns the order of things and the ends of a run; the physics, the protocol and the decisions live in the modules it calls.
-`run_live` returns a `RunResult`; a device that is silent, refuses or goes away ends in LinkError with the recording closed and whole.
+`run_live` returns a `RunResult`, also when the link is lost on the way (`link_lost`); a device that cannot be armed raises LinkError.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from .connection import Arrived, Connection, check_device
 from .core import Core, Output
 from .dark import DarkMonitor, DarkReport
 from .decide import Decider
+from .errors import LinkError
 from .link import Link, link_facts
 from .plan import Plan
 from .profile import Profile
@@ -37,6 +38,7 @@ RECEIVE_WINDOW = 4096  # stream messages
 FLUSH_EVERY_NS = 500 * NS_PER_MS
 POLL_S = 0.02
 SILENCE_NS = 5 * NS_PER_S
+STOP_GIVE_UP_NS = 1 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,7 @@ class RunResult:
     armed_after_s: float
     seconds: float
     ended: str
+    link_lost: bool
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
 
@@ -108,6 +111,8 @@ def run_live(
                     run.turn(watch)
             except KeyboardInterrupt:
                 run.ended = "interrupted"
+            except LinkError as error:
+                run.lose_link(error)
             run.stop()
         return run.result(dict(welcome.facts) | link_facts(link))
     finally:
@@ -133,6 +138,7 @@ class LiveRun:
         self.realtime: dict[str, Any] = {}
         self.clock: ClockModel | None = None
         self.ended = ""
+        self.link_lost = False
         self._connection, self._plan, self._config, self._recorder = connection, plan, config, recorder
         self._now = connection.link.now_ns
         expected_dark = float(click_probability(click_law(profile, plan.exposure_us), 0.0))
@@ -160,11 +166,20 @@ class LiveRun:
         self._renew(now_ns)
 
     def stop(self) -> None:
-        """Tell the device to go dark and settle what it will not send any more."""
+        """Tell the device to go dark. One that does not answer any more does so by itself when its lease runs out."""
         session = self._connection.session
-        session.submit(Opcode.STOP)
-        while not session.settled:
-            self._take(self._connection.pump(POLL_S))
+        give_up_ns = self._now() + STOP_GIVE_UP_NS
+        try:
+            session.submit(Opcode.STOP)
+            while not session.settled and self._now() < give_up_ns:
+                self._take(self._connection.pump(POLL_S))
+        except LinkError as error:
+            self.lose_link(error)
+
+    def lose_link(self, error: LinkError) -> None:
+        """End the run because the link is gone; what was decided so far stands."""
+        self.ended = self.ended or f"the link was lost: {error.message}"
+        self.link_lost = True
 
     # -- one turn ------------------------------------------------------------------------------------------------------
 
@@ -244,6 +259,7 @@ class LiveRun:
         if self._config.seconds and now_ns - self._start_ns >= self._config.seconds * NS_PER_S:
             return "time is up"
         if now_ns - self._last_data_ns > SILENCE_NS + self._plan.cycle_us * NS_PER_US:
+            self.link_lost = True
             return "the device fell silent"
         return ""
 
@@ -277,6 +293,7 @@ class LiveRun:
             armed_after_s=self._armed_after_s,
             seconds=(self._now() - self._start_ns) / NS_PER_S,
             ended=self.ended,
+            link_lost=self.link_lost,
             events=self._events,
         )
         return result

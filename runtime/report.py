@@ -41,6 +41,7 @@ def summarise(result: RunResult, *, illumination: float, expected_decisions: int
         "armed_after_s": result.armed_after_s,
         "seconds": result.seconds,
         "ended": result.ended,
+        "link_lost": result.link_lost,
         "decisions_sha256": result.decisions_sha256,
         "simulated": bool(result.device.get("simulated")),
         "verdict": "FAIL" if faults else "PASS",
@@ -52,6 +53,8 @@ def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
     """Return one sentence for each way in which the run broke its promise; empty means PASS."""
     tally, timing, stream = result.tally, result.timing, result.stream
     faults = []
+    if result.link_lost:
+        faults.append(result.ended)
     if timing.late:
         blame = ", ".join(f"{stage} {count}" for stage, count in sorted(timing.blame.items()))
         faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (slowest stage: {blame})")

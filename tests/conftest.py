@@ -11,7 +11,9 @@ import pytest
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if os.environ.get("PANS_DATA"):
         return
-    skip = pytest.mark.skip(reason="needs the IDX data sets: set PANS_DATA to the folder that holds mnist/ and fashion-mnist/")
+    skip = pytest.mark.skip(
+        reason="needs the IDX data sets: set PANS_DATA to the folder that holds mnist/ and fashion-mnist/"
+    )
     for item in items:
         if "data" in item.keywords:
             item.add_marker(skip)

@@ -8,7 +8,9 @@ from pans.runtime.plan import Plan
 from pans.runtime.wire import DARK_PATTERN
 
 
-def count_visits(plan: Plan, n_features: int, shots: int, exposures: dict[int, tuple[int, int]]) -> dict[tuple[int, int], Any]:
+def count_visits(
+    plan: Plan, n_features: int, shots: int, exposures: dict[int, tuple[int, int]]
+) -> dict[tuple[int, int], Any]:
     """Return {(visit, window): (counts, missing, wrong)} from {exposure: (shown pattern, bit)} of a sequential run."""
     per_cycle = plan.slots_per_cycle
     per_visit = per_cycle * plan.cycles_per_object

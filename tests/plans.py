@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from pans.runtime.plan import NO_SHOT, Plan
 from pans.runtime.wire import DARK_PATTERN
 
@@ -25,7 +26,9 @@ def parallel(n_features: int, shots: int) -> Plan:
     return _plan("parallel", [DARK_PATTERN] + [0] * shots, [NO_SHOT, *range(shots)], n_features, shots, 1)
 
 
-def _plan(mode: str, patterns: list[int], numbers: list[int], n_features: int, shots_per_cycle: int, cycles: int) -> Plan:
+def _plan(
+    mode: str, patterns: list[int], numbers: list[int], n_features: int, shots_per_cycle: int, cycles: int
+) -> Plan:
     return Plan(
         mode=mode,
         n_patterns=n_features,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from pans.runtime.clock import ClockModel
 from pans.runtime.errors import LinkError
 
@@ -11,7 +12,9 @@ TICK_HZ = 10_000_000
 NS_PER_TICK = 100
 
 
-def simulate(drift_ppm: float, offset_ticks: int, seconds: float, seed: int, jitter_us: float = 30.0) -> tuple[list[float], list[float]]:
+def simulate(
+    drift_ppm: float, offset_ticks: int, seconds: float, seed: int, jitter_us: float = 30.0
+) -> tuple[list[float], list[float]]:
     """Probe every 97 ms over a jittery, asymmetric link; return true errors and published uncertainties, in ns."""
     rng = np.random.default_rng(seed)
     rate = 1 + drift_ppm * 1e-6

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plans import shot_major
+
 from pans.runtime import wire
 from pans.runtime.core import MAX_MARKS, NO_LABEL, Core
 from pans.runtime.decide import Verdict
 from pans.runtime.record import DECISION_DTYPE, DecisionFlag
 from pans.runtime.wire import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
-
-from plans import shot_major
 
 N_FEATURES = 3
 PLAN = shot_major(N_FEATURES, 2)  # 4 slots per cycle, 2 cycles per object
@@ -40,7 +40,11 @@ def frame(data: bytes) -> Frame:
 
 def cycle(seq: int, number: int, bits: list[int], patterns: list[int] | None = None) -> Frame:
     shown = np.array(patterns or PLAN.slot_pattern, np.uint16)
-    return frame(wire.encode_clicks(ClickBlock(seq, 0, 1000 + 400 * number, 4 * number, 100, number // 2, shown, np.array(bits, np.uint8)), 1))
+    return frame(
+        wire.encode_clicks(
+            ClickBlock(seq, 0, 1000 + 400 * number, 4 * number, 100, number // 2, shown, np.array(bits, np.uint8)), 1
+        )
+    )
 
 
 def completed(next_exposure: int, tick: int = 10**6) -> Frame:
@@ -64,7 +68,9 @@ def test_a_gap_abstains_and_the_next_window_is_whole_again() -> None:
     core.step(cycle(0, 0, [0, 0, 0, 0]))
     output = core.step(cycle(2, 2, [0, 1, 1, 1]))
     gap, whole = output.decisions
-    assert output.events == [{"kind": "gap", "first_exposure": 4, "exposures": 4, "messages": 1, "dropped_by_device": 0}]
+    assert output.events == [
+        {"kind": "gap", "first_exposure": 4, "exposures": 4, "messages": 1, "dropped_by_device": 0}
+    ]
     assert (gap.label, gap.flags) == (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED)
     assert (whole.label, whole.flags, whole.object) == (3, 0, 1)
     assert len(decider.asked) == 2

@@ -7,17 +7,22 @@ from math import comb
 
 import mpmath
 import pytest
+
 from pans.runtime.dark import DarkMonitor, binomial_tail, wilson_interval
 
 
-@pytest.mark.parametrize(("clicks", "exposures", "p"), [(1, 10, 0.01), (5, 50, 0.01), (9, 10, 0.25), (40, 200, 0.05), (10, 10, 0.5)])
+@pytest.mark.parametrize(
+    ("clicks", "exposures", "p"), [(1, 10, 0.01), (5, 50, 0.01), (9, 10, 0.25), (40, 200, 0.05), (10, 10, 0.5)]
+)
 def test_tail_against_exact_rationals(clicks: int, exposures: int, p: float) -> None:
     q = Fraction(p)
     exact = sum(comb(exposures, k) * q**k * (1 - q) ** (exposures - k) for k in range(clicks, exposures + 1))
     assert binomial_tail(clicks, exposures, p) == pytest.approx(float(exact), rel=1e-11)
 
 
-@pytest.mark.parametrize(("clicks", "exposures", "p"), [(30, 10**9, 1e-9), (3, 10**9, 1e-12), (200, 10**6, 1e-5), (100, 10**6, 1e-5)])
+@pytest.mark.parametrize(
+    ("clicks", "exposures", "p"), [(30, 10**9, 1e-9), (3, 10**9, 1e-12), (200, 10**6, 1e-5), (100, 10**6, 1e-5)]
+)
 def test_tail_with_many_exposures_and_tiny_rates(clicks: int, exposures: int, p: float) -> None:
     mpmath.mp.dps = 40
     exact = mpmath.betainc(clicks, exposures - clicks + 1, 0, mpmath.mpf(p), regularized=True)

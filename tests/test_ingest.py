@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pans.runtime import wire
 from pans.runtime.ingest import Gap, StreamTracker
 from pans.runtime.wire import ClickBlock, Frame, FrameDecoder, Mark

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
+
 from pans.runtime import session as session_module
 from pans.runtime import wire
 from pans.runtime.errors import DeviceError, LinkError
@@ -103,7 +106,7 @@ def test_unacknowledged_commands_repeat_at_a_slowing_pace_and_then_give_up() -> 
             if frames:
                 assert frames == [1, 2]
                 repeats.append(now_ms)
-    gaps = [later - earlier for earlier, later in zip(repeats, repeats[1:])]
+    gaps = [later - earlier for earlier, later in itertools.pairwise(repeats)]
     assert gaps[:4] == [250, 500, 1000, 2000]
     assert max(gaps) == 2000
     assert session.counters.retransmissions == 2 * (len(repeats) - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from pans.runtime.core import NO_LABEL, Decision
 from pans.runtime.record import DecisionFlag
 from pans.runtime.tally import RunTally

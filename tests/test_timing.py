@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from pans.runtime.timing import N_BUCKETS, LatencyHistogram, TimingLedger, _upper_edge, arm_realtime
 
 
@@ -73,7 +74,11 @@ def test_the_realtime_set_up_is_undone() -> None:
     with arm_realtime(True) as granted:
         assert not gc.isenabled()
         assert granted["gc_off"] == "granted"
-        assert granted["sched_fifo"] == "granted" or "refused" in granted["sched_fifo"] or "no SCHED_FIFO" in granted["sched_fifo"]
+        assert (
+            granted["sched_fifo"] == "granted"
+            or "refused" in granted["sched_fifo"]
+            or "no SCHED_FIFO" in granted["sched_fifo"]
+        )
         assert granted["mlockall"]
     assert gc.isenabled()
     assert sys.getswitchinterval() == interval

@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from naive_window import count_visits
+from plans import parallel, pattern_major, shot_major
+
 from pans.runtime.errors import PlanError
 from pans.runtime.plan import Plan
 from pans.runtime.window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS, DecisionWindows
 from pans.runtime.wire import DARK_PATTERN, ClickBlock, FrameBlock
 
-from naive_window import count_visits
-from plans import parallel, pattern_major, shot_major
-
 N_VISITS = 3
 
 
-def run(plan: Plan, n_features: int, shots: int, exposures: dict[int, tuple[int, int]], cuts: set[int]) -> tuple[Any, DecisionWindows]:
+def run(
+    plan: Plan, n_features: int, shots: int, exposures: dict[int, tuple[int, int]], cuts: set[int]
+) -> tuple[Any, DecisionWindows]:
     """Push `exposures` as blocks that end at `cuts`, at losses and at cycle ends, as a device would send them."""
     windows = DecisionWindows(plan, n_features, shots)
     end = N_VISITS * windows.visit_exposures

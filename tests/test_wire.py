@@ -6,6 +6,7 @@ COBS groups and CRC-32 worked out independently of the code under test.
 
 from __future__ import annotations
 
+import contextlib
 import random
 import re
 import struct
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from pans.runtime import wire
 from pans.runtime.wire import FrameDecoder, MessageType
 from pans.runtime.wire_commands import (
@@ -145,7 +147,9 @@ def test_golden_frames(encoded: bytes, message_type: int, payload: str) -> None:
 def test_messages_survive_the_round_trip() -> None:
     patterns = np.arange(300, dtype=np.uint16) % 11
     bits = (np.arange(300) % 3 == 0).astype(np.uint8)
-    block = wire.decode_clicks(one(wire.encode_clicks(wire.ClickBlock(2**32 - 1, 2, 2**63, 2**40, 5, 9, patterns, bits), SESSION)).payload)
+    block = wire.decode_clicks(
+        one(wire.encode_clicks(wire.ClickBlock(2**32 - 1, 2, 2**63, 2**40, 5, 9, patterns, bits), SESSION)).payload
+    )
     assert block[:6] == (2**32 - 1, 2, 2**63, 2**40, 5, 9)
     np.testing.assert_array_equal(block.patterns, patterns)
     np.testing.assert_array_equal(block.bits, bits)
@@ -279,12 +283,17 @@ def test_impossible_payloads_are_refused(decode: object, payload: bytes) -> None
 
 @given(st.binary(max_size=200))
 def test_no_decoder_raises_anything_else(payload: bytes) -> None:
-    decoders = [wire.decode_hello, wire.decode_welcome, wire.decode_ping, wire.decode_pong, wire.decode_command, wire.decode_ack]
+    decoders = [
+        wire.decode_hello,
+        wire.decode_welcome,
+        wire.decode_ping,
+        wire.decode_pong,
+        wire.decode_command,
+        wire.decode_ack,
+    ]
     decoders += [wire.decode_grant, wire.decode_status, wire.decode_clicks, wire.decode_frames, wire.decode_mark]
     decoders += [unpack_pattern, unpack_plan, unpack_arm, unpack_gate]
     for decode in decoders:
         for candidate in (payload, struct.pack("<IHH", wire.SCHEMA, 1, 0) + payload):
-            try:
+            with contextlib.suppress(wire.MalformedMessage):
                 decode(candidate)
-            except wire.MalformedMessage:
-                pass
