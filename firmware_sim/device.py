@@ -7,12 +7,8 @@ sent. Whatever arrives, it answers, refuses or counts; it never raises over byte
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from pans.runtime import wire
 from pans.runtime.errors import ConfigError
@@ -20,20 +16,15 @@ from pans.runtime.profile import Profile
 from pans.runtime.wire import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 from pans.runtime.wire_commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
 
-from .detector import DetectorModel, detector_model, first_click_probability
-from .measurement import LightTable, Measurement, StreamMessage
-from .optics import expected_photoelectrons
+from .detector import detector_model
+from .gates import GATE_CHANNELS, Gates
+from .measurement import MAX_LEASE_MS, LightTable, Measurement, check_arm, light_table
 from .scene import Scene
+from .stream import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
 
 FIRMWARE = "pans-sim 1"
 BUFFER_MESSAGES = 256
-GATE_CHANNELS = 8
-MAX_PENDING_GATES = 256
-MAX_LEASE_MS = 3_600_000
-MAX_ARM_AHEAD_S = 3600
-MAX_TICK = 1 << 62
-_U32 = 0xFFFFFFFF
 
 
 @dataclass(slots=True)
@@ -47,16 +38,7 @@ class InstrumentCounters:
     refused: int = 0
     repeated_commands: int = 0
     commands_out_of_order: int = 0
-    dropped_messages: int = 0
     lease_expiries: int = 0
-
-
-class GatePulse(NamedTuple):
-    """One accepted actuation: output `channel` opens at `tick` and closes at `end_tick`, unless cut short."""
-
-    tick: int
-    end_tick: int
-    channel: int
 
 
 class Instrument:
@@ -78,11 +60,10 @@ class Instrument:
         self.decoder = wire.FrameDecoder()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
         self.session = 0  # the host's nonce; 0 before the first HELLO
-        self.gate_pulses: deque[GatePulse] = deque(maxlen=4096)  # ground truth for tests: what was actuated, and when
+        self.gates = Gates()
         self._seed, self._epoch, self._tick, self._tick_hz = seed, epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
-        self._buffer: deque[tuple[int, bytes]] = deque()
-        self._buffer_messages = buffer_messages
+        self.stream = StreamBuffer(buffer_messages)
         self._out: list[bytes] = []
         self._forget_session()
 
@@ -96,13 +77,9 @@ class Instrument:
         self._run: Measurement | None = None
         self._lease_tick: int | None = None
         self._status_tick: int | None = None
-        self._stream_limit = 0
-        self._forget_stream()
-
-    def _forget_stream(self) -> None:
-        """Start numbering anew; the receive window stays, since the host may grant just before it arms."""
-        self._buffer.clear()
-        self._sequence = self._drops = self._exposures_ended = 0
+        self._exposures_ended = 0
+        self.stream.limit = 0
+        self.stream.restart()
 
     @property
     def tick(self) -> int:
@@ -113,10 +90,6 @@ class Instrument:
     def projector_lit(self) -> bool:
         """Whether light can leave the projector: in a run, and in no other state."""
         return self.state is DeviceState.RUNNING
-
-    def gate_open(self, channel: int) -> bool:
-        """Whether output `channel` is open at the present tick."""
-        return any(one.channel == channel and one.tick <= self._tick < one.end_tick for one in self.gate_pulses)
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
@@ -161,7 +134,7 @@ class Instrument:
         elif what == "start":
             self._enter(DeviceState.RUNNING, StateReason.NONE)
         elif what == "message" and run is not None:
-            self._stream(run.emit())
+            self._out += self.stream.put(run.emit(), self.session)
         elif what == "end":
             self._end_run(DeviceState.IDLE, StateReason.COMPLETED)
         elif what == "lease":
@@ -179,19 +152,13 @@ class Instrument:
             return
         rest = run.cut(self._tick)
         if rest is not None:
-            self._stream(rest)
+            self._out += self.stream.put(rest, self.session)
         self._exposures_ended = run.ended_by(self._tick)
         self._draws += run.begun_by(self._tick)
         self._run = self._lease_tick = None
         if reason is not StateReason.COMPLETED:
-            self._close_gates()
+            self.gates.close_all(self._tick)
         self._enter(state, reason)
-
-    def _close_gates(self) -> None:
-        now = self._tick
-        kept = [one._replace(end_tick=min(one.end_tick, now)) for one in self.gate_pulses if one.tick <= now]
-        self.gate_pulses.clear()
-        self.gate_pulses.extend(kept)
 
     # -- what the device sends -----------------------------------------------------------------------------------------
 
@@ -201,33 +168,11 @@ class Instrument:
         self._status_tick = self._tick + self._tick_hz
         left = 0 if self._lease_tick is None else (self._lease_tick - self._tick) * 1000 // self._tick_hz
         following = self._exposures_ended if self._run is None else self._run.begun_by(self._tick)
-        status = wire.Status(self.state, self.reason, left, self._drops & _U32, self._tick, following)
+        status = wire.Status(self.state, self.reason, left, self.stream.dropped_exposures & U32, self._tick, following)
         self._out.append(wire.encode_status(status, self.session))
 
     def _send_ack(self) -> None:
         self._out.append(wire.encode_ack(self._ack, self.session))
-
-    def _stream(self, message: StreamMessage) -> None:
-        """Number a stream message and send it, hold it back, or drop it whole when the buffer is full."""
-        if len(self._buffer) >= self._buffer_messages:
-            self.counters.dropped_messages += 1
-            self._drops += _exposures_in(message)
-            return
-        self._buffer.append((self._sequence, self._encode(message)))
-        self._sequence = (self._sequence + 1) & _U32
-        self._release()
-
-    def _encode(self, message: StreamMessage) -> bytes:
-        if isinstance(message, wire.Mark):
-            return wire.encode_mark(message._replace(seq=self._sequence), self.session)
-        if isinstance(message, wire.ClickBlock):
-            return wire.encode_clicks(message._replace(seq=self._sequence, drops=self._drops & _U32), self.session)
-        return wire.encode_frames(message._replace(seq=self._sequence, drops=self._drops & _U32), self.session)
-
-    def _release(self) -> None:
-        """Send what the receive window allows; sequence numbers compare modulo 2^32."""
-        while self._buffer and 0 < (self._stream_limit - self._buffer[0][0]) & _U32 < 1 << 31:
-            self._out.append(self._buffer.popleft()[1])
 
     # -- what the device receives --------------------------------------------------------------------------------------
 
@@ -267,7 +212,7 @@ class Instrument:
         profile = self.profile
         return {
             "firmware": FIRMWARE,
-            "serial": f"SIM-{self._seed & _U32:08X}",
+            "serial": f"SIM-{self._seed & U32:08X}",
             "epoch": self._epoch,
             "tick_hz": self._tick_hz,
             "tick": self._tick,
@@ -277,20 +222,19 @@ class Instrument:
             "pattern_memory": profile.projector.pattern_memory,
             "pattern_pixels": min(profile.projector.width_px * profile.projector.height_px, MAX_PATTERN_PIXELS),
             "slot_memory": MAX_SLOTS,
-            "buffer_messages": self._buffer_messages,
+            "buffer_messages": self.stream.capacity,
             "simulated": True,
             "profile": profile.name,
             "gate_channels": GATE_CHANNELS,
-            "scene": self.scene.name[:200],
+            "scene": self.scene.name[:60],  # a receiver takes at most 256 bytes of text
             "objects": self.scene.n_objects,
             "seed": self._seed,
         }
 
     def _grant(self, grant: wire.Grant) -> None:
-        self._stream_limit = grant.stream_limit
         if self._run is not None and grant.lease_ms:
             self._renew(grant.lease_ms)
-        self._release()
+        self._out += self.stream.grant(grant.stream_limit)
 
     def _renew(self, lease_ms: int) -> None:
         self._lease_tick = self._tick + max(1, min(lease_ms, MAX_LEASE_MS) * self._tick_hz // 1000)
@@ -346,17 +290,11 @@ class Instrument:
         program = self._plan.program
         if program is None:
             raise Refused(AckStatus.WRONG_STATE, "no complete plan is loaded")
-        if arm.start_tick <= self._tick:
-            raise Refused(AckStatus.TOO_LATE, f"start tick {arm.start_tick} has passed, it is {self._tick}")
-        if arm.start_tick > self._tick + MAX_ARM_AHEAD_S * self._tick_hz:
-            raise Refused(AckStatus.OUT_OF_RANGE, f"start tick {arm.start_tick} is more than {MAX_ARM_AHEAD_S} s ahead")
-        if not 0 < arm.lease_ms <= MAX_LEASE_MS:
-            raise Refused(AckStatus.OUT_OF_RANGE, f"lease of {arm.lease_ms} ms: allowed 1..{MAX_LEASE_MS}")
-        if arm.start_tick + max(program.cycle_ticks, program.n_slots) * arm.n_cycles >= MAX_TICK:
-            raise Refused(AckStatus.OUT_OF_RANGE, f"{arm.n_cycles} cycles last beyond tick {MAX_TICK}")
+        check_arm(program, arm, self._tick, self._tick_hz)
         light = self._light_table(program)
         model = detector_model(self.profile, self._exposure_us(program))
-        self._forget_stream()
+        self.stream.restart()
+        self._exposures_ended = 0
         self._run = Measurement(program, arm, self.scene, light, model, self._seed, self._draws)
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
@@ -368,35 +306,15 @@ class Instrument:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
         key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
         if self._light is None or self._light[0] != key:
-            exposure_us = self._exposure_us(program)
             levels = self._patterns.stack(program.n_patterns)
             try:
-                photons = expected_photoelectrons(self.profile, self.scene, levels, exposure_us)
+                self._light = (key, light_table(self.profile, self.scene, levels, self._exposure_us(program)))
             except ConfigError as error:
                 raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
-            self._light = (key, _tabulate(photons, detector_model(self.profile, exposure_us)))
         return self._light[1]
 
     def _gate(self, body: bytes) -> None:
         gate = unpack_gate(body)
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
-        if gate.tick <= self._tick:
-            raise Refused(AckStatus.TOO_LATE, f"gate tick {gate.tick} has passed, it is {self._tick}")
-        if gate.channel >= GATE_CHANNELS or not gate.duration_ticks:
-            text = f"gate {gate.channel} for {gate.duration_ticks} ticks: channels are 0..{GATE_CHANNELS - 1}"
-            raise Refused(AckStatus.OUT_OF_RANGE, text)
-        if sum(one.tick > self._tick for one in self.gate_pulses) >= MAX_PENDING_GATES:
-            raise Refused(AckStatus.OUT_OF_RANGE, f"{MAX_PENDING_GATES} gate pulses are pending already")
-        self.gate_pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
-
-
-def _tabulate(photons: NDArray[np.float64], model: DetectorModel) -> LightTable:
-    with_dark = np.column_stack([photons, np.zeros(len(photons))])
-    return LightTable(first_click_probability(model, with_dark), photons.sum(axis=1))
-
-
-def _exposures_in(message: StreamMessage) -> int:
-    if isinstance(message, wire.Mark):
-        return 0
-    return len(message.patterns) if isinstance(message, wire.ClickBlock) else len(message.words)
+        self.gates.add(gate, self._tick)

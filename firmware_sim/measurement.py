@@ -12,14 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.wire import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock, Mark
+from pans.runtime.profile import Profile
+from pans.runtime.wire import DARK_PATTERN, NO_OBJECT, AckStatus, ClickBlock, FrameBlock, Mark
 from pans.runtime.wire_commands import PARALLEL, Arm
 
-from .detector import DetectorModel, sample_clicks
+from .detector import DetectorModel, detector_model, first_click_probability, sample_clicks
+from .optics import expected_photoelectrons
 from .scene import Scene
-from .upload import Program, word_bytes
+from .upload import Program, Refused, word_bytes
 
 BATCH_NUMBERS = 1 << 14
+MAX_LEASE_MS = 3_600_000
+MAX_ARM_AHEAD_S = 3600
+MAX_TICK = 1 << 62
 
 StreamMessage = ClickBlock | FrameBlock | Mark
 
@@ -32,6 +37,26 @@ class LightTable(NamedTuple):
 
     probability: NDArray[np.float64]
     photons: NDArray[np.float64]
+
+
+def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
+    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
+    photons = expected_photoelectrons(profile, scene, levels, exposure_us)
+    with_dark = np.column_stack([photons, np.zeros(len(photons))])
+    model = detector_model(profile, exposure_us)
+    return LightTable(first_click_probability(model, with_dark), photons.sum(axis=1))
+
+
+def check_arm(program: Program, arm: Arm, now: int, tick_hz: int) -> None:
+    """Raise `Refused` when `program` cannot be started as `arm` says at tick `now`."""
+    if arm.start_tick <= now:
+        raise Refused(AckStatus.TOO_LATE, f"start tick {arm.start_tick} has passed, it is {now}")
+    if arm.start_tick > now + MAX_ARM_AHEAD_S * tick_hz:
+        raise Refused(AckStatus.OUT_OF_RANGE, f"start tick {arm.start_tick} is more than {MAX_ARM_AHEAD_S} s ahead")
+    if not 0 < arm.lease_ms <= MAX_LEASE_MS:
+        raise Refused(AckStatus.OUT_OF_RANGE, f"lease of {arm.lease_ms} ms: allowed 1..{MAX_LEASE_MS}")
+    if arm.start_tick + max(program.cycle_ticks, program.n_slots) * arm.n_cycles >= MAX_TICK:
+        raise Refused(AckStatus.OUT_OF_RANGE, f"{arm.n_cycles} cycles last beyond tick {MAX_TICK}")
 
 
 class Measurement:

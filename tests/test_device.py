@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pans.firmware_sim.device import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse, Instrument
+from pans.firmware_sim.device import Instrument
+from pans.firmware_sim.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse
 from pans.firmware_sim.scene import load_scene, scene_from_arrays
 from pans.firmware_sim.upload import word_bytes
 from pans.runtime import wire
@@ -92,6 +93,9 @@ class Bench:
         ack = self.command(opcode, body)
         assert ack.last_id == ack.refused_id == self.command_id
         return ack.status, ack.text
+
+    def gate_open(self, channel: int) -> bool:
+        return self.device.gates.is_open(channel, self.device.tick)
 
     def grant(self, limit: int = 1 << 30, lease_ms: int = 0) -> list[Any]:
         return self.send(wire.encode_grant(wire.Grant(limit, lease_ms), NONCE))
@@ -271,6 +275,7 @@ def test_mean_clicks_follow_the_click_law() -> None:
     z = (counts / n - p) / np.sqrt(p * (1 - p) / n)
     lit = [0, 2, 3]
     assert np.abs(z[:, lit]).max() < 5
+    assert abs(counts[:, lit].sum() - n * p[:, lit].sum()) < 5 * np.sqrt(n * (p * (1 - p))[:, lit].sum())
     assert abs(counts[:, 1].sum() - 4 * n * p[0, 1]) < 5 * np.sqrt(4 * n * p[0, 1]) + 1
 
 
@@ -557,12 +562,12 @@ def test_an_expired_lease_latches_the_device_dark() -> None:
     bench.done(Opcode.GATE, pack_gate(Gate(10_500, 5000, 2)))
     bench.run_to(10_900)
     assert bench.device.projector_lit
-    assert bench.device.gate_open(2)
+    assert bench.gate_open(2)
     messages = bench.run_to(11_000)  # 10 ms after ARM
     status = of_type(messages, wire.Status)[-1]
     assert (status.state, status.reason, status.tick) == (DeviceState.SAFE, StateReason.LEASE_EXPIRED, 11_000)
     assert not bench.device.projector_lit
-    assert not bench.device.gate_open(2)
+    assert not bench.gate_open(2)
     assert of_type(bench.run_to(500_000), wire.ClickBlock) == []
     bench.grant(lease_ms=1000)
     assert bench.device.state is DeviceState.SAFE
@@ -629,13 +634,13 @@ def test_a_gate_opens_at_its_tick_for_its_time() -> None:
     bench = Bench().ready()
     bench.arm(cycles=0)
     bench.done(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))
-    assert list(bench.device.gate_pulses) == [GatePulse(3000, 3050, 1)]
+    assert list(bench.device.gates.pulses) == [GatePulse(3000, 3050, 1)]
     states = []
     for tick in (2999, 3000, 3049, 3050):
         bench.run_to(tick)
-        states.append(bench.device.gate_open(1))
+        states.append(bench.gate_open(1))
     assert states == [False, True, True, False]
-    assert not bench.device.gate_open(0)
+    assert not bench.gate_open(0)
 
 
 def test_a_late_gate_is_not_executed() -> None:
@@ -646,7 +651,7 @@ def test_a_late_gate_is_not_executed() -> None:
     assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.TOO_LATE
     assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 50, GATE_CHANNELS)))[0] == AckStatus.OUT_OF_RANGE
     assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 0, 1)))[0] == AckStatus.OUT_OF_RANGE
-    assert not bench.device.gate_pulses
+    assert not bench.device.gates.pulses
 
 
 def test_stop_closes_gates_and_cancels_those_to_come() -> None:
@@ -656,7 +661,7 @@ def test_stop_closes_gates_and_cancels_those_to_come() -> None:
     bench.done(Opcode.GATE, pack_gate(Gate(9000, 50, 2)))
     bench.run_to(4000)
     bench.done(Opcode.STOP)
-    assert list(bench.device.gate_pulses) == [GatePulse(3000, 4000, 1)]
+    assert list(bench.device.gates.pulses) == [GatePulse(3000, 4000, 1)]
 
 
 def test_pending_gates_are_limited() -> None:
@@ -698,7 +703,7 @@ def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
     first_block = of_type(following, wire.ClickBlock)[0]
     assert first_block.exposure_index == 15
     assert first_block.drops == 9
-    assert bench.device.counters.dropped_messages == 6
+    assert bench.device.stream.dropped_messages == 6
     assert of_type([message for _, message in bench.got], wire.Status)[-1].drops == 9
 
 
@@ -722,7 +727,7 @@ def test_every_exposure_is_delivered_or_counted() -> None:
 def test_the_window_compares_modulo_2_to_the_32() -> None:
     bench = Bench().ready()
     bench.arm(cycles=0)
-    bench.device._sequence = 0xFFFFFFFE
+    bench.device.stream.sequence = 0xFFFFFFFE
     bench.grant(limit=0xFFFFFFFF)
     assert [message.seq for message in bench.run_to(2599) if hasattr(message, "seq")] == [0xFFFFFFFE]
     assert [message.seq for message in bench.grant(limit=1)] == [0xFFFFFFFF, 0]

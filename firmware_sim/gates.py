@@ -1,0 +1,53 @@
+"""The actuation outputs: which pulses were accepted, and which output is open when.
+
+Owns the pulses, bounded, as the ground truth of what was actuated; never decides whether the state allows one (device.py).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from pans.runtime.wire import AckStatus
+from pans.runtime.wire_commands import Gate
+
+from .upload import Refused
+
+GATE_CHANNELS = 8
+MAX_PENDING_GATES = 256
+MAX_KEPT_PULSES = 4096
+
+
+class GatePulse(NamedTuple):
+    """One accepted actuation: output `channel` opens at `tick` and closes at `end_tick`, unless cut short."""
+
+    tick: int
+    end_tick: int
+    channel: int
+
+
+class Gates:
+    """All outputs; `pulses` are in the order of their commands, the oldest are forgotten."""
+
+    def __init__(self) -> None:
+        self.pulses: deque[GatePulse] = deque(maxlen=MAX_KEPT_PULSES)
+
+    def add(self, gate: Gate, now: int) -> None:
+        """Accept a pulse, or raise `Refused`: a pulse that comes too late is never executed."""
+        if gate.tick <= now:
+            raise Refused(AckStatus.TOO_LATE, f"gate tick {gate.tick} has passed, it is {now}")
+        if gate.channel >= GATE_CHANNELS or not gate.duration_ticks:
+            text = f"gate {gate.channel} for {gate.duration_ticks} ticks: channels are 0..{GATE_CHANNELS - 1}"
+            raise Refused(AckStatus.OUT_OF_RANGE, text)
+        if sum(pulse.tick > now for pulse in self.pulses) >= MAX_PENDING_GATES:
+            raise Refused(AckStatus.OUT_OF_RANGE, f"{MAX_PENDING_GATES} gate pulses are pending already")
+        self.pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
+
+    def is_open(self, channel: int, now: int) -> bool:
+        """Whether output `channel` is open at tick `now`."""
+        return any(pulse.channel == channel and pulse.tick <= now < pulse.end_tick for pulse in self.pulses)
+
+    def close_all(self, now: int) -> None:
+        """Close what is open and cancel what is to come."""
+        kept = [pulse._replace(end_tick=min(pulse.end_tick, now)) for pulse in self.pulses if pulse.tick <= now]
+        self.pulses = deque(kept, maxlen=MAX_KEPT_PULSES)

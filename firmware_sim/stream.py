@@ -1,0 +1,67 @@
+"""The device's end of the stream: sequence numbers, receive window, buffer and drop count (docs/PROTOCOL.md, section 5).
+
+Owns what waits to be sent; never retransmits. `StreamBuffer.put` and `grant` return the frames that may be sent now.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from pans.runtime import wire
+
+from .measurement import StreamMessage
+
+U32 = 0xFFFFFFFF
+
+
+@dataclass(slots=True)
+class StreamBuffer:
+    """At most `capacity` messages are held back; when it is full the newest is dropped whole and its exposures counted."""
+
+    capacity: int
+    sequence: int = 0
+    limit: int = 0
+    dropped_exposures: int = 0
+    dropped_messages: int = 0  # since power-on
+    _held: deque[tuple[int, bytes]] = field(default_factory=deque)
+
+    def restart(self) -> None:
+        """Number anew for the next run; the receive window stays, since the host may grant just before it arms."""
+        self._held.clear()
+        self.sequence = self.dropped_exposures = 0
+
+    def put(self, message: StreamMessage, session: int) -> list[bytes]:
+        """Number a message and hold it, or drop it; return what the window lets out."""
+        if len(self._held) >= self.capacity:
+            self.dropped_messages += 1
+            self.dropped_exposures += _exposures_in(message)
+            return []
+        self._held.append((self.sequence, self._encode(message, session)))
+        self.sequence = (self.sequence + 1) & U32
+        return self._released()
+
+    def grant(self, limit: int) -> list[bytes]:
+        """Move the receive window: messages with a sequence below `limit` may leave; return those that now do."""
+        self.limit = limit
+        return self._released()
+
+    def _released(self) -> list[bytes]:
+        released = []
+        while self._held and 0 < (self.limit - self._held[0][0]) & U32 < 1 << 31:  # modulo 2^32
+            released.append(self._held.popleft()[1])
+        return released
+
+    def _encode(self, message: StreamMessage, session: int) -> bytes:
+        drops = self.dropped_exposures & U32
+        if isinstance(message, wire.Mark):
+            return wire.encode_mark(message._replace(seq=self.sequence), session)
+        if isinstance(message, wire.ClickBlock):
+            return wire.encode_clicks(message._replace(seq=self.sequence, drops=drops), session)
+        return wire.encode_frames(message._replace(seq=self.sequence, drops=drops), session)
+
+
+def _exposures_in(message: StreamMessage) -> int:
+    if isinstance(message, wire.Mark):
+        return 0
+    return len(message.patterns) if isinstance(message, wire.ClickBlock) else len(message.words)
