@@ -81,7 +81,7 @@ def log_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
 def object_transmission(
     profile: Profile | None, images: NDArray[np.uint8], dtype: DTypeLike = np.float64
 ) -> NDArray[np.floating]:
-    """Transmission in [1/contrast, 1] of 8-bit `images` (any shape) on the profile's object modulator; same shape.
+    """Transmission in [black, 1] of 8-bit `images` (any shape) on the profile's object modulator; same shape.
 
     Without a profile, or without a modulator in it, black is 0 and white is 1. A modulator of fewer than 256 levels rounds
     to its own.
@@ -93,7 +93,7 @@ def object_transmission(
     if modulator is not None:
         if modulator.levels < 256:
             gray = np.rint(gray * (modulator.levels - 1)) / (modulator.levels - 1)
-        darkest = 1.0 / modulator.contrast
+        darkest = profile.min_transmission if profile is not None else 0.0
         gray = darkest + (1.0 - darkest) * gray
     table = gray.astype(dtype)
     return np.asarray(table[images])

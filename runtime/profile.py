@@ -38,10 +38,14 @@ class Projector:
 
 @dataclass(frozen=True, slots=True)
 class ObjectModulator:
-    """What shows test images as objects; `contrast` is brightest over darkest transmission, inf for perfect black."""
+    """What shows test images as objects; `contrast` is brightest over darkest transmission, inf for perfect black.
+
+    `black_transmission` is what a black pixel lets through at the object in fact, where that was measured; else 1/contrast.
+    """
 
     contrast: float
     levels: int
+    black_transmission: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +111,11 @@ class Profile:
 
     @property
     def min_transmission(self) -> float:
-        """Transmission of a black object pixel: 1/contrast of the modulator, 0 without one."""
-        return 0.0 if self.object_modulator is None else 1.0 / self.object_modulator.contrast
+        """Transmission of a black object pixel: as declared, else 1/contrast of the modulator, 0 without one."""
+        modulator = self.object_modulator
+        if modulator is None:
+            return 0.0
+        return 1.0 / modulator.contrast if modulator.black_transmission is None else modulator.black_transmission
 
 
 def load_profile(name_or_path: str | Path) -> Profile:

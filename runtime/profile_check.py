@@ -77,6 +77,7 @@ _SCHEMA: dict[str, dict[str, _Key]] = {
     "object": {
         "contrast": _Key("number", 1, 1e12, above=True, infinite=True),
         "levels": _Key("whole", 2, 65536),
+        "black_transmission": _Key("number", 0, 0.99, required=False),
     },
     "detector": {
         "kind": _Key("text"),

@@ -1,6 +1,7 @@
 """The click law against mpmath at 60 digits, at the hard cases: no light, tiny, ordinary and enormous means."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import mpmath
@@ -182,9 +183,11 @@ def test_object_transmission_spans_the_contrast():
     images = np.array([[0, 51, 255]], np.uint8)
     np.testing.assert_allclose(object_transmission(None, images), [[0.0, 0.2, 1.0]])
     np.testing.assert_allclose(object_transmission(load_profile("ideal"), images), [[0.0, 0.2, 1.0]])
-    np.testing.assert_allclose(
-        object_transmission(load_profile("oled-qcmos"), images), [[0.02, 0.02 + 0.98 * 0.2, 1.0]]
-    )
+    paper = load_profile("oled-qcmos")
+    np.testing.assert_allclose(object_transmission(paper, images), [[0.001, 0.001 + 0.999 * 0.2, 1.0]])
+    assert paper.object_modulator is not None
+    bare = replace(paper, object_modulator=replace(paper.object_modulator, black_transmission=None))
+    np.testing.assert_allclose(object_transmission(bare, images), [[0.02, 0.02 + 0.98 * 0.2, 1.0]])
     assert object_transmission(None, images, np.float32).dtype == np.float32
 
 

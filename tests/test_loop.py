@@ -37,7 +37,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
         image_shape=(8, 8),
         levels=124,
         pattern_levels=levels.astype(np.uint16),
-        photons_per_level=2.0 / 123,
+        photons_per_level=8.0 / 123,
         table=rng.normal(size=(16, 3)).astype(np.float32),
         provenance={},
     )
