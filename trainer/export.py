@@ -1,0 +1,162 @@
+"""From a trained model to a bundle, and the proof that the bundle decides as the model does.
+
+Owns the folding of the normalisation, the ONNX graph and the comparison; never trains. `export` writes the file, reads it
+back and raises when a score or a decision of the file differs from the torch model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from pans.runtime import __version__
+from pans.runtime.bundle import Bundle, load_bundle, make_bundle, word_means, write_bundle
+from pans.runtime.bundle_facts import GOLDEN_TOLERANCE
+from pans.runtime.decide import make_decider
+from pans.runtime.errors import PansError
+
+from .heads import EPSILON, MlpHead
+
+OPSET = 17
+IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
+DEAD_VARIANCE = 1e-7  # a pattern that clicks, or stays dark, less than once in ten million times says nothing
+ALL_WORDS_MAX = 12
+RANDOM_WORDS = 10_000
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """The written bundle and how far its back ends are from the torch model."""
+
+    bundle: Bundle
+    sha256: str
+    words_compared: int
+    score_difference: float  # the largest, over max(1, |score|)
+    dead_patterns: tuple[int, ...]
+
+
+def fold_normalisation(
+    weight: F64, bias: F64, gain: F64, shift: F64, click_mean: F64
+) -> tuple[F64, F64, tuple[int, ...]]:
+    """Fold normalisation by `click_mean` (d_f,) into a linear layer: weight (hidden, d_f), bias (hidden,).
+
+    The population variance of a click is p(1-p), exactly. A pattern that always or never clicks has none: its scale would
+    explode, so its column is dropped (set to 0) and its constant part goes into the bias. Returns the folded weight and
+    bias, float64, and the dropped patterns.
+    """
+    variance = click_mean * (1 - click_mean)
+    dead = variance < DEAD_VARIANCE
+    scale = np.where(dead, 0.0, gain / np.sqrt(variance + EPSILON))
+    folded_bias = bias + weight @ (shift - click_mean * scale)
+    return weight * scale, folded_bias, tuple(int(i) for i in np.flatnonzero(dead))
+
+
+def head_onnx(head: MlpHead, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
+    """Return the head as ONNX (float32 click means (n, d_f) -> scores (n, classes)) and the dropped patterns."""
+
+    def wide(parameter: torch.Tensor) -> F64:
+        return np.asarray(parameter.detach().double().numpy())
+
+    weight, bias, dead = fold_normalisation(
+        wide(head.hidden.weight), wide(head.hidden.bias), wide(head.norm.gain), wide(head.norm.bias), click_mean
+    )
+    layers = {"w1": weight, "b1": bias, "w2": wide(head.output.weight), "b2": wide(head.output.bias)}
+    initializers = [numpy_helper.from_array(value.astype(np.float32), name) for name, value in layers.items()]
+    nodes = [
+        helper.make_node("Gemm", ["clicks", "w1", "b1"], ["sums"], transB=1),
+        helper.make_node("Relu", ["sums"], ["hidden"]),
+        helper.make_node("Gemm", ["hidden", "w2", "b2"], ["scores"], transB=1),
+    ]
+    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["n", weight.shape[1]])
+    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", len(layers["b2"])])
+    graph = helper.make_graph(nodes, "head", [source], [result], initializers)
+    opset = helper.make_opsetid("", OPSET)
+    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="pans-runtime")
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString()), dead
+
+
+def export(
+    path: Path,
+    head: MlpHead,
+    click_mean: F64,
+    pattern_levels: NDArray[np.uint16],
+    photons_per_level: float,
+    *,
+    name: str,
+    task: str,
+    classes: tuple[str, ...],
+    image_shape: tuple[int, int],
+    levels: int,
+    provenance: Mapping[str, Any],
+) -> Exported:
+    """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ."""
+    graph, dead = head_onnx(head, click_mean)
+    bundle = make_bundle(
+        name=name,
+        task=task,
+        classes=classes,
+        image_shape=image_shape,
+        levels=levels,
+        pattern_levels=pattern_levels,
+        photons_per_level=photons_per_level,
+        head_onnx=graph,
+        provenance={**provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
+    )
+    write_bundle(bundle, path)
+    bundle, digest = load_bundle(path)
+    words, difference = compare(bundle, head, click_mean)
+    return Exported(bundle, digest, words, difference, dead)
+
+
+def compare(bundle: Bundle, head: MlpHead, click_mean: F64) -> tuple[int, float]:
+    """Hold every back end of `bundle` against the torch head: all click words up to d_f = 12, else 10 000 random ones.
+
+    Returns the number of words and the largest score difference over max(1, |score|). PansError where it exceeds 1e-5
+    or a decision differs whose margin is clear of that.
+    """
+    if bundle.n_features <= ALL_WORDS_MAX:
+        means = word_means(np.arange(1 << bundle.n_features), bundle.n_features)
+    else:
+        means = np.random.default_rng(0).integers(0, 2, (RANDOM_WORDS, bundle.n_features)).astype(np.float32)
+    wanted = reference_scores(head, click_mean, means)
+    scale = np.maximum(1.0, np.abs(wanted))
+    ranked = np.sort(wanted, axis=1)
+    clear = ranked[:, -1] - ranked[:, -2] > 2 * GOLDEN_TOLERANCE * scale.max(axis=1)
+    worst = 0.0
+    for backend in ("onnx", "table") if bundle.table is not None else ("onnx",):
+        decider = make_decider(bundle, backend=backend)
+        found = decider.scores_batch(means.astype(np.int64), 1).astype(np.float64)
+        difference = float((np.abs(found - wanted) / scale).max())
+        changed = int((clear & (found.argmax(axis=1) != wanted.argmax(axis=1))).sum())
+        if not difference <= GOLDEN_TOLERANCE or changed:
+            raise PansError(
+                f"the {backend} back end of {bundle.name} differs from the trained model: scores by {difference:.3g} of "
+                f"max(1, |score|), allowed {GOLDEN_TOLERANCE:g}; {changed} of {len(means)} decisions, allowed 0",
+                remedy="report this with the bundle: the export is wrong",
+            )
+        worst = max(worst, difference)
+    return len(means), worst
+
+
+def reference_scores(head: MlpHead, click_mean: F64, means: NDArray[np.float32]) -> F64:
+    """Scores of the trained head as it stands, not folded, in float64; dead patterns at their constant value."""
+    variance = click_mean * (1 - click_mean)
+    clicks = means.astype(np.float64)
+    dead = variance < DEAD_VARIANCE
+    clicks[:, dead] = click_mean[dead]
+    with torch.no_grad():
+        wide = MlpHead(len(click_mean), head.hidden.out_features, head.output.out_features, torch.Generator()).double()
+        wide.load_state_dict(head.state_dict())
+        wide.norm.running_mean.copy_(torch.from_numpy(click_mean))
+        return np.asarray(wide.eval()(torch.from_numpy(clicks)).numpy())

@@ -1,0 +1,436 @@
+"""Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
+
+Owns the schedule, the photon budget and the checkpoint; never writes a bundle (export.py) and never sees the held-out
+objects. `train` returns a `Trained` whose patterns are already what the projector will show.
+
+Stages (one epoch is one pass over the training objects):
+
+1. straight-through on sampled clicks (paper, algorithm for active PANS), on an object modulator with perfect black;
+2. with the exact estimator: the expectation over all 2**d_f click words, while black rises to what the modulator can do;
+3. the same with patterns rounded to levels; the photoelectrons of the top level are trained with them;
+4. the patterns stay, the head is fitted to them alone.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pans.runtime.clicks import ClickLaw, click_law, object_transmission
+from pans.runtime.errors import DamagedFileError, PlanError, UsageError
+from pans.runtime.profile import Profile
+
+from .detection import (
+    EXACT_FEATURES_MAX,
+    click_probability,
+    click_words,
+    expected_cross_entropy,
+    sample_clicks,
+    word_probabilities,
+)
+from .encoders import ActiveIllumination
+from .heads import MlpHead
+from .quantise import Quantised, exposure_us_of, quantise, top_limits
+from .tasks import Objects, Task
+
+VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
+CHUNK = 2000  # objects per pass where no gradient is needed
+DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
+DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to train. `alpha` weighs the illumination; `photons` and `clicks` are targets per inference, held by weights."""
+
+    features: int
+    alpha: float | None = None
+    photons: float | None = None
+    clicks: float | None = None
+    estimator: str = "exact"
+    epochs: int = 60
+    seed: int = 0
+    restarts: int = 1
+    hidden: int = 512
+    batch: int = 512
+    front_rate: float = 1e-2
+    head_rate: float = 1e-3
+    slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
+    clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+
+
+@dataclass(frozen=True, slots=True)
+class EpochReport:
+    """How one epoch went: means over its batches."""
+
+    restart: int
+    epoch: int
+    stage: str
+    loss: float
+    clicks: float
+    photons: float
+    illumination: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trained:
+    """A finished model: the shown patterns, the head in evaluation mode, the law it was trained for."""
+
+    quantised: Quantised
+    float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels
+    head: MlpHead
+    click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
+    law: ClickLaw
+    validation_loss: float
+    validation_losses: tuple[float, ...]  # of all restarts
+    options: Options
+
+
+def check_options(options: Options, profile: Profile) -> None:
+    """Raise UsageError or PlanError for what cannot be trained on this profile."""
+    limits = {"features": (1, 4096), "epochs": (1, 100_000), "restarts": (1, 1000), "hidden": (1, 65536)}
+    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1)}
+    for name, (low, high) in limits.items():
+        if not low <= getattr(options, name) <= high:
+            raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
+    for name in ("alpha", "photons", "clicks"):
+        value = getattr(options, name)
+        if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
+            raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
+    if options.clicks is not None and options.clicks >= options.features:
+        raise UsageError(
+            f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
+        )
+    if options.estimator not in ("ste", "exact"):
+        raise UsageError(f"--estimator is {options.estimator!r}, allowed: ste, exact")
+    if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
+        raise UsageError(
+            f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
+            f"{EXACT_FEATURES_MAX} patterns",
+            remedy="use --estimator ste",
+        )
+    channels = profile.detector.channels
+    if profile.mode == "parallel" and options.features > channels:
+        raise PlanError(
+            f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
+            remedy=f"--features {channels}, or fewer",
+        )
+    if options.features > profile.projector.pattern_memory:
+        raise PlanError(
+            f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
+            remedy=f"--features {profile.projector.pattern_memory}, or fewer",
+        )
+
+
+def train(
+    task: Task,
+    profile: Profile,
+    options: Options,
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    report: Callable[[EpochReport], None] = lambda _: None,
+) -> Trained:
+    """Train `task` through `profile`; the same options, machine and number of threads give the same result.
+
+    After every epoch the state goes to `checkpoint`; with `resume` a run goes on from there. KeyboardInterrupt passes
+    through, with the state of the last whole epoch on disk.
+    """
+    check_options(options, profile)
+    data = _Data(task, profile, validation=max(1, len(task.train) // VALIDATION_PART))
+    saved = _read_checkpoint(checkpoint, options, task) if resume and checkpoint else {}
+    best: dict[str, Any] | None = saved.get("best")
+    losses: list[float] = saved.get("losses", [])
+    for restart in range(len(losses), options.restarts):
+        run = _Run(data, profile, options, restart)
+        if "run" in saved:
+            run.restore(saved.pop("run"))
+        while run.epoch < options.epochs:
+            report(run.one_epoch())
+            if checkpoint:
+                _write_checkpoint(checkpoint, options, task, {"run": run.state(), "best": best, "losses": losses})
+        losses = [*losses, run.validation_loss()]
+        if losses[-1] <= min(losses):
+            best = run.state()
+    run = _Run(data, profile, options, losses.index(min(losses)))
+    if best is not None:
+        run.restore(best)
+    return run.finish(tuple(losses))
+
+
+class _Data:
+    """Training objects as float32 tensors: `gray` is the transmission with a perfect black, `floor` the real one."""
+
+    def __init__(self, task: Task, profile: Profile, validation: int) -> None:
+        self.floor = profile.min_transmission
+        self.validation = validation
+        self.gray = self._flat(profile, task.train)
+        self.labels = torch.from_numpy(task.train.labels)
+        self.n_classes = len(task.classes)
+        self.n_fit = len(self.labels) - validation
+
+    def _flat(self, profile: Profile, objects: Objects) -> Tensor:
+        shown = object_transmission(profile, objects.images.reshape(len(objects), -1), "float32")
+        return torch.from_numpy((shown - self.floor) / (1 - self.floor))
+
+
+class _Run:
+    """One restart: patterns, head, optimiser, random numbers, and how far it has come."""
+
+    def __init__(self, data: _Data, profile: Profile, options: Options, restart: int) -> None:
+        self.data, self.profile, self.options, self.restart = data, profile, options, restart
+        self.random = torch.Generator().manual_seed(options.seed + restart)
+        limits = top_limits(profile)
+        self.encoder = ActiveIllumination(options.features, data.gray.shape[1], limits, self.random)
+        self.head = MlpHead(options.features, options.hidden, data.n_classes, self.random)
+        self.epoch = 0
+        self.weights = {"photons": 1e-3, "clicks": 1e-3}  # of the budgets; they follow the excess
+        self.optimiser = self._new_optimiser()
+
+    # ---- the schedule ----
+
+    @property
+    def first_exact(self) -> int:
+        """The epoch at which stage 2 begins; the end when there is no stage 2."""
+        return round(0.3 * self.options.epochs) if self.options.estimator == "exact" else self.options.epochs
+
+    @property
+    def first_whole(self) -> int:
+        """The epoch at which the patterns become whole levels."""
+        return round(0.75 * self.options.epochs)
+
+    def stage(self) -> str:
+        """Name of the stage of the present epoch."""
+        name = "ste" if self.epoch < self.first_exact else "exact"
+        return f"{name}, levels" if self.epoch >= self.first_whole else name
+
+    def rates(self, progress: float) -> tuple[float, float]:
+        """Learning rates of patterns and head: one cycle per estimator, the second one half as high in front."""
+        now, total = self.epoch + progress, self.options.epochs
+        start, end = (0, self.first_exact) if self.epoch < self.first_exact else (self.first_exact, total)
+        at = (now - start) / (end - start)
+        cycle = (
+            0.5 - 0.5 * math.cos(math.pi * at / 0.25)
+            if at < 0.25
+            else 0.5 + 0.5 * math.cos(math.pi * (at - 0.25) / 0.75)
+        )
+        front = self.options.front_rate * (1.0 if self.epoch < self.first_exact else 0.5)
+        return front * cycle + 1e-6, self.options.head_rate * cycle + 1e-6
+
+    def floor(self, progress: float) -> float:
+        """Transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
+        now, total = self.epoch + progress, self.options.epochs
+        start = self.first_exact if self.options.estimator == "exact" else 0.3 * total
+        return self.data.floor * min(1.0, max(0.0, (now - start) / (0.4 * total)))
+
+    # ---- the loop ----
+
+    def one_epoch(self) -> EpochReport:
+        """Pass once over the training objects, in random order."""
+        options, data = self.options, self.data
+        if self.epoch == self.first_exact:
+            self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
+        if self.epoch == self.first_whole:
+            self.encoder.start_quantising(self.profile.projector.levels)
+        exact, law = self.epoch >= self.first_exact, self.law()
+        order = torch.randperm(data.n_fit, generator=self.random)
+        batches = [part for part in order.split(options.batch) if len(part) > 1]
+        sums = torch.zeros(4, dtype=torch.float64)
+        self.head.train()
+        for i, batch in enumerate(batches):
+            progress = i / len(batches)
+            light, photons = self.light(batch, self.floor(progress))
+            slope, clamp = self._slope_and_clamp(progress)
+            p = click_probability(light.clamp(max=clamp), law, slope)
+            labels = data.labels[batch]
+            loss = self._exact_loss(p, labels) if exact else self._sampled_loss(p, labels)
+            clicks = p.sum(dim=1).mean()
+            illumination = self.encoder.patterns().sum()
+            total = loss + self._penalty(clicks, photons, illumination)
+            for group, rate in zip(self.optimiser.param_groups, self.rates(progress)):
+                group["lr"] = rate
+            self.optimiser.zero_grad()
+            total.backward()
+            self.optimiser.step()
+            sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
+        stage = self.stage()
+        self.epoch += 1
+        return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
+
+    def light(self, which: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+        """Photoelectrons (n, d_f) of the objects `which` with black at `floor`, and their mean sum per object."""
+        patterns = self.encoder.patterns()
+        light = (1 - floor) * (self.data.gray[which] @ patterns.T) + floor * patterns.sum(dim=1)
+        return light, light.sum(dim=1).mean()
+
+    def law(self) -> ClickLaw:
+        """The click law at the exposure that the present brightest pixel needs."""
+        low, high = self.encoder.top_limits
+        with torch.no_grad():
+            brightest = self.encoder.patterns().max() if self.encoder.levels is None else self.encoder.top()
+        return click_law(self.profile, exposure_us_of(self.profile, min(max(float(brightest), low), high)))
+
+    def _sampled_loss(self, p: Tensor, labels: Tensor) -> Tensor:
+        return torch.nn.functional.cross_entropy(self.head(sample_clicks(p, self.random)), labels)
+
+    def _exact_loss(self, p: Tensor, labels: Tensor) -> Tensor:
+        scores = self.head(click_words(self.options.features), mean=p.mean(dim=0))
+        return expected_cross_entropy(word_probabilities(p), scores, labels)
+
+    def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
+        """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
+        penalty = (self.options.alpha or 0.0) * illumination
+        for name, measured in (("photons", photons), ("clicks", clicks)):
+            target = getattr(self.options, name)
+            if target is not None:
+                penalty = penalty + self.weights[name] * measured
+                excess = min(1.0, max(-1.0, float(measured.detach()) / target - 1))
+                self.weights[name] = min(10.0, max(1e-5, self.weights[name] * math.exp(DUAL_RATE * excess)))
+        return penalty
+
+    def _slope_and_clamp(self, progress: float) -> tuple[float, float]:
+        if self.epoch >= self.first_exact:
+            return 1.0, math.inf
+        done = min(1.0, (self.epoch + progress) / (0.3 * self.options.epochs))
+        return self.options.slope ** (1 - done), self.options.clamp if done < 1 else math.inf
+
+    def _new_optimiser(self) -> torch.optim.Adam:
+        groups = [{"params": self.encoder.parameters()}, {"params": self.head.parameters()}]
+        return torch.optim.Adam(groups, lr=1e-3)
+
+    # ---- after the last epoch ----
+
+    def probabilities(self, start: int, stop: int) -> Tensor:
+        """Click probabilities, float64 (n, d_f), of the training objects start..stop through the whole instrument."""
+        law, parts = self.law(), []
+        with torch.no_grad():
+            for first in range(start, stop, CHUNK):
+                which = torch.arange(first, min(first + CHUNK, stop))
+                parts.append(click_probability(self.light(which, self.data.floor)[0].double(), law))
+        return torch.cat(parts)
+
+    def validation_loss(self) -> float:
+        """Cross-entropy on the validation objects: exact where the words can be enumerated, else of one sample."""
+        p = self.probabilities(self.data.n_fit, len(self.data.labels))
+        labels = self.data.labels[self.data.n_fit :]
+        self.head.eval()
+        with torch.no_grad():
+            if self.options.features > EXACT_FEATURES_MAX:
+                generator = torch.Generator().manual_seed(self.options.seed)
+                return float(torch.nn.functional.cross_entropy(self.head(sample_clicks(p, generator).float()), labels))
+            scores = self.head(click_words(self.options.features)).double()
+            return float(expected_cross_entropy(word_probabilities(p), scores, labels))
+
+    def finish(self, losses: tuple[float, ...]) -> Trained:
+        """Freeze the patterns as levels, then fit the head to what they show of all training objects."""
+        with torch.no_grad():
+            floats = (self.encoder.weight**2).numpy().copy()
+        quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
+        p = self.probabilities(0, len(self.data.labels))
+        mean = p.mean(dim=0)
+        self.head.norm.running_mean.copy_(mean)
+        if self.options.features <= EXACT_FEATURES_MAX:
+            fit_head_exactly(self.head, joint_distribution(p, self.data.labels, self.data.n_classes))
+        else:
+            self._fit_head_by_samples(p)
+        self.head.eval()
+        return Trained(quantised, floats, self.head, mean, self.law(), min(losses), losses, self.options)
+
+    def _fit_head_by_samples(self, p: Tensor, epochs: int = 10) -> None:
+        optimiser = torch.optim.Adam(self.head.parameters(), lr=self.options.head_rate)
+        self.head.eval()  # the normalisation stays: its mean is exact
+        for epoch in range(epochs):
+            optimiser.param_groups[0]["lr"] = self.options.head_rate * (1 - epoch / epochs)
+            for batch in torch.randperm(len(p), generator=self.random).split(self.options.batch):
+                clicks = sample_clicks(p[batch], self.random).float()
+                optimiser.zero_grad()
+                loss = torch.nn.functional.cross_entropy(self.head(clicks), self.data.labels[batch])
+                loss.backward()
+                optimiser.step()
+
+    # ---- checkpoints ----
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next epoch depends on, as copies."""
+        copied = {
+            name: {key: value.clone() for key, value in module.state_dict().items()} for name, module in self._modules()
+        }
+        return copied | {
+            "optimiser": self.optimiser.state_dict(),
+            "random": self.random.get_state(),
+            "epoch": self.epoch,
+            "weights": dict(self.weights),
+            "levels": self.encoder.levels,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        for name, module in self._modules():
+            module.load_state_dict(state[name])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.random.set_state(state["random"])
+        self.epoch, self.weights, self.encoder.levels = state["epoch"], dict(state["weights"]), state["levels"]
+
+    def _modules(self) -> tuple[tuple[str, torch.nn.Module], ...]:
+        return ("encoder", self.encoder), ("head", self.head)
+
+
+def joint_distribution(p: Tensor, labels: Tensor, n_classes: int) -> Tensor:
+    """Return P(word, class) over objects with click probabilities `p` (n, d_f), float64 (2**d_f, classes); sums to 1."""
+    joint = torch.zeros(1 << p.shape[1], n_classes, dtype=torch.float64)
+    for start in range(0, len(p), CHUNK):
+        words = word_probabilities(p[start : start + CHUNK].double())
+        of_class = torch.nn.functional.one_hot(labels[start : start + CHUNK], n_classes).double()
+        joint += words.T @ of_class
+    return joint / len(p)
+
+
+def fit_head_exactly(head: MlpHead, joint: Tensor, steps: int = 1500, rate: float = 2e-3) -> None:
+    """Fit the head to `joint` (2**d_f, classes): the whole training set at every step, with a falling rate."""
+    words, target = click_words(head.norm.gain.numel()), joint.float()
+    optimiser = torch.optim.Adam(head.parameters(), lr=rate)
+    head.eval()  # the normalisation stays: its mean is exact
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+        optimiser.zero_grad()
+        loss = -(target * torch.log_softmax(head(words), dim=1)).sum()
+        loss.backward()
+        optimiser.step()
+
+
+def _identity(options: Options, task: Task) -> dict[str, Any]:
+    plain = {key: str(value) for key, value in asdict(replace(options, restarts=1)).items()}
+    return plain | {"task": task.sha256}
+
+
+def _write_checkpoint(path: Path, options: Options, task: Task, state: dict[str, Any]) -> None:
+    beside = path.with_name(path.name + ".part")
+    torch.save({"identity": _identity(options, task), **state}, beside)
+    os.replace(beside, path)
+
+
+def _read_checkpoint(path: Path, options: Options, task: Task) -> dict[str, Any]:
+    if not path.is_file():
+        raise UsageError(f"{path} is not there", remedy="leave --resume out to start anew")
+    try:
+        saved: dict[str, Any] = torch.load(path, weights_only=True)  # tensors and plain values only
+        found = saved["identity"]
+    except Exception as error:  # torch raises a dozen unrelated classes
+        raise DamagedFileError(
+            f"{path}: not a checkpoint: {error}", remedy="leave --resume out to start anew"
+        ) from error
+    wanted = _identity(options, task)
+    differing = [f"{key} {found.get(key)} (now {value})" for key, value in wanted.items() if found.get(key) != value]
+    if differing:
+        raise UsageError(
+            f"{path} belongs to another training: {', '.join(differing)}",
+            remedy="repeat its options, or leave --resume out",
+        )
+    return saved
