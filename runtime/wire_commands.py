@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .wire import _STRUCT, MAX_PAYLOAD_BYTES, SLOT_DTYPE, U16, MalformedMessage, _fields
+from .wire import MAX_PAYLOAD_BYTES, SLOT_DTYPE, STRUCTS, U16, MalformedMessage, fields
 
 SEQUENTIAL, PARALLEL = 0, 1
 MODES = {"sequential": SEQUENTIAL, "parallel": PARALLEL}
@@ -61,23 +61,23 @@ class Gate(NamedTuple):
 
 def pack_pattern(chunk: PatternChunk) -> bytes:
     """Return the body of LOAD_PATTERN."""
-    head = _STRUCT["LOAD_PATTERN"].pack(chunk.pattern, 0, chunk.first_pixel, chunk.n_pixels)
+    head = STRUCTS["LOAD_PATTERN"].pack(chunk.pattern, 0, chunk.first_pixel, chunk.n_pixels)
     return head + chunk.levels.astype("<u2").tobytes()
 
 
 def unpack_pattern(body: bytes) -> PatternChunk:
     """Invert `pack_pattern`."""
-    pattern, _, first_pixel, n_pixels = _fields("LOAD_PATTERN", body, exact=False)
-    rest = len(body) - _STRUCT["LOAD_PATTERN"].size
+    pattern, _, first_pixel, n_pixels = fields("LOAD_PATTERN", body, exact=False)
+    rest = len(body) - STRUCTS["LOAD_PATTERN"].size
     if rest == 0 or rest % 2 or rest // 2 > MAX_PIXELS_PER_CHUNK or first_pixel + rest // 2 > n_pixels:
         raise MalformedMessage(f"LOAD_PATTERN holds {rest} bytes of levels from pixel {first_pixel} of {n_pixels}")
-    levels = np.frombuffer(body, "<u2", rest // 2, _STRUCT["LOAD_PATTERN"].size).astype(np.uint16)
+    levels = np.frombuffer(body, "<u2", rest // 2, STRUCTS["LOAD_PATTERN"].size).astype(np.uint16)
     return PatternChunk(pattern, first_pixel, n_pixels, levels)
 
 
 def pack_plan(chunk: PlanChunk) -> bytes:
     """Return the body of LOAD_PLAN."""
-    head = _STRUCT["LOAD_PLAN"].pack(
+    head = STRUCTS["LOAD_PLAN"].pack(
         chunk.mode, 0, chunk.n_patterns, chunk.n_slots, chunk.first_slot, chunk.exposure_ticks, chunk.slot_period_ticks,
         chunk.cycle_ticks, chunk.block_exposures, 0, chunk.cycles_per_object,
     )  # fmt: skip
@@ -86,10 +86,10 @@ def pack_plan(chunk: PlanChunk) -> bytes:
 
 def unpack_plan(body: bytes) -> PlanChunk:
     """Invert `pack_plan`."""
-    mode, _, n_patterns, n_slots, first_slot, exposure, period, cycle, block, _, per_object = _fields(
+    mode, _, n_patterns, n_slots, first_slot, exposure, period, cycle, block, _, per_object = fields(
         "LOAD_PLAN", body, exact=False
     )
-    size = _STRUCT["LOAD_PLAN"].size
+    size = STRUCTS["LOAD_PLAN"].size
     count, odd = divmod(len(body) - size, SLOT_DTYPE.itemsize)
     if odd or not 0 < count <= MAX_SLOTS_PER_CHUNK or first_slot + count > n_slots or len(body) > MAX_PAYLOAD_BYTES:
         raise MalformedMessage(f"LOAD_PLAN holds {len(body) - size} bytes of slots from slot {first_slot} of {n_slots}")
@@ -99,19 +99,19 @@ def unpack_plan(body: bytes) -> PlanChunk:
 
 def pack_arm(arm: Arm) -> bytes:
     """Return the body of ARM."""
-    return _STRUCT["ARM"].pack(*arm, 0)
+    return STRUCTS["ARM"].pack(*arm, 0)
 
 
 def unpack_arm(body: bytes) -> Arm:
     """Invert `pack_arm`."""
-    return Arm(*_fields("ARM", body)[:3])
+    return Arm(*fields("ARM", body)[:3])
 
 
 def pack_gate(gate: Gate) -> bytes:
     """Return the body of GATE."""
-    return _STRUCT["GATE"].pack(*gate, 0)
+    return STRUCTS["GATE"].pack(*gate, 0)
 
 
 def unpack_gate(body: bytes) -> Gate:
     """Invert `pack_gate`."""
-    return Gate(*_fields("GATE", body)[:3])
+    return Gate(*fields("GATE", body)[:3])
