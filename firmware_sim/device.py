@@ -199,6 +199,11 @@ class Instrument:
         hello = wire.decode_hello(frame.payload)
         if not frame.session:
             raise wire.MalformedMessage("HELLO without a nonce")
+        if frame.session == self.session and hello == (wire.SCHEMA, wire.PROTOCOL_VERSION):
+            # A repetition: starting afresh here would let commands that came in between be executed twice.
+            self._out.append(wire.encode_welcome(self._facts(), self.session))
+            self._send_status()
+            return
         self.counters.sessions += 1
         self._end_run(DeviceState.IDLE, StateReason.STOPPED)
         self._forget_session()
@@ -242,15 +247,16 @@ class Instrument:
     def _command(self, command: wire.CommandMessage) -> None:
         expected = self._ack.last_id + 1
         if command.command_id == expected:
-            self._ack = self._ack._replace(last_id=expected)
+            mask = self._ack.refused_mask << 1 & U32
+            self._ack = self._ack._replace(last_id=expected, refused_mask=mask)
             try:
                 self._execute(command)
             except Refused as refusal:
                 self.counters.refused += 1
-                self._ack = wire.Ack(expected, expected, refusal.status, refusal.text)
+                self._ack = wire.Ack(expected, expected, refusal.status, refusal.text, mask | 1)
             except wire.MalformedMessage as error:
                 self.counters.refused += 1
-                self._ack = wire.Ack(expected, expected, AckStatus.MALFORMED, str(error))
+                self._ack = wire.Ack(expected, expected, AckStatus.MALFORMED, str(error), mask | 1)
         elif command.command_id < expected:
             self.counters.repeated_commands += 1
         else:

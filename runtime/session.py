@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from . import wire
 from .errors import DeviceError, LinkError
 from .wire import AckStatus, Frame, MessageType, Opcode
 
 NS_PER_MS = 1_000_000
+UNKNOWN_STATUS = 0xFFFF
 HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
@@ -21,6 +23,9 @@ STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS
 RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
+MAX_WAITING = 256  # commands not sent yet; above it `submit` refuses
+MAX_PROBES = 64  # probes without an answer; the oldest is given up
+MAX_KEPT = 256  # answers that nobody has taken; the oldest is forgotten
 
 
 @dataclass(slots=True)
@@ -31,6 +36,16 @@ class SessionCounters:
     wrong_session: int = 0
     malformed: int = 0
     unknown_type: int = 0
+    stale_probes: int = 0
+    repeated_welcomes: int = 0
+
+
+class Refusal(NamedTuple):
+    """A command that the device did not carry out, of the kind that may be refused without ending the session."""
+
+    command_id: int
+    status: int
+    text: str
 
 
 class HostSession:
@@ -42,7 +57,8 @@ class HostSession:
         self.nonce = nonce
         self.welcome: wire.Welcome | None = None
         self.status: wire.Status | None = None
-        self.pongs: deque[tuple[wire.Pong, int]] = deque(maxlen=256)
+        self.pongs: deque[tuple[wire.Pong, int]] = deque(maxlen=MAX_KEPT)
+        self.refusals: deque[Refusal] = deque(maxlen=MAX_KEPT)
         self.counters = SessionCounters()
         self._output: list[bytes] = []
         self._hello_due_ns: int | None = None
@@ -50,10 +66,12 @@ class HostSession:
         self._next_id = 1
         self._waiting: deque[tuple[int, bytes]] = deque()  # not sent yet
         self._unacknowledged: deque[tuple[int, bytes]] = deque()
+        self._may_be_refused: set[int] = set()
         self._retry_due_ns = 0
         self._retry_after_ns = RETRY_FIRST_NS
         self._oldest_ns = 0
         self._probe_id = 0
+        self._probes: deque[int] = deque(maxlen=MAX_PROBES)  # sent and not answered
 
     # -- what the host wants -------------------------------------------------------------------------------------------
 
@@ -62,8 +80,16 @@ class HostSession:
         self._hello_started_ns = self._hello_due_ns = now_ns
         self.poll(now_ns)
 
-    def submit(self, opcode: Opcode, body: bytes = b"") -> int:
-        """Queue a command and return its id; it is sent by the next `poll` that finds room in the window."""
+    def submit(self, opcode: Opcode, body: bytes = b"", *, may_be_refused: bool = False) -> int:
+        """Queue a command and return its id; it is sent by the next `poll` that finds room in the window.
+
+        A refusal ends the session with DeviceError, unless the command `may_be_refused`: then it is put into `refusals`.
+        LinkError when MAX_WAITING commands wait already: nothing is dropped in silence.
+        """
+        if not self.has_room:
+            raise LinkError(f"{MAX_WAITING} commands wait for a device that acknowledges none", remedy="check the link")
+        if may_be_refused:
+            self._may_be_refused.add(self._next_id)
         command_id = self._next_id
         self._next_id += 1
         self._waiting.append((command_id, wire.encode_command(command_id, opcode, body, self.nonce)))
@@ -72,11 +98,17 @@ class HostSession:
     def probe(self, now_ns: int) -> None:
         """Send one clock probe stamped with `now_ns`."""
         self._probe_id = (self._probe_id + 1) & 0xFFFFFFFF
+        self._probes.append(self._probe_id)
         self._output.append(wire.encode_ping(self._probe_id, now_ns, self.nonce))
 
     def grant(self, stream_limit: int, lease_ms: int) -> None:
         """Move the receive window and renew the lease."""
         self._output.append(wire.encode_grant(wire.Grant(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `submit` takes another command."""
+        return len(self._waiting) < MAX_WAITING
 
     @property
     def settled(self) -> bool:
@@ -142,7 +174,7 @@ class HostSession:
 
     def _digest(self, frame: Frame, now_ns: int) -> None:
         if frame.type == MessageType.PONG:
-            self.pongs.append((wire.decode_pong(frame.payload), now_ns))
+            self._on_pong(wire.decode_pong(frame.payload), now_ns)
         elif frame.type == MessageType.ACK:
             self._on_ack(wire.decode_ack(frame.payload), now_ns)
         elif frame.type == MessageType.STATUS:
@@ -152,7 +184,20 @@ class HostSession:
         else:
             self.counters.unknown_type += 1
 
+    def _on_pong(self, pong: wire.Pong, now_ns: int) -> None:
+        """Keep the first answer to each probe: a repetition would lie about its round trip."""
+        if pong.probe_id in self._probes:
+            self._probes.remove(pong.probe_id)
+            self.pongs.append((pong, now_ns))
+        else:
+            self.counters.stale_probes += 1
+
     def _on_welcome(self, welcome: wire.Welcome) -> None:
+        if self.welcome is not None:
+            self.counters.repeated_welcomes += 1
+            if welcome.facts.get("epoch") != self.welcome.facts.get("epoch"):
+                raise LinkError("the device restarted within the session: its clock and its uploads are gone")
+            return
         if (welcome.schema, welcome.protocol) != (wire.SCHEMA, wire.PROTOCOL_VERSION):
             raise DeviceError(
                 f"the device speaks protocol {welcome.protocol} (schema {welcome.schema:#010x}), "
@@ -167,6 +212,14 @@ class HostSession:
             acknowledged, _ = self._unacknowledged.popleft()
             self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS
             self._retry_due_ns = now_ns + RETRY_FIRST_NS
-            if acknowledged == ack.refused_id:
-                name = AckStatus(ack.status).name if ack.status in set(AckStatus) else str(ack.status)
-                raise DeviceError(f"the device refused command {ack.refused_id} ({name}): {ack.text}")
+            allowed = acknowledged in self._may_be_refused
+            self._may_be_refused.discard(acknowledged)
+            if not ack.refuses(acknowledged):
+                continue
+            named = acknowledged == ack.refused_id
+            status, text = (ack.status, ack.text) if named else (UNKNOWN_STATUS, "the reason was lost on the way")
+            if allowed:
+                self.refusals.append(Refusal(acknowledged, status, text))
+                continue
+            name = AckStatus(status).name if status in set(AckStatus) else str(status)
+            raise DeviceError(f"the device refused command {acknowledged} ({name}): {text}")

@@ -405,7 +405,11 @@ def test_the_latest_refusal_stays_in_later_acknowledgements() -> None:
     bench.hello()
     bench.refused(0x77)
     ack = bench.command(Opcode.STOP)
-    assert (ack.last_id, ack.refused_id, ack.status) == (2, 1, AckStatus.UNKNOWN_OPCODE)
+    assert (ack.last_id, ack.refused_id, ack.status, ack.refused_mask) == (2, 1, AckStatus.UNKNOWN_OPCODE, 2)
+    bench.refused(0x78)
+    ack = bench.command(Opcode.STOP)
+    assert (ack.last_id, ack.refused_id, ack.refused_mask) == (4, 3, 0b1010)
+    assert [ack.refuses(command_id) for command_id in (1, 2, 3, 4)] == [True, False, True, False]
 
 
 def pattern_body(**changes: Any) -> bytes:
@@ -600,8 +604,11 @@ def test_hello_ends_a_run_and_forgets_uploads() -> None:
     bench = Bench().ready()
     bench.arm(cycles=0)
     bench.run_to(2100)
-    bench.hello()
+    bench.send(wire.encode_hello(NONCE))  # a repetition changes nothing
+    assert bench.device.state is DeviceState.RUNNING
+    bench.send(wire.encode_hello(NONCE + 1))
     assert (bench.device.state, bench.device.reason) == (DeviceState.IDLE, StateReason.STOPPED)
+    bench.hello()
     assert bench.refused(Opcode.ARM, pack_arm(Arm(5000, 1, 100)))[1] == "no complete plan is loaded"
 
 

@@ -140,6 +140,7 @@ def test_stream_and_status_frames_are_handed_on_the_rest_is_digested() -> None:
     assert deliver(session, wire.encode_status(wire.Status(1, 0, 5, 0, 9, 0), NONCE)) == [True]
     assert session.status is not None
     assert session.status.tick == 9
+    session.probe(2)
     assert deliver(session, wire.encode_pong(wire.Pong(1, 2, 3, 4), NONCE), 55) == [False]
     assert session.pongs.popleft() == (wire.Pong(1, 2, 3, 4), 55)
 
@@ -149,6 +150,45 @@ def test_malformed_and_unknown_messages_are_counted() -> None:
     assert deliver(session, wire.encode_frame(MessageType.ACK, b"short", NONCE)) == [False]
     assert deliver(session, wire.encode_frame(0x42, b"", NONCE)) == [False]
     assert (session.counters.malformed, session.counters.unknown_type) == (1, 1)
+
+
+def test_a_probe_counts_once() -> None:
+    session = opened()
+    session.probe(2)
+    answer = wire.encode_pong(wire.Pong(1, 2, 3, 4), NONCE)
+    deliver(session, answer, 55)
+    deliver(session, answer, 60_000)
+    deliver(session, wire.encode_pong(wire.Pong(9, 2, 3, 4), NONCE), 70_000)
+    assert [arrival_ns for _, arrival_ns in session.pongs] == [55]
+    assert session.counters.stale_probes == 2
+
+
+def test_a_command_that_may_be_refused_is_reported_and_the_session_goes_on() -> None:
+    session = opened()
+    first = session.submit(Opcode.GATE, b"", may_be_refused=True)
+    second = session.submit(Opcode.GATE, b"", may_be_refused=True)
+    session.poll(0)
+    deliver(session, wire.encode_ack(Ack(2, 2, wire.AckStatus.TOO_LATE, "gone", 0b11), NONCE))
+    assert [refusal.command_id for refusal in session.refusals] == [first, second]
+    assert [refusal.status for refusal in session.refusals] == [session_module.UNKNOWN_STATUS, wire.AckStatus.TOO_LATE]
+    assert session.settled
+
+
+def test_a_device_that_restarts_within_the_session_is_told() -> None:
+    session = opened()
+    deliver(session, wire.encode_welcome({"tick_hz": 1}, NONCE))
+    assert session.counters.repeated_welcomes == 1
+    with pytest.raises(LinkError, match="restarted"):
+        deliver(session, wire.encode_welcome({"tick_hz": 1, "epoch": 2}, NONCE))
+
+
+def test_a_full_queue_of_commands_is_refused_not_dropped() -> None:
+    session = opened()
+    for _ in range(session_module.MAX_WAITING):
+        session.submit(Opcode.STOP)
+    assert not session.has_room
+    with pytest.raises(LinkError, match="256 commands wait"):
+        session.submit(Opcode.STOP)
 
 
 def test_grant_wraps_with_the_sequence() -> None:

@@ -84,7 +84,7 @@ GOLDEN = [
     (wire.encode_ping(7, 0x0102030405060708, SESSION), 0x02, "07000000 0807060504030201"),
     (wire.encode_pong(wire.Pong(7, 1, 2, 3), SESSION), 0x82, "07000000 0100000000000000 0200000000000000 0300000000000000"),
     (wire.encode_command(3, wire.Opcode.STOP, b"", SESSION), 0x03, "03000000 04 00 0000"),
-    (wire.encode_ack(wire.Ack(5, 4, 3, "no"), SESSION), 0x83, "05000000 04000000 0300 0200 6e6f"),
+    (wire.encode_ack(wire.Ack(5, 4, 3, "no", 2), SESSION), 0x83, "05000000 04000000 02000000 0300 0200 6e6f"),
     (wire.encode_grant(wire.Grant(4096, 1000), SESSION), 0x04, "00100000 e8030000"),
     (
         wire.encode_status(wire.Status(2, 0, 900, 1, 5, 6), SESSION),
