@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,28 +28,54 @@ def replay(recording: Recording, bundle: Bundle) -> tuple[int, str]:
     """Return how many decisions `recording` gives with `bundle`, and the SHA-256 of their log."""
     config = recording.header.get("config", {})
     try:
-        chunks, arm = sent_plan(recording)
+        chunks, arms = sent_plan(recording)
         plan = plan_from_chunks(chunks, int(config["tick_hz"]))
         shots = int(config["shots"])
     except (KeyError, TypeError, ValueError, MalformedMessage) as error:
         raise DamagedFileError(f"{recording.path}: the run cannot be rebuilt: {error}") from error
     core = Core(
-        plan, make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto"))), shots, arm.n_cycles
+        plan, make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto"))), shots, arms[0][1].n_cycles
     )
-    core.start_tick = arm.start_tick
     log, n_decisions = hashlib.sha256(), 0
-    for _, body in recording.messages():
-        decisions: list[Any] = core.step(unpack_body(body)).decisions
+    for decisions in _decisions(core, arms, recording):
         log.update(np.array(decisions, DECISION_DTYPE).tobytes())
         n_decisions += len(decisions)
     return n_decisions, log.hexdigest()
 
 
-def sent_plan(recording: Recording) -> tuple[list[PlanChunk], Arm]:
-    """Return the plan and the ARM command as they were sent to the device (repetitions left out)."""
+def _decisions(core: Core, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
+    """Drive `core` as the live loop did: each ARM begins a stream, which has the session of its frames."""
+    following = iter(arms)
+    session = 0
+
+    def begin_next() -> list[Any]:
+        nonlocal session
+        session, arm = next(following)
+        return core.begin(arm.start_tick, arm.n_cycles).decisions
+
+    for _, body in recording.messages():
+        frame = unpack_body(body)
+        while frame.session != session:
+            try:
+                yield begin_next()
+            except StopIteration:
+                raise DamagedFileError(
+                    f"{recording.path}: a message of a session that never armed the device"
+                ) from None
+        yield core.step(frame).decisions
+    for _ in range(len(arms)):  # streams that gave no message at all
+        try:
+            yield begin_next()
+        except StopIteration:
+            break
+    yield core.end().decisions
+
+
+def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Arm]]]:
+    """Return the plan and the ARM commands with their sessions, as they were sent to the device (repetitions left out)."""
     decoder = FrameDecoder()
     chunks: dict[int, PlanChunk] = {}
-    arm: Arm | None = None
+    arms: dict[int, Arm] = {}
     for _, data in recording.commands():
         for frame in decoder.feed(data):
             if frame.type != MessageType.COMMAND:
@@ -58,10 +85,10 @@ def sent_plan(recording: Recording) -> tuple[list[PlanChunk], Arm]:
                 chunk = unpack_plan(command.body)
                 chunks[chunk.first_slot] = chunk
             elif command.opcode == Opcode.ARM:
-                arm = unpack_arm(command.body)
-    if arm is None:
+                arms[frame.session] = unpack_arm(command.body)
+    if not arms:
         raise MalformedMessage("the device was never armed")
-    return [chunks[first] for first in sorted(chunks)], arm
+    return [chunks[first] for first in sorted(chunks)], list(arms.items())
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

@@ -10,13 +10,15 @@ import argparse
 import importlib.resources
 import platform
 import shlex
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from types import FrameType
+from typing import Any, Generic, NoReturn, TypeVar
 
 from . import __version__
 from .cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
@@ -50,6 +52,8 @@ class Job:
     backend: str
     realtime: bool
     record: Path | None
+    reconnect_s: float
+    trace: Path | None
     command: str
 
 
@@ -67,6 +71,12 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     parser.add_argument("--backend", default="auto", choices=("auto", "table", "onnx"), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
+    parser.add_argument(
+        "--reconnect-s", type=float, default=10.0, help="how long to look for a lost device (default 10, 0: not at all)"
+    )
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE", help="write all bytes of both directions as hex, with times"
+    )
 
 
 def _configure_run(parser: argparse.ArgumentParser) -> None:
@@ -108,8 +118,8 @@ def _job(
     for name in ("shots", "trials"):
         if getattr(args, name) < 1:
             raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
-    if args.seconds < 0 or decisions < 0 or args.deadline_us < 0 or args.dark_slots < 0:
-        raise UsageError("--seconds, --decisions, --deadline-us and --dark-slots must not be negative")
+    if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
+        raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
     loaded = load_profile(profile)
     return Job(
         bundle_path=bundle,
@@ -126,6 +136,8 @@ def _job(
         backend=args.backend,
         realtime=not args.no_realtime,
         record=record,
+        reconnect_s=args.reconnect_s,
+        trace=args.trace,
         command=shlex.join(["pans", *sys.argv[1:]]),
     )
 
@@ -161,8 +173,17 @@ class _Background(Generic[T]):
         return self._value[0]
 
 
+def _leave(signum: int, frame: FrameType | None) -> NoReturn:
+    """SIGTERM and a closed terminal end a run as Ctrl-C does: the light goes off first."""
+    raise KeyboardInterrupt
+
+
 def _execute(args: argparse.Namespace, job: Job) -> int:
     started_ns = process_start_ns()
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), _leave)
     opening = _Background(lambda: open_link(job.device))
     try:
         from .bundle import load_bundle
@@ -172,7 +193,9 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         from .loop import RunConfig, run_live
         from .plan import build_plan
         from .record import Recorder
+        from .recovery import Recovery
         from .report import summarise, write_markdown
+        from .trace import TracedLink
 
         bundle, bundle_sha256 = load_bundle(job.bundle_path)
         plan = build_plan(
@@ -200,10 +223,13 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         _close_quietly(opening)
         raise
     link = opening.result()
+    if job.trace is not None:
+        link = TracedLink(link, job.trace, job.device)
+    recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
     with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
         title = f"{bundle.name} on {job.profile.name}"
         with live_view(title, bundle.classes, expected, link.simulated) as watch:
-            result = run_live(link, job.profile, bundle, plan, decider, config, recorder, watch, started_ns)
+            result = run_live(link, job.profile, bundle, plan, decider, config, recorder, watch, started_ns, recovery)
         summary = summarise(result, illumination=bundle.illumination() * job.shots, expected_decisions=expected)
         result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
     page = job.out / "summary.md"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .bundle import Bundle
-from .clock import ClockModel
+from .clock import ClockModel, ClockStep
 from .errors import DeviceError, LinkError
 from .link import Link, LinkReader
 from .plan import Plan
@@ -33,7 +33,7 @@ from .wire_commands import (
 NS_PER_S = 1_000_000_000
 SETUP_POLL_S = 0.02
 CLOCK_BURST = 16
-CLOCK_GIVE_UP_NS = 3 * NS_PER_S
+PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for
 REQUIRED_FACTS = ("tick_hz", "mode", "channels", "levels", "pattern_memory", "pattern_pixels", "slot_memory")
 
 
@@ -53,6 +53,7 @@ class Connection:
         self.decoder = FrameDecoder()
         self.session = HostSession(secrets.randbelow(0xFFFFFFFF) + 1)
         self.clock: ClockModel | None = None
+        self.clock_steps: list[ClockStep] = []  # since the last look
         self._on_sent = on_sent
 
     def pump(self, timeout_s: float) -> list[Arrived]:
@@ -67,7 +68,9 @@ class Connection:
         if self.clock is not None:
             while self.session.pongs:
                 pong, arrival_ns = self.session.pongs.popleft()
-                self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
+                step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
+                if step is not None:
+                    self.clock_steps.append(step)
         return stream
 
     def flush(self) -> None:
@@ -104,8 +107,12 @@ class Connection:
         for index, levels in enumerate(bundle.pattern_levels):
             for first in range(0, len(levels), MAX_PIXELS_PER_CHUNK):
                 part = levels[first : first + MAX_PIXELS_PER_CHUNK]
+                while not self.session.has_room:
+                    self.pump(SETUP_POLL_S)
                 self.session.submit(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, first, len(levels), part)))
         for chunk in plan_chunks(plan):
+            while not self.session.has_room:
+                self.pump(SETUP_POLL_S)
             self.session.submit(Opcode.LOAD_PLAN, pack_plan(chunk))
         self.settle()
 
@@ -118,11 +125,15 @@ class Connection:
             wanted = clock.n_probes + 1
             now_ns = self.link.now_ns()
             self.session.probe(now_ns)
-            while clock.n_probes < wanted and self.link.now_ns() - now_ns < CLOCK_GIVE_UP_NS:
+            while clock.n_probes < wanted and self.link.now_ns() - now_ns < PROBE_GIVE_UP_NS:
                 self.pump(SETUP_POLL_S)
         if clock.n_probes == 0:
             raise LinkError("the device answered no clock probe", remedy="check that its firmware answers PING")
         return clock
+
+    def detach(self) -> None:
+        """Stop reading and leave the link as it is, for whoever opens it again."""
+        self.reader.stop()
 
     def close(self) -> None:
         """Close the link and its reader."""

@@ -24,6 +24,7 @@ from .wire import (
     Mark,
     MessageType,
     StateReason,
+    Status,
     decode_status,
 )
 
@@ -56,7 +57,10 @@ class Output(NamedTuple):
 
 
 class Core:
-    """Stream tracker, windows and back end joined up, for one run of `n_cycles` cycles (0: until stopped) from `start_tick` on."""
+    """Stream tracker, windows and back end joined up, for one run of `n_cycles` cycles (0: until stopped) from `start_tick` on.
+
+    A run that lost its device and found it again goes on in another stream: `begin` ends the old one and starts the next.
+    """
 
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int) -> None:
         self.start_tick = 0
@@ -69,7 +73,46 @@ class Core:
         self.n_abstained = 0
         self._decider = decider
         self._exposure_ticks = plan.exposure_ticks
-        self._end_exposure = n_cycles * plan.slots_per_cycle if n_cycles else 1 << 63
+        self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
+        self._end_exposure = self._exposures_of(n_cycles)
+        self._begun = False
+        self._visits_before = 0  # in streams that have ended
+        self._last_tick = 0
+        self._status: Status | None = None  # the latest of this stream
+        self._told_end: int | None = None  # tick of the first STATUS that told of the end
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output:
+        """Follow the stream that an ARM starts; the output settles what the one before left open (INCOMPLETE, never guessed)."""
+        output = self.end()
+        if self._begun:
+            self._visits_before += self.windows.visits_begun
+            windows = self.windows.restart()
+            output.decisions.extend(
+                self._decide(window, self._last_tick, DecisionFlag.INCOMPLETE) for window in windows
+            )
+            self.tracker.restart()
+            self.marks.clear()
+        self._begun, self.completed, self._told_end, self._status = True, False, None, None
+        self.start_tick, self._end_exposure = start_tick, self._exposures_of(n_cycles)
+        return output
+
+    def end(self) -> Output:
+        """End the stream: report what the device says that it exposed and never came, or that this is not known."""
+        if not self._begun or self.completed:
+            return Output([], [], None)
+        status = self._status
+        if status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE):
+            return self._finish(status)
+        self.completed = True
+        unknown = {"kind": "stream_end_unknown", "first_exposure": self.tracker.next_exposure}
+        return Output([], [unknown], None)
+
+    def cycles_left(self, n_cycles: int) -> int:
+        """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""
+        return n_cycles - (self._visits_before + self.windows.visits_begun) * self._cycles_per_object
+
+    def _exposures_of(self, n_cycles: int) -> int:
+        return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
 
     def step(self, frame: Frame) -> Output:
         """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
@@ -87,6 +130,7 @@ class Core:
             self.tracker.counters.malformed += 1
             return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
+        self._last_tick = end_tick
         decisions = self._missed(message.exposure_index, message.tick)
         decisions += [self._decide(window, end_tick) for window in self.windows.push(message)]
         return Output(decisions, events, end_tick)
@@ -96,14 +140,26 @@ class Core:
         self.windows.warm_up()
 
     def _on_status(self, frame: Frame) -> Output:
-        """When the device says that the plan is done, settle what will never be complete."""
+        """When the device says that the plan is done, settle what will never be complete.
+
+        STATUS may overtake stream messages, so that with exposures missing only a second one settles them.
+        """
         try:
             status = decode_status(frame.payload)
         except MalformedMessage:
             return Output([], [], None)
-        done = (status.state, status.reason) == (DeviceState.IDLE, StateReason.COMPLETED)
-        if self.completed or not done or status.tick < self.start_tick:  # an earlier run's news
+        if self.completed or status.tick < self.start_tick:  # an earlier run's news
             return Output([], [], None)
+        self._status = status
+        if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
+            return Output([], [], None)
+        missing = min(status.next_exposure, self._end_exposure) > self.tracker.next_exposure
+        if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
+            self._told_end = status.tick
+            return Output([], [], None)
+        return self._finish(status)
+
+    def _finish(self, status: Status) -> Output:
         self.completed = True
         end = min(status.next_exposure, self._end_exposure)
         gap = self.tracker.finish(end, status.drops)
@@ -118,8 +174,8 @@ class Core:
     def _missed(self, exposure_index: int, tick: int) -> list[Decision]:
         return [self._decide(window, tick) for window in self.windows.skip_to(exposure_index)]
 
-    def _decide(self, window: Window, tick: int) -> Decision:
-        flags, label, probability = DecisionFlag(0), NO_LABEL, 0.0
+    def _decide(self, window: Window, tick: int, flags: DecisionFlag = DecisionFlag(0)) -> Decision:
+        label, probability = NO_LABEL, 0.0
         if window.missing:
             flags |= DecisionFlag.GAP
         if window.wrong:

@@ -14,6 +14,7 @@ from .wire import ClickBlock, Frame, FrameBlock, Mark, MessageType
 
 SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31
+MAX_GAP_EXPOSURES = 1 << 24  # a number further ahead is nonsense: believing it would mean millions of windows at once
 
 
 class Gap(NamedTuple):
@@ -48,6 +49,7 @@ class StreamTracker:
         self.next_exposure = 0
         self._drops = 0
         self._lost_messages = 0  # since the last click block: reported with the next gap in the exposures
+        self._finished = False
 
     def accept(self, frame: Frame) -> tuple[ClickBlock | FrameBlock | Mark | None, Gap | None]:
         """Take one stream frame; see the module's docstring."""
@@ -57,8 +59,11 @@ class StreamTracker:
             self.counters.malformed += 1
             return None, None
         ahead = (message.seq - self.next_seq) % SEQUENCE
-        if ahead >= HALF_SEQUENCE:  # seen before, or overtaken: a late photon is useless
+        if ahead >= HALF_SEQUENCE or self._finished:  # seen before, or overtaken: a late photon is useless
             self.counters.repeated += 1
+            return None, None
+        if not isinstance(message, Mark) and message.exposure_index - self.next_exposure > MAX_GAP_EXPOSURES:
+            self.counters.malformed += 1
             return None, None
         self._lost_messages += ahead
         self.counters.lost_messages += ahead
@@ -76,8 +81,21 @@ class StreamTracker:
         return message, gap
 
     def finish(self, next_exposure: int, drops: int) -> Gap | None:
-        """Close the stream: the device says it stopped before `next_exposure`; return the gap at the end, if any."""
-        return self._gap_before(next_exposure, drops) if next_exposure > self.next_exposure else None
+        """Close the stream: the device says it stopped before `next_exposure`; return the gap at the end, if any.
+
+        What still comes is counted as repeated: it has been reported lost.
+        """
+        self._finished = True
+        if not 0 < next_exposure - self.next_exposure <= MAX_GAP_EXPOSURES:
+            return None
+        gap = self._gap_before(next_exposure, drops)
+        self.next_exposure = next_exposure
+        return gap
+
+    def restart(self) -> None:
+        """Follow the stream of another ARM; the totals go on."""
+        self.next_seq = self.next_exposure = self._drops = self._lost_messages = 0
+        self._finished = False
 
     def _gap_before(self, exposure_index: int, drops: int) -> Gap | None:
         missing = exposure_index - self.next_exposure

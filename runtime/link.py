@@ -188,13 +188,17 @@ class LinkReader:
             raise self._death
         return chunks
 
-    def close(self) -> None:
-        """Stop the thread and close the link."""
+    def stop(self) -> None:
+        """Stop the thread; the link stays as it is."""
         self._stopping = True
         if self._thread is not None and self._thread is not threading.current_thread():
             with self._ready:
                 self._ready.notify_all()
             self._thread.join(timeout=2.0)
+
+    def close(self) -> None:
+        """Stop the thread and close the link."""
+        self.stop()
         self._link.close()
 
     def _pump(self) -> None:

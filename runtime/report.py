@@ -42,6 +42,7 @@ def summarise(result: RunResult, *, illumination: float, expected_decisions: int
         "seconds": result.seconds,
         "ended": result.ended,
         "link_lost": result.link_lost,
+        "reconnects": result.reconnects,
         "decisions_sha256": result.decisions_sha256,
         "simulated": bool(result.device.get("simulated")),
         "verdict": "FAIL" if faults else "PASS",
@@ -55,6 +56,8 @@ def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
     faults = []
     if result.link_lost:
         faults.append(result.ended)
+    if result.reconnects:
+        faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late:
         blame = ", ".join(f"{stage} {count}" for stage, count in sorted(timing.blame.items()))
         faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (slowest stage: {blame})")

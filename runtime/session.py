@@ -59,6 +59,7 @@ class HostSession:
         self.status: wire.Status | None = None
         self.pongs: deque[tuple[wire.Pong, int]] = deque(maxlen=MAX_KEPT)
         self.refusals: deque[Refusal] = deque(maxlen=MAX_KEPT)
+        self.heard_ns = 0  # when the latest frame of this session came
         self.counters = SessionCounters()
         self._output: list[bytes] = []
         self._hello_due_ns: int | None = None
@@ -163,6 +164,7 @@ class HostSession:
         if frame.session != self.nonce:
             self.counters.wrong_session += 1
             return False
+        self.heard_ns = now_ns
         if frame.type in STREAM_TYPES:
             return True
         try:

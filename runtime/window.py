@@ -133,6 +133,17 @@ class DecisionWindows:
         visit, relative = divmod(exposure_index, self.visit_exposures)
         return self._advance_to(visit) + self._settle(relative)
 
+    @property
+    def visits_begun(self) -> int:
+        """Visits of which something has been seen or settled."""
+        return self._visit + (self._next_window > 0 or bool(self._seen.any()))
+
+    def restart(self) -> list[Window]:
+        """Give up the visit under way and count from exposure 0 again; return its windows that were still open."""
+        open_windows = self._advance_to(self.visits_begun)
+        self._visit = 0
+        return open_windows
+
     def warm_up(self) -> None:
         """Compile or load the kernel that `push` will use, without counting anything."""
         if self.parallel:

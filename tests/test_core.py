@@ -87,11 +87,68 @@ def test_a_wrong_pattern_abstains() -> None:
 def test_completion_settles_what_never_came() -> None:
     core, _ = make()
     core.step(cycle(0, 0, [0, 0, 0, 0]))
-    assert core.step(completed(24, tick=0)._replace(payload=completed(24).payload)).decisions
+    assert not core.step(completed(24)).decisions  # it may have overtaken what is missing
+    assert not core.step(completed(24)).decisions  # a repetition says nothing new
+    assert not core.completed
+    assert core.step(completed(24, tick=10**6 + 1)).decisions
     assert core.completed
     assert core.n_decisions == 6
     assert core.tracker.counters.lost_exposures == 20
     assert core.step(completed(24)).decisions == []
+
+
+def test_blocks_that_a_status_overtook_still_count() -> None:
+    core, decider = make(n_cycles=1)
+    core.step(completed(4))
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].flags == 0
+    core.step(completed(4, tick=10**6 + 1))
+    assert core.completed
+    assert core.tracker.counters.lost_exposures == 0
+    assert decider.asked == [[1, 0, 0]]
+
+
+def test_what_comes_after_the_end_was_settled_is_dropped_and_counted() -> None:
+    core, decider = make(n_cycles=1)
+    core.step(completed(4))
+    assert core.step(completed(4, tick=10**6 + 1)).decisions[0].flags & DecisionFlag.GAP
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions == []
+    assert (core.tracker.counters.repeated, decider.asked) == (1, [])
+
+
+def test_another_stream_settles_the_open_visit_and_counts_anew() -> None:
+    core, decider = make(n_cycles=6)  # three visits of two cycles
+    core.begin(0, 6)
+    core.step(cycle(0, 0, [0, 1, 1, 1]))
+    core.step(cycle(1, 1, [0, 1, 1, 1]))
+    core.step(cycle(2, 2, [0, 1, 1, 1]))
+    ended = core.end()
+    assert ended.events == [{"kind": "stream_end_unknown", "first_exposure": 12}]
+    assert core.cycles_left(6) == 2
+    (given_up,) = core.begin(5000, 2).decisions
+    assert given_up.flags == DecisionFlag.GAP | DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED
+    assert given_up.number == 3
+    (decision,) = core.step(cycle(0, 0, [0, 1, 1, 0])).decisions
+    assert (decision.number, decision.flags, decision.exposure_index) == (4, 0, 3)
+    assert len(decider.asked) == 4
+
+
+def test_a_stream_that_was_stopped_reports_what_was_exposed_and_never_came() -> None:
+    core, _ = make(n_cycles=0)
+    core.begin(0, 0)
+    core.step(cycle(0, 0, [0, 1, 1, 1]))
+    stopped = wire.encode_status(Status(DeviceState.IDLE, StateReason.STOPPED, 0, 0, 2000, 9), 1)
+    assert core.step(frame(stopped)).events == []
+    ended = core.end()
+    assert [event["exposures"] for event in ended.events] == [5]
+    assert len(ended.decisions) == 1  # the window that lies whole in the gap
+    assert core.end().events == []
+
+
+def test_an_absurd_exposure_number_is_damage_not_a_million_windows() -> None:
+    core, decider = make(n_cycles=0)
+    assert core.step(cycle(0, 1 << 26, [0, 0, 0, 0])).decisions == []
+    assert core.tracker.counters.malformed == 1
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].flags == 0
 
 
 def test_an_earlier_runs_completion_is_no_news() -> None:
@@ -143,7 +200,7 @@ def test_random_losses_never_reach_the_decider(seed: int) -> None:
     for seq in range(200):
         if rng.random() > 0.2:
             log += core.step(cycle(seq, seq, rng.integers(0, 2, 4).tolist())).decisions
-    log += core.step(completed(800)).decisions
+    log += core.step(completed(800)).decisions + core.step(completed(800, tick=10**6 + 1)).decisions
     assert len(log) == 200
     flagged = [d for d in log if d.flags & DecisionFlag.GAP]
     assert len(flagged) + len(decider.asked) == 200

@@ -154,7 +154,7 @@ def test_a_device_that_dies_ends_the_run_loudly(bundle: Bundle, scene: Path) -> 
         return data if seen[0] < 6000 else b""
 
     result = run(bundle, scene, n_objects=200, disturb=die)
-    assert result.ended == "the device fell silent"
+    assert result.ended == "the link was lost: the device fell silent"
     assert result.link_lost
 
 
