@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from pans.runtime.profile import Profile
 
     from .evaluate import Measured
+    from .options import Options
     from .tasks import Objects, Task
-    from .train import EpochReport, Options, Trained
+    from .train import EpochReport, Trained
 
 DEFAULT_PROFILE = "oled-qcmos"
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
@@ -72,8 +73,9 @@ def _train(args: argparse.Namespace) -> int:
     torch = _torch()
     from pans.runtime.profile import load_profile
 
+    from .options import check_options
     from .tasks import load_task
-    from .train import check_options, train
+    from .train import train
 
     if not 1 <= args.threads <= 1024:
         raise UsageError(f"--threads is {args.threads}, allowed: 1 to 1024")
@@ -114,8 +116,7 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> Options:
-    from .detection import EXACT_FEATURES_MAX
-    from .train import DEFAULT_ALPHA, Options
+    from .options import DEFAULT_ALPHA, EXACT_FEATURES_MAX, Options
 
     estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "ste")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
@@ -127,7 +128,7 @@ def _export_and_measure(
     args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float
 ) -> tuple[Any, Measured]:
     from .export import export
-    from .tasks import PUBLIC_SETS
+    from .public_sets import PUBLIC_SETS
 
     known = asdict(trained.options) | {"threads": args.threads}
     exported = export(
@@ -286,7 +287,7 @@ def _configure_data(parser: argparse.ArgumentParser) -> None:
 
 
 def _data(args: argparse.Namespace) -> int:
-    from .tasks import PUBLIC_SETS, check_pinned, data_folder, fetch
+    from .public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
 
     unknown = [name for name in args.names if name not in PUBLIC_SETS]
     if unknown:

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from pans.runtime.clicks import ClickLaw, survival_coefficients
 
-EXACT_FEATURES_MAX = 12  # 4096 words per object
 _MU_MAX = 100.0  # beyond it no detector of a profile stays dark, and high powers of mu leave float64
 _NEGLIGIBLE = 1e-13  # chance of missing that many photoelectrons, below which the term is left out
 

@@ -61,7 +61,7 @@ def light_of(
     `dark` replaces the profile's dark photoelectrons per exposure.
     """
     if images.shape[1:] != bundle.image_shape:
-        raise UsageError(f"images are {images.shape[1:]}, the patterns of {bundle.name} are {bundle.image_shape}")
+        raise UsageError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
         raise UsageError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
     law = click_law(profile, exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1)))

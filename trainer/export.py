@@ -6,6 +6,7 @@ back and raises when a score or a decision of the file differs from the torch mo
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,9 +114,14 @@ def export(
         head_onnx=graph,
         provenance={**provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
     )
-    write_bundle(bundle, path)
-    bundle, digest = load_bundle(path)
-    words, difference = compare(bundle, head, click_mean)
+    unchecked = path.with_name(path.name + ".unchecked")  # a wrong bundle must not stand where a right one may be
+    try:
+        write_bundle(bundle, unchecked)
+        bundle, digest = load_bundle(unchecked)
+        words, difference = compare(bundle, head, click_mean)
+        os.replace(unchecked, path)
+    finally:
+        unchecked.unlink(missing_ok=True)
     return Exported(bundle, digest, words, difference, dead)
 
 

@@ -14,9 +14,8 @@ Stages (one epoch is one pass over the training objects):
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,10 @@ import torch
 from torch import Tensor
 
 from pans.runtime.clicks import ClickLaw, click_law, object_transmission
-from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import Profile
 
+from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import (
-    EXACT_FEATURES_MAX,
     click_probability,
     click_words,
     expected_cross_entropy,
@@ -37,33 +35,15 @@ from .detection import (
 )
 from .encoders import ActiveIllumination
 from .heads import MlpHead
+from .options import EXACT_FEATURES_MAX, Options, check_options
 from .quantise import Quantised, exposure_us_of, quantise, top_limits
 from .tasks import Objects, Task
 
 VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
 CHUNK = 2000  # objects per pass where no gradient is needed
-DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
-DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What to train. `alpha` weighs the illumination; `photons` and `clicks` are targets per inference, held by weights."""
-
-    features: int
-    alpha: float | None = None
-    photons: float | None = None
-    clicks: float | None = None
-    estimator: str = "exact"
-    epochs: int = 60
-    seed: int = 0
-    restarts: int = 1
-    hidden: int = 512
-    batch: int = 512
-    front_rate: float = 1e-2
-    head_rate: float = 1e-3
-    slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
-    clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
+DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
+DUAL_RATE_MAX = 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,42 +73,6 @@ class Trained:
     options: Options
 
 
-def check_options(options: Options, profile: Profile) -> None:
-    """Raise UsageError or PlanError for what cannot be trained on this profile."""
-    limits = {"features": (1, 4096), "epochs": (1, 100_000), "restarts": (1, 1000), "hidden": (1, 65536)}
-    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1)}
-    for name, (low, high) in limits.items():
-        if not low <= getattr(options, name) <= high:
-            raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
-    for name in ("alpha", "photons", "clicks"):
-        value = getattr(options, name)
-        if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
-            raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
-    if options.clicks is not None and options.clicks >= options.features:
-        raise UsageError(
-            f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
-        )
-    if options.estimator not in ("ste", "exact"):
-        raise UsageError(f"--estimator is {options.estimator!r}, allowed: ste, exact")
-    if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
-        raise UsageError(
-            f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
-            f"{EXACT_FEATURES_MAX} patterns",
-            remedy="use --estimator ste",
-        )
-    channels = profile.detector.channels
-    if profile.mode == "parallel" and options.features > channels:
-        raise PlanError(
-            f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
-            remedy=f"--features {channels}, or fewer",
-        )
-    if options.features > profile.projector.pattern_memory:
-        raise PlanError(
-            f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
-            remedy=f"--features {profile.projector.pattern_memory}, or fewer",
-        )
-
-
 def train(
     task: Task,
     profile: Profile,
@@ -145,7 +89,7 @@ def train(
     """
     check_options(options, profile)
     data = _Data(task, profile, validation=max(1, len(task.train) // VALIDATION_PART))
-    saved = _read_checkpoint(checkpoint, options, task) if resume and checkpoint else {}
+    saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
     best: dict[str, Any] | None = saved.get("best")
     losses: list[float] = saved.get("losses", [])
     for restart in range(len(losses), options.restarts):
@@ -155,7 +99,7 @@ def train(
         while run.epoch < options.epochs:
             report(run.one_epoch())
             if checkpoint:
-                _write_checkpoint(checkpoint, options, task, {"run": run.state(), "best": best, "losses": losses})
+                write_checkpoint(checkpoint, options, task.sha256, {"run": run.state(), "best": best, "losses": losses})
         losses = [*losses, run.validation_loss()]
         if losses[-1] <= min(losses):
             best = run.state()
@@ -191,6 +135,8 @@ class _Run:
         self.encoder = ActiveIllumination(options.features, data.gray.shape[1], limits, self.random)
         self.head = MlpHead(options.features, options.hidden, data.n_classes, self.random)
         self.epoch = 0
+        steps = options.epochs * math.ceil(data.n_fit / options.batch)
+        self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))
         self.weights = {"photons": 1e-3, "clicks": 1e-3}  # of the budgets; they follow the excess
         self.optimiser = self._new_optimiser()
 
@@ -292,7 +238,7 @@ class _Run:
             if target is not None:
                 penalty = penalty + self.weights[name] * measured
                 excess = min(1.0, max(-1.0, float(measured.detach()) / target - 1))
-                self.weights[name] = min(10.0, max(1e-5, self.weights[name] * math.exp(DUAL_RATE * excess)))
+                self.weights[name] = min(10.0, max(1e-5, self.weights[name] * math.exp(self.dual_rate * excess)))
         return penalty
 
     def _slope_and_clamp(self, progress: float) -> tuple[float, float]:
@@ -403,34 +349,3 @@ def fit_head_exactly(head: MlpHead, joint: Tensor, steps: int = 1500, rate: floa
         loss = -(target * torch.log_softmax(head(words), dim=1)).sum()
         loss.backward()
         optimiser.step()
-
-
-def _identity(options: Options, task: Task) -> dict[str, Any]:
-    plain = {key: str(value) for key, value in asdict(replace(options, restarts=1)).items()}
-    return plain | {"task": task.sha256}
-
-
-def _write_checkpoint(path: Path, options: Options, task: Task, state: dict[str, Any]) -> None:
-    beside = path.with_name(path.name + ".part")
-    torch.save({"identity": _identity(options, task), **state}, beside)
-    os.replace(beside, path)
-
-
-def _read_checkpoint(path: Path, options: Options, task: Task) -> dict[str, Any]:
-    if not path.is_file():
-        raise UsageError(f"{path} is not there", remedy="leave --resume out to start anew")
-    try:
-        saved: dict[str, Any] = torch.load(path, weights_only=True)  # tensors and plain values only
-        found = saved["identity"]
-    except Exception as error:  # torch raises a dozen unrelated classes
-        raise DamagedFileError(
-            f"{path}: not a checkpoint: {error}", remedy="leave --resume out to start anew"
-        ) from error
-    wanted = _identity(options, task)
-    differing = [f"{key} {found.get(key)} (now {value})" for key, value in wanted.items() if found.get(key) != value]
-    if differing:
-        raise UsageError(
-            f"{path} belongs to another training: {', '.join(differing)}",
-            remedy="repeat its options, or leave --resume out",
-        )
-    return saved

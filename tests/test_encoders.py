@@ -1,0 +1,77 @@
+"""Active illumination: squared weights inside the limits of the projector, whole levels, gradients through the rounding."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import math
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.trainer.encoders import ActiveIllumination
+
+
+def encoder(limits=(0.1, 2.0), seed=0):
+    return ActiveIllumination(3, 20, limits, torch.Generator().manual_seed(seed))
+
+
+def test_photoelectrons_are_squared_weights_times_transmission():
+    light = encoder(limits=(0.1, 100.0))
+    transmission = torch.rand(5, 20, generator=torch.Generator().manual_seed(1))
+    wanted = transmission.numpy() @ (light.weight.detach().numpy() ** 2).T
+    assert light(transmission).detach().numpy() == pytest.approx(wanted, rel=1e-6)
+
+
+def test_gradient_of_the_illumination_is_twice_the_weight():
+    light = encoder(limits=(0.1, 100.0))
+    light.patterns().sum().backward()
+    assert torch.allclose(light.weight.grad, 2 * light.weight.detach())
+
+
+def test_initial_weights_are_kaiming_uniform():
+    wide = ActiveIllumination(10, 784, (0.1, 2.0), torch.Generator().manual_seed(2))
+    bound = math.sqrt(6 / ((1 + 1.2**2) * 784))
+    weights = wide.weight.detach().numpy()
+    assert np.abs(weights).max() <= bound
+    assert weights.std() == pytest.approx(bound / math.sqrt(3), rel=0.03)
+    assert abs(weights.mean()) < 5 * bound / math.sqrt(3 * weights.size)
+
+
+def test_no_pixel_is_brighter_than_the_projector():
+    light = encoder()
+    with torch.no_grad():
+        light.weight[0, 0] = 5.0
+    assert float(light.patterns().detach().max()) == 2.0
+
+
+def test_patterns_are_whole_levels_once_quantised():
+    light = encoder()
+    with torch.no_grad():
+        light.weight.mul_(8)
+    before = light.patterns().detach()
+    light.start_quantising(16)
+    top = float(light.top().detach())
+    assert top == pytest.approx(float(before.max()))
+    levels = light.patterns().detach() / (top / 15)
+    assert torch.allclose(levels, levels.round(), atol=1e-5)
+    assert float((light.patterns().detach() - before).abs().max()) <= 0.5 * top / 15 * (1 + 1e-5)
+
+
+def test_the_gradient_passes_the_rounding_and_reaches_the_top_level():
+    light = encoder()
+    with torch.no_grad():
+        light.weight.mul_(8)
+    light.start_quantising(4)
+    light.patterns().sum().backward()
+    inside = light.weight.detach() ** 2 < float(light.top().detach())
+    assert torch.allclose(light.weight.grad[inside], 2 * light.weight.detach()[inside])
+    assert float(light.log_top.grad) != 0
+
+
+def test_the_top_level_stays_within_its_limits():
+    light = encoder()
+    light.start_quantising(4)
+    assert 0.1 <= float(light.top().detach()) <= 2.0
+    with torch.no_grad():
+        light.log_top.fill_(10.0)
+    assert float(light.top().detach()) == pytest.approx(2.0)

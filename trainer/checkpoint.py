@@ -1,0 +1,51 @@
+"""Checkpoints: the state of a training on disk, so that an interrupted one goes on to the same result.
+
+Owns the file and the check that it belongs to this training; never knows what the state means. Tensors and plain values
+only: a stranger's file cannot run code.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pans.runtime.errors import DamagedFileError, UsageError
+
+from .options import Options
+
+
+def _identity(options: Options, data_sha256: str) -> dict[str, Any]:
+    plain = {key: str(value) for key, value in asdict(replace(options, restarts=1)).items()}
+    return plain | {"data": data_sha256}
+
+
+def write_checkpoint(path: Path, options: Options, data_sha256: str, state: dict[str, Any]) -> None:
+    """Write `state` (tensors and plain values) to `path`, whole or not at all."""
+    beside = path.with_name(path.name + ".part")
+    torch.save({"identity": _identity(options, data_sha256), **state}, beside)
+    os.replace(beside, path)
+
+
+def read_checkpoint(path: Path, options: Options, data_sha256: str) -> dict[str, Any]:
+    """Return the state in `path`; UsageError unless it belongs to the same options (but restarts) and data."""
+    if not path.is_file():
+        raise UsageError(f"{path} is not there", remedy="leave --resume out to start anew")
+    try:
+        saved: dict[str, Any] = torch.load(path, weights_only=True)  # tensors and plain values only
+        found = saved["identity"]
+    except Exception as error:  # torch raises a dozen unrelated classes
+        raise DamagedFileError(
+            f"{path}: not a checkpoint: {error}", remedy="leave --resume out to start anew"
+        ) from error
+    wanted = _identity(options, data_sha256)
+    differing = [f"{key} {found.get(key)} (now {value})" for key, value in wanted.items() if found.get(key) != value]
+    if differing:
+        raise UsageError(
+            f"{path} belongs to another training: {', '.join(differing)}",
+            remedy="repeat its options, or leave --resume out",
+        )
+    return saved

@@ -1,0 +1,71 @@
+"""What to train: the options of `pans train`, and what of them is impossible on a profile.
+
+Owns the names, defaults and limits; never trains. `check_options` returns nothing, or raises with the numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.profile import Profile
+
+EXACT_FEATURES_MAX = 12  # 4096 click words per object
+DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to train. `alpha` weighs the illumination; `photons` and `clicks` are targets per inference, held by weights."""
+
+    features: int
+    alpha: float | None = None
+    photons: float | None = None
+    clicks: float | None = None
+    estimator: str = "exact"
+    epochs: int = 60
+    seed: int = 0
+    restarts: int = 1
+    hidden: int = 512
+    batch: int = 512
+    front_rate: float = 1e-2
+    head_rate: float = 1e-3
+    slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
+    clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+
+
+def check_options(options: Options, profile: Profile) -> None:
+    """Raise UsageError or PlanError for what cannot be trained on this profile."""
+    limits = {"features": (1, 4096), "epochs": (1, 100_000), "restarts": (1, 1000), "hidden": (1, 65536)}
+    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1)}
+    for name, (low, high) in limits.items():
+        if not low <= getattr(options, name) <= high:
+            raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
+    for name in ("alpha", "photons", "clicks"):
+        value = getattr(options, name)
+        if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
+            raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
+    if options.clicks is not None and options.clicks >= options.features:
+        raise UsageError(
+            f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
+        )
+    if options.estimator not in ("ste", "exact"):
+        raise UsageError(f"--estimator is {options.estimator!r}, allowed: ste, exact")
+    if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
+        raise UsageError(
+            f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
+            f"{EXACT_FEATURES_MAX} patterns",
+            remedy="use --estimator ste",
+        )
+    channels = profile.detector.channels
+    if profile.mode == "parallel" and options.features > channels:
+        raise PlanError(
+            f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
+            remedy=f"--features {channels}, or fewer",
+        )
+    if options.features > profile.projector.pattern_memory:
+        raise PlanError(
+            f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
+            remedy=f"--features {profile.projector.pattern_memory}, or fewer",
+        )
