@@ -18,8 +18,10 @@ from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link import Link, open_link
 from pans.runtime.profile import load_profile
 
-from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock
+from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
 from .device import Instrument
+from .faults import NO_FAULTS, check_possible, parse_faults
+from .faulty import FaultyDevice
 from .scene import load_scene
 from .virtual import START_NS, VirtualLink
 
@@ -38,10 +40,11 @@ class SimOptions:
     pace: str = "real"
     offset: int = DEFAULT_OFFSET_TICKS
     drift_ppm: float = DEFAULT_DRIFT_PPM
+    faults: str = ""
 
 
 def parse_sim_url(url: str) -> SimOptions:
-    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&offset=TICKS&drift_ppm=X]`; UsageError for anything else."""
+    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&offset=TICKS&drift_ppm=X]`; UsageError for anything else."""
     scheme, _, rest = url.partition(":")
     profile, _, query = rest.partition("?")
     if scheme != "sim" or not profile:
@@ -67,17 +70,29 @@ def check_options(options: SimOptions) -> SimOptions:
         raise UsageError(f"seed={options.seed}: allowed are 0..2^64-1")
     if not 0 <= options.offset < 1 << 60:
         raise UsageError(f"offset={options.offset}: allowed are 0..2^60-1 ticks")
+    check_possible(parse_faults(options.faults), pace=options.pace)
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
     return options
 
 
-def build_instrument(options: SimOptions, host_ns: int) -> tuple[Instrument, DeviceClock]:
-    """Make the instrument, switched on at `host_ns`, and its clock; ConfigError for an impossible profile or scene."""
+def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, DeviceClock]:
+    """Make the instrument, switched on at `host_ns`, and its clock; ConfigError for an impossible profile or scene.
+
+    With faults, the instrument stands behind a bad link.
+    """
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
     scene = load_scene(options.scene)
-    return Instrument(profile, scene, seed=options.seed, power_on_tick=clock.tick_at(host_ns)), clock
+    faults = parse_faults(options.faults)
+
+    def switch_on(epoch: int, tick: int) -> Instrument:
+        return Instrument(profile, scene, seed=options.seed, power_on_tick=tick, epoch=epoch)
+
+    start_tick = clock.tick_at(host_ns)
+    if faults == NO_FAULTS:
+        return switch_on(1, start_tick), clock
+    return FaultyDevice(switch_on, clock, faults, options.seed, start_tick), clock
 
 
 def open_sim(url: str) -> Link:

@@ -29,6 +29,7 @@ from .wire import (
 )
 
 NO_LABEL = 0xFFFF
+NO_FLAGS = DecisionFlag(0)
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 
 
@@ -174,7 +175,7 @@ class Core:
     def _missed(self, exposure_index: int, tick: int) -> list[Decision]:
         return [self._decide(window, tick) for window in self.windows.skip_to(exposure_index)]
 
-    def _decide(self, window: Window, tick: int, flags: DecisionFlag = DecisionFlag(0)) -> Decision:
+    def _decide(self, window: Window, tick: int, flags: DecisionFlag = NO_FLAGS) -> Decision:
         label, probability = NO_LABEL, 0.0
         if window.missing:
             flags |= DecisionFlag.GAP

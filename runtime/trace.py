@@ -26,7 +26,7 @@ class TracedLink:
         self.now_ns = link.now_ns
         self.pause: Any = getattr(link, "pause", time.sleep)
         try:
-            self._file = open(path, "w", encoding="ascii", buffering=1)
+            self._file = open(path, "w", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
         except OSError as error:
             raise UsageError(f"{path}: the trace cannot be written: {error.strerror or error}") from error
         self._note("#", f"{link.name} opened; > to the device, < from it; seconds since then")
