@@ -1,0 +1,292 @@
+"""Baselines, the common ground: light, detection, the exact posterior over the training objects, and the score.
+
+Owns what every alternative to PANS shares: how N photons are dealt out, how they are detected, the Bayes decision of a
+mixture of all training objects, and how a result is counted. Never trains a network (baseline_nets.py) and reads no file.
+numpy only. Readouts are float32 (n, m): m pixels of a frame, or m = d_f patterns.
+
+Two conventions of "N photons" (`brightness`), both SIMULATED:
+
+- **source**: one source for all objects; N is the mean over the test objects, bright objects give more (the paper's
+  appendix on direct imaging, and `photons` everywhere in this project). How bright an object is then tells about it.
+- **object**: the source follows the object, so that every object gives N photons in expectation.
+
+Two detectors: `counting` (Poisson counts: ideal shot noise) and `binary` (a click when at least one photon came).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import UsageError
+
+from .evaluate import Measured
+from .tasks import Task
+
+BRIGHTNESS = ("source", "object")
+DETECTORS = ("counting", "binary")
+FLOORS = (1e-3, 5e-3, 2e-2)  # of full transmission, among which a part of the training objects chooses
+VALIDATION_OBJECTS = 1000
+_BLOCK = 4096  # training objects per matrix product
+_CHUNK = 2048  # readouts per matrix product: 32 MiB of log-likelihoods at a time
+_GRAY_MAX = np.float32(255)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Decide = Callable[[F32], I64]  # readouts (n, m) -> labels (n,)
+Report = Callable[[str, float], None]  # what is being done, and which part of it is done (0 to 1)
+
+
+def silent(_what: str, _done: float) -> None:
+    """A `Report` for nobody."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """Linear measurements of all objects of a task at unit light: rows (objects, m), times `unit`, are sums of transmission.
+
+    `full` (m,) is what an object of transmission 1 everywhere would give: the sum of each pattern.
+    """
+
+    train: NDArray[Any]
+    train_labels: I64
+    test: NDArray[Any]
+    test_labels: I64
+    n_classes: int
+    full: F32
+    unit: float
+    brightness: str
+    image_shape: tuple[int, int] | None  # of a frame; None when the m values are no picture
+
+    def photoelectrons(self, rows: NDArray[Any], photons: float, floor: float = 0.0) -> F32:
+        """Return expected photoelectrons, float32 (n, m), of `rows` at `photons` per object; `floor` lifts every transmission.
+
+        Dark objects stay dark: they give no light in either convention.
+        """
+        light = rows.astype(np.float32)
+        light *= np.float32(self.unit)
+        if floor:
+            light += np.float32(floor) * self.full
+        light *= np.float32(self._scale(light, photons))
+        return light
+
+    def illumination(self, photons: float) -> float:
+        """Return the sum of all pattern intensities, in photoelectrons per unit transmission, averaged over the test objects."""
+        light = self.test.astype(np.float32) * np.float32(self.unit)
+        return float(np.mean(self._scale(light, photons))) * float(self.full.sum(dtype=np.float64))
+
+    def _scale(self, light: F32, photons: float) -> Any:
+        if self.brightness == "source":
+            return photons / (float(self.test.sum(dtype=np.float64)) * self.unit / len(self.test))
+        sums = light.sum(axis=1, keepdims=True, dtype=np.float64)
+        return np.divide(photons, sums, out=np.zeros_like(sums), where=sums > 0)
+
+
+def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
+    """Measure all objects of `task` by `patterns` (d_f, pixels, at least 0), or pixel by pixel without them (direct imaging)."""
+    if brightness not in BRIGHTNESS:
+        raise UsageError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
+    n_pixels = math.prod(task.image_shape)
+    train, test = (part.images.reshape(len(part), n_pixels) for part in (task.train, task.test))
+    if not test.any():
+        raise UsageError(f"the test objects of {task.name} are black: no light can reach the detector")
+    shared = (task.train.labels, task.test.labels, len(task.classes))
+    if patterns is None:
+        ones = np.ones(n_pixels, np.float32)
+        return Measurement(train, shared[0], test, shared[1], shared[2], ones, 1 / 255, brightness, task.image_shape)
+    if patterns.ndim != 2 or patterns.shape[1] != n_pixels or not (patterns >= 0).all() or not patterns.any():
+        raise UsageError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
+    weights = patterns.astype(np.float32).T
+    features = [_features(images, weights) for images in (train, test)]
+    full = weights.sum(axis=0)
+    return Measurement(features[0], shared[0], features[1], shared[1], shared[2], full, 1.0, brightness, None)
+
+
+def _features(images: NDArray[np.uint8], weights: F32) -> F32:
+    out = np.empty((len(images), weights.shape[1]), np.float32)
+    for start in range(0, len(images), _BLOCK):
+        part = images[start : start + _BLOCK].astype(np.float32) / _GRAY_MAX
+        out[start : start + _BLOCK] = part @ weights
+    return out
+
+
+# ---- detection ----
+
+
+def detect(photoelectrons: F32, detector: str, rng: np.random.Generator, dark: float = 0.0) -> F32:
+    """Return one readout per value: Poisson counts, or whether there was any; `dark` photoelectrons are added to each."""
+    counts = rng.poisson(photoelectrons.astype(np.float64) + dark)
+    return (counts > 0).astype(np.float32) if detector == "binary" else counts.astype(np.float32)
+
+
+def log_weights(photoelectrons: F32, detector: str) -> tuple[F32, F32]:
+    """Return (w, b) with log P(readout | object) = readout @ w + b + what does not depend on the object.
+
+    Counting: w = log(lambda), b = -sum(lambda). Binary: log(p / (1 - p)) = log(expm1(lambda)), and sum(log(1 - p)) is
+    again -sum(lambda). Where there is no light, w is -inf and any photon rules the object out: lift it by a floor.
+    """
+    total = photoelectrons.sum(axis=1, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        if detector == "counting":
+            return np.log(photoelectrons), -total.astype(np.float32)
+        # log(expm1(x)) = x + log(1 - exp(-x)): does not overflow
+        return photoelectrons + np.log(-np.expm1(-photoelectrons)), -total.astype(np.float32)
+
+
+# ---- the exact posterior ----
+
+
+def log_joint(
+    measurement: Measurement,
+    readouts: F32,
+    photons: float,
+    detector: str,
+    *,
+    floor: float = FLOORS[0],
+    dark: float = 0.0,
+    left_out: NDArray[np.bool_] | None = None,
+    report: Report = silent,
+) -> F64:
+    """Return log sum P(readout | object) / objects over the training objects of every class, float64 (n, classes).
+
+    Exact under the model that the world holds just these objects, up to a term that all classes share: the arg max is the
+    Bayes decision, the softmax its posterior. `left_out` (training objects,) are no part of the mixture.
+    """
+    if not (floor > 0 or dark > 0):
+        raise UsageError(f"floor is {floor:g} and dark is {dark:g}: one must be above 0", remedy="try --floor 0.001")
+    labels = measurement.train_labels if left_out is None else np.where(left_out, -1, measurement.train_labels)
+    # log weights are taken relative to a typical object: smaller numbers, fewer lost digits in float32
+    typical = measurement.photoelectrons(measurement.train[::50], photons, floor).mean(axis=0, keepdims=True) + dark
+    reference = log_weights(typical.astype(np.float32), detector)[0]
+    out = np.full((len(readouts), measurement.n_classes), -np.inf)
+    done, total = 0, int((labels >= 0).sum())
+    for label in range(measurement.n_classes):
+        members = np.flatnonzero(labels == label)
+        for start in range(0, len(members), _BLOCK):
+            rows = measurement.train[members[start : start + _BLOCK]]
+            light = measurement.photoelectrons(rows, photons, floor)
+            light += np.float32(dark)
+            weights, offsets = log_weights(light, detector)
+            weights -= reference
+            for first in range(0, len(readouts), _CHUNK):
+                likelihood = readouts[first : first + _CHUNK] @ weights.T
+                likelihood += offsets
+                of_class = out[first : first + _CHUNK, label]
+                np.logaddexp(of_class, _log_sum_exp(likelihood), out=of_class)
+            done += len(rows)
+            report("posterior over the training objects", done / total)
+    return out - math.log(total)
+
+
+def _log_sum_exp(rows: F32) -> F64:
+    """Along the last axis; `rows` is overwritten."""
+    top = rows.max(axis=1, keepdims=True)
+    rows -= top
+    np.exp(rows, out=rows)
+    sums: F64 = np.log(rows.sum(axis=1, dtype=np.float64)) + top[:, 0]
+    return sums
+
+
+def choose_floor(
+    measurement: Measurement, photons: float, detector: str, rng: np.random.Generator, *, dark: float = 0.0
+) -> float:
+    """Return the one of `FLOORS` that decides best on training objects left out of the mixture; the test objects stay unseen."""
+    n = len(measurement.train_labels)
+    left_out = np.zeros(n, bool)
+    left_out[rng.permutation(n)[: min(VALIDATION_OBJECTS, n // 5)]] = True
+    light = measurement.photoelectrons(measurement.train[left_out], photons)
+    readouts = detect(light, detector, rng, dark)
+    wanted = measurement.train_labels[left_out]
+    right = []
+    for floor in FLOORS:
+        joint = log_joint(measurement, readouts, photons, detector, floor=floor, dark=dark, left_out=left_out)
+        right.append(int((joint.argmax(axis=1) == wanted).sum()))
+    return FLOORS[int(np.argmax(right))]
+
+
+def bayes(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    *,
+    seed: int,
+    dark: float = 0.0,
+    floor: float | None = None,
+    report: Report = silent,
+) -> tuple[Decide, float]:
+    """Return the Bayes decision of the mixture of all training objects, and its floor (by default chosen on left-out ones).
+
+    For frames and for measured features alike: nothing decides better as far as the training objects stand for the world.
+    """
+    if floor is None:
+        rng = np.random.default_rng([seed, 2])
+        floor = choose_floor(measurement, photons, detector, rng, dark=dark)
+
+    def decide(readouts: F32) -> I64:
+        joint = log_joint(measurement, readouts, photons, detector, floor=floor, dark=dark, report=report)
+        labels: I64 = joint.argmax(axis=1)
+        return labels
+
+    return decide, floor
+
+
+# ---- the score ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trials:
+    """What was decided: `right` (trials, objects), the readouts' clicks (objects,), expected photons (objects,)."""
+
+    right: NDArray[np.bool_]
+    clicks: F64
+    photons: F64
+    illumination: float
+
+    def measured(self, first: int | None = None) -> Measured:
+        """Return means over the first `first` objects (default: all), with the spread over trials and over objects apart.
+
+        `clicks_mean` counts readouts with at least one photon, for a counting detector too: what a binary one would report.
+        """
+        right = self.right[:, :first].astype(np.float64)
+        of_object, n = right.mean(axis=0), right.shape[1]
+        return Measured(
+            accuracy_mean=float(right.mean()),
+            accuracy_std=float(right.mean(axis=1).std(ddof=1)) if len(right) > 1 else 0.0,
+            accuracy_se_objects=float(of_object.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+            clicks_mean=float(self.clicks[:first].mean()),
+            photons_mean=float(self.photons[:first].mean()),
+            illumination=self.illumination,
+            objects=n,
+            trials=len(right),
+            shots=1,
+        )
+
+
+def run_trials(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    decide: Decide,
+    *,
+    trials: int,
+    seed: int,
+    dark: float = 0.0,
+) -> Trials:
+    """Detect every test object `trials` times at `photons` per object and let `decide` (readouts -> labels) judge."""
+    if not (trials >= 1 and 0 < photons < math.inf and 0 <= dark < math.inf):
+        raise UsageError(f"{trials} trials, {photons:g} photons, dark {dark:g}; allowed: from 1, above 0, from 0")
+    light = measurement.photoelectrons(measurement.test, photons)
+    rng = np.random.default_rng([seed, 1])
+    right = np.empty((trials, len(light)), bool)
+    clicks = np.zeros(len(light))
+    for trial in range(trials):
+        readouts = detect(light, detector, rng, dark)
+        clicks += (readouts > 0).sum(axis=1)
+        right[trial] = decide(readouts) == measurement.test_labels
+    return Trials(right, clicks / trials, light.sum(axis=1, dtype=np.float64), measurement.illumination(photons))
