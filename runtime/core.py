@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 from .decide import Decider
 from .ingest import Gap, StreamTracker
 from .plan import Plan
-from .record import DecisionFlag
+from .record_format import NO_LABEL as NO_LABEL
+from .record_format import DecisionFlag
 from .window import DecisionWindows, Window
 from .wire import (
     NO_OBJECT,
@@ -28,7 +29,6 @@ from .wire import (
     decode_status,
 )
 
-NO_LABEL = 0xFFFF
 NO_FLAGS = DecisionFlag(0)
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 
@@ -127,13 +127,15 @@ class Core:
             return Output([], [], None)
         events = [] if gap is None else [_gap_event(gap)]
         n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
-        if message.exposure_index + n_exposures > self._end_exposure:
+        if message.exposure_index + n_exposures > self._end_exposure or not self.windows.fits(message):
             self.tracker.counters.malformed += 1
             return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
         self._last_tick = end_tick
         decisions = self._missed(message.exposure_index, message.tick)
-        decisions += [self._decide(window, end_tick) for window in self.windows.push(message)]
+        for window in self.windows.push(message):
+            before_end = (message.exposure_index + n_exposures - 1 - window.last_exposure) * message.period_ticks
+            decisions.append(self._decide(window, end_tick - before_end))
         return Output(decisions, events, end_tick)
 
     def warm_up(self) -> None:
@@ -186,6 +188,10 @@ class Core:
             self.n_abstained += 1
         else:
             label, probability = self._decider.decide(window.counts, self.shots)
+            if not probability > 0:  # the scores were not finite: their label means nothing
+                flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
+                label, probability = NO_LABEL, 0.0
+                self.n_abstained += 1
         mark = self.marks.get(window.object_index)
         decision = Decision(
             number=self.n_decisions,

@@ -112,6 +112,18 @@ class DecisionWindows:
         self._next_window = 0
         self._object = NO_OBJECT
 
+    def fits(self, block: ClickBlock | FrameBlock) -> bool:
+        """Whether `block` is of the plan's kind, lies within one visit and has a bit for every channel: what `push` relies on."""
+        if isinstance(block, FrameBlock):
+            n_exposures, word_bytes = block.words.shape
+            if not self.parallel or 8 * word_bytes < self._counts.shape[1]:
+                return False
+        else:
+            n_exposures = len(block.patterns)
+            if self.parallel:
+                return False
+        return block.exposure_index % self.visit_exposures + n_exposures <= self.visit_exposures
+
     def push(self, block: ClickBlock | FrameBlock) -> list[Window]:
         """Count a block and return the windows that are settled by it, oldest first."""
         visit, relative = divmod(block.exposure_index, self.visit_exposures)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plans import shot_major
+from plans import parallel, shot_major
 
 from pans.runtime import wire
 from pans.runtime.core import MAX_MARKS, NO_LABEL, Core
-from pans.runtime.decide import Verdict
+from pans.runtime.decide import Verdict, softmax_winner
 from pans.runtime.record import DECISION_DTYPE, DecisionFlag
+from pans.runtime.window import DecisionWindows
 from pans.runtime.wire import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
 
 N_FEATURES = 3
@@ -205,3 +206,40 @@ def test_random_losses_never_reach_the_decider(seed: int) -> None:
     flagged = [d for d in log if d.flags & DecisionFlag.GAP]
     assert len(flagged) + len(decider.asked) == 200
     assert core.tracker.counters.lost_exposures == 4 * len(flagged)
+
+
+@pytest.mark.parametrize("score", [float("nan"), float("inf")])
+def test_scores_that_are_not_finite_give_no_label(score: float) -> None:
+    core, decider = make()
+    decider.decide = lambda counts, shots: softmax_winner(np.array([0.0, score], np.float32))  # type: ignore[method-assign]
+    (decision,) = core.step(cycle(0, 0, [0, 1, 0, 1])).decisions
+    assert (decision.label, decision.probability) == (NO_LABEL, 0.0)
+    assert decision.flags == DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
+    assert core.n_abstained == 1
+
+
+def test_the_tick_is_the_end_of_the_windows_own_last_exposure() -> None:
+    plan = parallel(N_FEATURES, 4)
+    core = Core(plan, CountingDecider(), 2, 0)  # type: ignore[arg-type]
+    block = wire.FrameBlock(0, 0, 1000, 0, 100, 0, np.ones((5, 1), np.uint8))
+    output = core.step(frame(wire.encode_frames(block, 1)))
+    assert [(d.exposure_index, d.tick) for d in output.decisions] == [(2, 1260), (4, 1460)]
+    assert output.block_end_tick == 1460
+
+
+def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
+    plan = parallel(N_FEATURES + 8, 4)
+    core = Core(plan, CountingDecider(), 1, 0)  # type: ignore[arg-type]
+    core.windows = DecisionWindows(plan, N_FEATURES + 8, 1)
+    too_narrow = wire.FrameBlock(0, 0, 0, 0, 100, 0, np.ones((5, 1), np.uint8))
+    two_visits = wire.FrameBlock(1, 0, 0, 5, 100, 0, np.ones((6, 2), np.uint8))
+    other_kind = ClickBlock(2, 0, 0, 11, 100, 0, np.zeros(2, np.uint16), np.ones(2, np.uint8))
+    for message in (
+        wire.encode_frames(too_narrow, 1),
+        wire.encode_frames(two_visits, 1),
+        wire.encode_clicks(other_kind, 1),
+    ):
+        output = core.step(frame(message))
+        assert output.events[-1]["kind"] == "beyond_plan"
+        assert all(d.flags & DecisionFlag.GAP for d in output.decisions)
+    assert core.tracker.counters.malformed == 3
