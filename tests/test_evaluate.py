@@ -2,6 +2,8 @@
 
 import itertools
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -118,3 +120,11 @@ def test_impossible_requests_are_refused():
         evaluate_sampled(model, light, LABELS, trials=0)
     with pytest.raises(UsageError, match="outcomes"):
         evaluate_exactly(model, light, LABELS, shots=40)
+
+
+def test_evaluation_loads_no_torch():
+    code = (
+        "import sys, pans.trainer.commands, pans.trainer.evaluate, pans.trainer.tasks\n"
+        "assert 'torch' not in sys.modules and 'onnx' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

@@ -171,7 +171,8 @@ def _progress(options: Options) -> Iterator[Callable[[EpochReport], None]]:
 
         def show(epoch: EpochReport) -> None:
             done = epoch.restart * options.epochs + epoch.epoch
-            bar.update(task, completed=done, description=_epoch_line(epoch, options))
+            said = f"{epoch.stage}: loss {epoch.loss:.3f}, {epoch.clicks:.1f} clicks, {epoch.photons:.0f} photons"
+            bar.update(task, completed=done, description=said)
 
         yield show
 
