@@ -20,6 +20,7 @@ from .bundle_format import bundle_bytes, parse_bundle
 from .container import canonical_json, parse_json_object, read_file, replace_file
 from .errors import UsageError
 from .head import OnnxHead, open_head
+from .int8_head import Int8Head
 
 __all__ = [
     "Bundle",
@@ -48,6 +49,8 @@ def make_bundle(
     table: ArrayLike | None = None,
     provenance: Mapping[str, Any],
     encoder: str = "active",
+    int8_head: Int8Head | None = None,
+    int8_onnx: bytes | None = None,
 ) -> Bundle:
     """Return a checked bundle with golden vectors, and with a table made from the head where d_f <= 12.
 
@@ -74,6 +77,8 @@ def make_bundle(
             golden_means=frozen(means),
             golden_scores=frozen(scores),
             provenance=parse_json_object(canonical_json(dict(provenance)), "provenance"),
+            int8_head=int8_head,
+            int8_onnx=None if int8_onnx is None else bytes(int8_onnx),
         )
         check_bundle(bundle)
     except (ValueError, TypeError) as error:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .head import HEAD_MAX_BYTES
+from .int8_head import STEP_MAX, WEIGHT_MAX, Int8Head
 
 ENCODERS = ("active",)
 FEATURES_MAX = 4096
@@ -24,6 +26,7 @@ CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
 TEXT_MAX_CHARACTERS = 200
 TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
+LAYERS_MAX = 16
 GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
 
 
@@ -44,6 +47,8 @@ class Bundle:
     golden_means: NDArray[np.float32]  # (g, d_f)
     golden_scores: NDArray[np.float32]  # (g, classes)
     provenance: Mapping[str, Any]
+    int8_head: Int8Head | None = None  # the head in integers, for our kernels
+    int8_onnx: bytes | None = None  # the same as a quantised ONNX model
 
     @property
     def n_features(self) -> int:
@@ -150,10 +155,31 @@ def check_bundle(bundle: Bundle) -> None:
     if bundle.head_onnx is not None:
         size = len(bundle.head_onnx)
         demand(0 < size <= HEAD_MAX_BYTES, f"the head has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+    if bundle.int8_onnx is not None:
+        size = len(bundle.int8_onnx)
+        demand(0 < size <= HEAD_MAX_BYTES, f"the int8 model has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+    if bundle.int8_head is not None:
+        _check_int8(bundle.int8_head, d_f, bundle.n_classes)
     if bundle.table is not None:
         check_table_shape(bundle.table.shape, d_f, bundle.n_classes)
         demand(bool(np.isfinite(bundle.table).all()), "the table holds scores that are not finite")
     _check_golden(bundle)
+
+
+def _check_int8(head: Int8Head, n_features: int, n_classes: int) -> None:
+    sizes = head.sizes.tolist()
+    demand(2 <= len(sizes) <= LAYERS_MAX + 1, f"the int8 head has {len(sizes) - 1} layers, allowed: 1 to {LAYERS_MAX}")
+    demand(min(sizes) >= 1, f"the int8 head has the sizes {sizes}, allowed: 1 or more")
+    ends = (sizes[0], sizes[-1])
+    demand(ends == (n_features, n_classes), f"the int8 head maps {ends}, allowed: {(n_features, n_classes)}")
+    n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
+    demand(head.weights.shape == (n_weights,), f"the int8 head has {head.weights.size} weights, needs {n_weights}")
+    wanted = (2, sum(sizes[1:]))
+    demand(head.affine.shape == wanted, f"int8_affine has shape {head.affine.shape}, allowed: {wanted}")
+    demand(bool(np.isfinite(head.affine).all()), "the int8 head holds scales that are not finite")
+    # a sum of integers stays exact: the kernel adds in int32
+    largest = max(n_in for n_in in sizes[1:-1]) * STEP_MAX * WEIGHT_MAX if len(sizes) > 2 else 0
+    demand(largest < 1 << 31, f"an int8 layer of {max(sizes[1:])} inputs could leave int32")
 
 
 def _check_golden(bundle: Bundle) -> None:

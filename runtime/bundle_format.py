@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .bundle_facts import LEVELS_MAX, Bundle, check_bundle, demand, frozen
 from .container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
 from .errors import DamagedFileError, UsageError
+from .int8_head import Int8Head
 
 MAGIC = b"PANSBNDL"
 FORMAT_VERSION = 1
@@ -30,6 +31,8 @@ _HEADER_KEYS = {
 }
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
+_INT8_PARTS = {"int8_sizes": "<u4", "int8_weights": "|i1", "int8_affine": "<f4"}  # all three or none
+_PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"}
 _REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
 
 
@@ -41,6 +44,11 @@ def bundle_bytes(bundle: Bundle) -> bytes:
     if bundle.table is not None:
         parts.append(("table", bundle.table))
     parts += [("golden_means", bundle.golden_means), ("golden_scores", bundle.golden_scores)]
+    if bundle.int8_head is not None:
+        head = bundle.int8_head
+        parts += [("int8_sizes", head.sizes), ("int8_weights", head.weights), ("int8_affine", head.affine)]
+    if bundle.int8_onnx is not None:
+        parts.append(("int8_onnx", np.frombuffer(bundle.int8_onnx, dtype=np.uint8)))
     rows, blobs, offset = [], [], 0
     for name, array in parts:
         blob = array.astype(_PARTS[name]).tobytes()
@@ -170,6 +178,7 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
     demand(isinstance(classes, list), f"classes is {ascii(classes)[:80]}, allowed: a list of names")
     demand(isinstance(header["provenance"], dict), "provenance is not an object")
     head = parts.get("head_onnx")
+    int8_onnx = parts.get("int8_onnx")
     bundle = Bundle(
         name=header["name"],
         task=header["task"],
@@ -184,9 +193,21 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
         golden_means=parts["golden_means"],
         golden_scores=parts["golden_scores"],
         provenance=header["provenance"],
+        int8_head=_int8_head(parts),
+        int8_onnx=None if int8_onnx is None else int8_onnx.tobytes(),
     )
     check_bundle(bundle)
     return bundle
+
+
+def _int8_head(parts: Mapping[str, NDArray[Any]]) -> Int8Head | None:
+    found = [parts[name] for name in _INT8_PARTS if name in parts]
+    demand(len(found) in (0, 3), f"an int8 head needs the parts {', '.join(_INT8_PARTS)}, all of them")
+    if not found:
+        return None
+    sizes, weights, affine = found
+    demand((sizes.ndim, weights.ndim, affine.ndim) == (1, 1, 2), "the parts of the int8 head have wrong shapes")
+    return Int8Head(frozen(sizes.astype(np.int64)), weights, affine)
 
 
 def _is_count(value: Any) -> bool:

@@ -141,7 +141,7 @@ def _refuse_external_data(model: bytes, where: str) -> None:
         kind, data, depth = pending.pop()
         if depth > _NESTING_MAX:
             raise _damaged(where, f"messages nested more than {_NESTING_MAX} deep")
-        for number, value in _fields(data, where):
+        for number, value in protobuf_fields(data, where):
             external = number == _TENSOR_EXTERNAL_DATA or (number == _TENSOR_DATA_LOCATION and value != 0)
             if kind == "tensor" and external:
                 raise _damaged(where, "its weights lie in another file (external data)")
@@ -150,7 +150,7 @@ def _refuse_external_data(model: bytes, where: str) -> None:
                 pending.append((child, value, depth + 1))
 
 
-def _fields(data: memoryview, where: str) -> Iterator[tuple[int, int | memoryview]]:
+def protobuf_fields(data: memoryview, where: str) -> Iterator[tuple[int, int | memoryview]]:
     """Yield (field number, value) of one protobuf message; fixed-width values come as their bytes."""
     position = 0
     while position < len(data):

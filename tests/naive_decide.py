@@ -42,3 +42,19 @@ def affine_scores(
         terms = [counts[pattern] / shots * weights[pattern][label] for pattern in range(len(counts))]
         result.append(math.fsum(terms) + bias[label])
     return result
+
+
+def mlp_scores(
+    counts: Sequence[int], shots: int, layers: Sequence[tuple[Sequence[Sequence[float]], Sequence[float], bool]]
+) -> list[float]:
+    """Scores of a chain of layers (weights (n_in, n_out), bias, rectified) in Python floats."""
+    values = [count / shots for count in counts]
+    for weights, bias, relu in layers:
+        sums = [math.fsum(values[i] * weights[i][k] for i in range(len(values))) + bias[k] for k in range(len(bias))]
+        values = [max(value, 0.0) for value in sums] if relu else sums
+    return values
+
+
+def integer_sums(steps: Sequence[int], weights: Sequence[Sequence[int]]) -> list[int]:
+    """The sums of one int8 layer in unbounded integers."""
+    return [sum(steps[i] * weights[i][k] for i in range(len(steps))) for k in range(len(weights[0]))]

@@ -17,6 +17,7 @@ from pans.runtime import decide_kernels
 from pans.runtime.bundle import Bundle, make_bundle, word_means
 from pans.runtime.decide import OnnxDecider, TableDecider, make_decider, softmax_winner
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.verdict import choice_of
 
 
 def _load(name: str) -> Any:
@@ -110,8 +111,7 @@ def test_every_word_as_the_oracle(backend: str) -> None:
 @pytest.mark.parametrize("batch", ["n", 1, None])
 def test_the_head_answers_means_of_several_shots(batch: Any) -> None:
     made, weights, bias = affine_bundle(5, 3, batch)
-    decider = make_decider(made, shots=7)
-    assert decider.name == "onnx"
+    decider = make_decider(made, shots=7, backend="onnx")
     counts = np.random.default_rng(3).integers(0, 8, size=(40, 5))
     scores = decider.scores_batch(counts, 7)
     assert scores.dtype == np.float32
@@ -128,7 +128,7 @@ def test_the_head_answers_means_of_several_shots(batch: Any) -> None:
 def test_fewer_shots_than_planned_are_still_means() -> None:
     made, weights, bias = affine_bundle(3, 2)
     wanted = naive.winner(naive.affine_scores([1, 0, 2], 2, weights.tolist(), bias.tolist()))
-    found = make_decider(made, shots=5).decide(np.array([1, 0, 2]), 2)
+    found = make_decider(made, shots=5, backend="onnx").decide(np.array([1, 0, 2]), 2)
     assert found.label == wanted[0]
     assert found.probability == pytest.approx(wanted[1], abs=1e-5)
 
@@ -214,14 +214,17 @@ def test_the_table_refuses_what_it_cannot_answer() -> None:
 def test_the_choice_of_the_back_end() -> None:
     both, _, _ = affine_bundle(3, 2)
     assert make_decider(both).name == "table"
-    assert make_decider(both, shots=2).name == "onnx"
+    measured = make_decider(both, shots=2)
+    assert measured.name in ("count-table", "sparse", "onnx")
+    assert choice_of(measured)["chosen"] == measured.name
+    assert set(choice_of(measured)["p50_us"]) == {"count-table", "sparse", "onnx"}
     assert make_decider(both, backend="onnx").name == "onnx"
     only_table = bundle(3, 2, table=np.zeros((8, 2)))
     for wrong in ({"backend": "onnx"}, {"shots": 2}, {"backend": "gpu"}, {"shots": 0}):
         with pytest.raises(UsageError):
             make_decider(only_table, **wrong)
     only_head = replaced(both, table=None)
-    assert make_decider(only_head).name == "onnx"
+    assert make_decider(only_head, backend="onnx").name == "onnx"
     with pytest.raises(UsageError, match="no table"):
         make_decider(only_head, backend="table")
     with pytest.raises(UsageError, match="single shots, not 3"):
