@@ -95,12 +95,14 @@ def run_live(
     watch: Watcher | None = None,
     started_ns: int | None = None,
     recovery: Recovery | None = None,
+    prepared: Callable[[LiveRun], None] | None = None,
 ) -> RunResult:
     """Run `plan` on the device behind `link` and decide until it is done; see the module's docstring.
 
     `watch` is called after every block, when there is slack, with the run and the block's output (for a live view).
     `started_ns` is the time from which "armed after" counts, on time.perf_counter_ns (default: now).
-    `recovery` says how to come back when the device is lost; without it the run ends there.
+    `recovery` says how to come back when the device is lost; without it the run ends there. `prepared` is called once, before
+    arming, with the run (for checks that look deeper than a view).
     """
     on_sent = None if recorder is None else recorder.add_command
 
@@ -129,6 +131,8 @@ def run_live(
         with arm_realtime(config.realtime and not link.virtual, [] if reader is None else [reader]) as granted:
             run.realtime = granted
             try:
+                if prepared is not None:
+                    prepared(run)
                 run.arm()
                 _until_ended(run, recovery, prepare, watch)
             except KeyboardInterrupt:
@@ -248,6 +252,11 @@ class LiveRun:
             self.ended = "the link was lost within the last object"
             return
         self.arm()
+
+    @property
+    def next_command_id(self) -> int:
+        """The id that the next command of this session will have."""
+        return self.connection.session.next_id
 
     def gate(self, tick: int, duration_ticks: int, channel: int) -> int:
         """Ask for a pulse at an absolute device tick and return the command's id; a refusal (too late) becomes an event.

@@ -23,6 +23,7 @@ STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS
 RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
+FAST_RETRY_NS = 10 * NS_PER_MS  # least time between repetitions that acknowledgements ask for
 MAX_WAITING = 256  # commands not sent yet; above it `submit` refuses
 MAX_PROBES = 64  # probes without an answer; the oldest is given up
 MAX_KEPT = 256  # answers that nobody has taken; the oldest is forgotten
@@ -64,13 +65,14 @@ class HostSession:
         self._output: list[bytes] = []
         self._hello_due_ns: int | None = None
         self._hello_started_ns = 0
-        self._next_id = 1
+        self.next_id = 1  # of the next command
         self._waiting: deque[tuple[int, bytes]] = deque()  # not sent yet
         self._unacknowledged: deque[tuple[int, bytes]] = deque()
         self._may_be_refused: set[int] = set()
         self._retry_due_ns = 0
         self._retry_after_ns = RETRY_FIRST_NS
         self._oldest_ns = 0
+        self._fast_retry_ns = 0  # not before
         self._probe_id = 0
         self._probes: deque[int] = deque(maxlen=MAX_PROBES)  # sent and not answered
 
@@ -90,9 +92,9 @@ class HostSession:
         if not self.has_room:
             raise LinkError(f"{MAX_WAITING} commands wait for a device that acknowledges none", remedy="check the link")
         if may_be_refused:
-            self._may_be_refused.add(self._next_id)
-        command_id = self._next_id
-        self._next_id += 1
+            self._may_be_refused.add(self.next_id)
+        command_id = self.next_id
+        self.next_id += 1
         self._waiting.append((command_id, wire.encode_command(command_id, opcode, body, self.nonce)))
         return command_id
 
@@ -210,6 +212,12 @@ class HostSession:
         self._hello_due_ns = None
 
     def _on_ack(self, ack: wire.Ack, now_ns: int) -> None:
+        oldest = self._unacknowledged[0][0] if self._unacknowledged else 0
+        if oldest > ack.last_id and now_ns >= self._fast_retry_ns:
+            # A later command was answered, so the oldest is lost: a gate cannot wait for the time-out.
+            self._fast_retry_ns = now_ns + FAST_RETRY_NS
+            self._output.extend(frame for _, frame in self._unacknowledged)
+            self.counters.retransmissions += len(self._unacknowledged)
         while self._unacknowledged and self._unacknowledged[0][0] <= ack.last_id:
             acknowledged, _ = self._unacknowledged.popleft()
             self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS
