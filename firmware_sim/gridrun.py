@@ -109,8 +109,8 @@ def grid_setup(mode: str) -> tuple[Profile, Bundle, Plan]:
     return profile, bundle, replace(plan, block_exposures=2 if mode == "sequential" else 1)
 
 
-def run_case(case: str, seed: int, frames: int) -> GridResult:
-    """Run one case for about `frames` stream messages and return what the checkers found."""
+def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) -> GridResult:
+    """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults."""
     mode = "parallel" if seed % 2 else "sequential"
     profile, bundle, plan = grid_setup(mode)
     checker = Checker(plan, SHOTS)
@@ -121,7 +121,7 @@ def run_case(case: str, seed: int, frames: int) -> GridResult:
     def switch_on(epoch: int, tick: int) -> WatchedInstrument:
         return WatchedInstrument(profile, scene, seed=seed, power_on_tick=tick, epoch=epoch).watch(checker)
 
-    faults = parse_faults(case_faults(case))
+    faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
     link = VirtualLink(device, clock, f"grid:{case}")
     host = GridHost(checker, plan, frames)
