@@ -19,6 +19,7 @@ from .clockwork import DeviceClock, SteppedDevice
 
 READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20
+FIFO_PRIORITY = 20  # above the host's loop: light does not wait for a computer
 LONGEST_WAIT_S = 0.25  # how late a stop request may be noticed
 
 
@@ -142,8 +143,20 @@ class TcpPort:
             self._client = None
 
 
+def ask_for_priority() -> str:
+    """Ask for SCHED_FIFO, since the instrument stands in for hardware that is never late itself; return what was granted."""
+    if not hasattr(os, "sched_setscheduler"):
+        return "this system has no SCHED_FIFO"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except OSError as error:
+        return f"refused: {error.strerror}"
+    return "granted"
+
+
 def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool]) -> None:
     """Step `device` in real time and carry its bytes over `port` until `stopped()`."""
+    ask_for_priority()
     backlog = bytearray()
     session = device.session
     while not stopped():
