@@ -372,9 +372,18 @@ def test_fewer_objects(task_file: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (answer["objects"], answer["train_objects"], answer["floor"]) == (50, 100, 0.01)
 
 
+def test_information_grows_with_the_photons(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--task", task_file, "--photons", 2, 20, "--trials", 1, "--floor", 0.01, "--information")
+    _, answer = called(capsys, "direct", *words)
+    low, high = answer["rows"]  # type: ignore[misc]
+    assert 0 < low["information"]["lower_bits"] < high["information"]["lower_bits"] < low["information"]["label_bits"]
+    assert 0 < low["fisher"]["trace"] < high["fisher"]["trace"]
+
+
 @pytest.mark.parametrize(
     "words",
     [
+        ("direct", "--information", "--detector", "binary"),
         ("direct", "--method", "mlp"),
         ("e2e", "--method", "bayes"),
         ("direct", "--photons", 0),

@@ -10,6 +10,7 @@ import pytest
 
 from pans.runtime.clicks import ClickLaw
 from pans.runtime.errors import UsageError
+from pans.trainer import information
 from pans.trainer.information import (
     entropy_bits,
     fisher,
@@ -198,6 +199,15 @@ def test_fisher_of_frames_at_every_photon_level() -> None:
     ratios = [found.trace for found in fisher_of_frames(light, labels, [1.0, 1e2, 1e4, 1e8])]
     assert ratios == sorted(ratios)
     assert ratios[0] < 0.2 * ratios[-1]
+
+
+def test_large_frames_have_a_trace_ratio_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(7)
+    light, labels = rng.gamma(1.0, 1.0, (20, 4)), np.arange(20) % 2
+    small = fisher(light, light, labels)
+    monkeypatch.setattr(information, "DISCRIMINANT_MAX", 3)
+    large = fisher(light, light, labels)
+    assert (large.trace, large.discriminant) == (small.trace, None)
 
 
 def test_fisher_refuses_what_does_not_belong_together() -> None:

@@ -88,10 +88,10 @@ def train_conventionally(
     n_pixels = math.prod(task.image_shape)
     model = seeded(lambda: EndToEnd(n_features, n_pixels, len(task.classes), bits), seed)
     assert isinstance(model, EndToEnd)
-    images = torch.from_numpy(task.train.images.reshape(len(task.train), n_pixels))
+    images = task.train.images.reshape(len(task.train), n_pixels)
 
     def objects(which: Tensor, _generator: torch.Generator) -> Tensor:
-        return images[which].float() / 255
+        return torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
 
     labels = torch.from_numpy(task.train.labels)
     rates = {"weight": PATTERN_RATE, "head": 1e-3}

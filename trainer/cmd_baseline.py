@@ -66,6 +66,11 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", type=int, metavar="N", help="only the first N test objects (default: all)")
     parser.add_argument("--train-objects", type=int, metavar="N", help="only the first N training objects")
     parser.add_argument("--trials", type=int, metavar="N", help="readouts per object (default: bayes 2, others 10)")
+    parser.add_argument(
+        "--information",
+        action="store_true",
+        help="of bayes, on a counting detector: bits that the readouts know of the label, and Fisher's ratio",
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument(
         "--threads", type=int, default=1, metavar="T", help="of torch (default 1); changes the rounding"
@@ -114,6 +119,10 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(f"--photons is {value:g}, allowed: above 0, at most 1e9")
     if args.floor is not None and not 0 < args.floor < 1:
         raise UsageError(f"--floor is {args.floor:g}, allowed: above 0, below 1")
+    if args.information and (args.method != "bayes" or args.detector != "counting" or args.brightness != "source"):
+        raise UsageError(
+            "--information is allowed with --method bayes, --detector counting and --brightness source only"
+        )
     if not 0 <= args.dark < math.inf:
         raise UsageError(f"--dark is {args.dark:g}, allowed: finite and at least 0")
 
@@ -169,9 +178,27 @@ def _paradigm(task: Task, args: argparse.Namespace, report: Report) -> tuple[Mea
         decide, floor = bayes(
             measurement, photons, args.detector, seed=args.seed, dark=args.dark, floor=args.floor, report=report
         )
-        return decide, facts | {"floor": floor}
+        known = _information(measurement, photons, floor, args) if args.information else {}
+        return decide, facts | {"floor": floor} | known
 
     return measurement, exact
+
+
+def _information(measurement: Measurement, photons: float, floor: float, args: argparse.Namespace) -> dict[str, Any]:
+    """One more readout of every test object, judged by the posterior; and what its statistics alone say."""
+    import numpy as np
+
+    from .baselines import detect, log_joint
+    from .information import fisher, posterior_information
+
+    light = measurement.photoelectrons(measurement.test, photons)
+    readouts = detect(light, args.detector, np.random.default_rng([args.seed, 4]), args.dark)
+    joint = log_joint(measurement, readouts, photons, args.detector, floor=floor, dark=args.dark)
+    mean = light.astype(np.float64) + args.dark  # of Poisson counts, and their variance too
+    return {
+        "information": asdict(posterior_information(joint, measurement.test_labels)),
+        "fisher": asdict(fisher(mean, mean, measurement.test_labels)),
+    }
 
 
 def _network(measurement: Measurement, args: argparse.Namespace, facts: dict[str, Any], report: Report) -> At:

@@ -14,7 +14,7 @@ only, float64. Entropies are in bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ from .evaluate import outcome_probabilities
 
 OUTCOMES_MAX = 1 << 16  # 16 patterns at one shot
 SMOOTHING = 1e-9  # of a word's probability, given to every class: words that no training object shows say nothing
+DISCRIMINANT_MAX = 2048
 _CHUNK_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
@@ -176,10 +177,13 @@ def _best_temperature(log_posterior: F64, labels: I64) -> float:
 
 @dataclass(frozen=True, slots=True)
 class FisherRatio:
-    """`trace` = tr(S_between) / tr(S_within); `discriminant` = tr(S_within^-1 S_between), over the best linear combinations."""
+    """`trace` = tr(S_between) / tr(S_within); `discriminant` = tr(S_within^-1 S_between), over the best linear combinations.
+
+    The discriminant is None beyond `DISCRIMINANT_MAX` readouts, whose scatter matrix would fill the memory.
+    """
 
     trace: float
-    discriminant: float
+    discriminant: float | None
 
 
 def fisher(mean: F64, variance: F64, labels: I64) -> FisherRatio:
@@ -189,43 +193,38 @@ def fisher(mean: F64, variance: F64, labels: I64) -> FisherRatio:
     variance = lambda. Clicks: p and p(1-p). Exact: nothing is sampled.
     """
     if mean.shape != variance.shape or len(mean) != len(labels):
-        raise UsageError(f"means are {mean.shape}, variances {variance.shape}, labels {labels.shape}")
-    noise = variance.mean(axis=0)
-    between, within = _scatter(mean, labels)
-    trace = float(np.trace(between)) / float(np.trace(within) + noise.sum())
-    seen = noise > 0  # readouts without noise are constant in every object: no light ever reaches them
-    total = within[np.ix_(seen, seen)] + np.diag(noise[seen])
-    discriminant = float(np.trace(np.linalg.solve(total, between[np.ix_(seen, seen)]))) if seen.any() else 0.0
-    return FisherRatio(trace, discriminant)
+        raise UsageError(
+            f"means are {mean.shape}, variances {variance.shape}, labels {labels.shape}; allowed: (n, m), (n,)"
+        )
+    return _Scatter(mean, labels).ratio(variance.mean(axis=0))
 
 
-def fisher_of_frames(light: F64, labels: I64, photons: list[float]) -> list[FisherRatio]:
-    """Return Fisher's ratios of counted frames at every photon level; `light` (objects, m) is relative.
+def fisher_of_frames(light: F64, labels: I64, photons: Sequence[float]) -> list[FisherRatio]:
+    """Return Fisher's ratios of counted readouts at every photon level; `light` (objects, m) is relative, one source for all.
 
     The scatter is computed once: light at eta has eta**2 times the scatter and eta times the noise.
     """
-    per_object = float(light.sum()) / len(light)
-    between, within = _scatter(light, labels)
-    noise = light.mean(axis=0)
-    seen = noise > 0
-    between, within, noise = between[np.ix_(seen, seen)], within[np.ix_(seen, seen)], noise[seen]
-    ratios = []
-    for level in photons:
-        total = within + np.diag(noise * (per_object / level))
-        trace = float(np.trace(between) / np.trace(total))
-        ratios.append(FisherRatio(trace, float(np.trace(np.linalg.solve(total, between)))))
-    return ratios
+    per_object, scatter = float(light.sum()) / len(light), _Scatter(light, labels)
+    return [scatter.ratio(light.mean(axis=0) * (per_object / level)) for level in photons]
 
 
-def _scatter(mean: F64, labels: I64) -> tuple[F64, F64]:
-    """Between-class and within-class covariance of the objects' means, each (m, m)."""
-    centre = mean.mean(axis=0)
-    between = np.zeros((mean.shape[1], mean.shape[1]))
-    within = np.zeros_like(between)
-    for label in np.unique(labels):
-        members = mean[labels == label]
-        of_class = members.mean(axis=0)
-        between += len(members) / len(mean) * np.outer(of_class - centre, of_class - centre)
-        apart = members - of_class
-        within += apart.T @ apart / len(mean)
-    return between, within
+class _Scatter:
+    """Between-class and within-class scatter of the objects' means, without noise."""
+
+    def __init__(self, mean: F64, labels: I64) -> None:
+        classes, members = np.unique(labels, return_inverse=True)
+        weight = np.bincount(members) / len(mean)
+        of_class = np.stack([mean[members == c].mean(axis=0) for c in range(len(classes))])
+        self.offsets = (of_class - mean.mean(axis=0)) * np.sqrt(weight)[:, None]
+        apart = mean - of_class[members]
+        self.within_trace = float((apart**2).sum()) / len(mean)
+        self.within = apart.T @ apart / len(mean) if mean.shape[1] <= DISCRIMINANT_MAX else None
+
+    def ratio(self, noise: F64) -> FisherRatio:
+        """The ratios when every readout has the variance `noise` (m,) beside the scatter."""
+        trace = float((self.offsets**2).sum()) / (self.within_trace + float(noise.sum()))
+        if self.within is None:
+            return FisherRatio(trace, None)
+        seen = noise > 0  # readouts without noise are constant in every object: no light ever reaches them
+        total, offsets = self.within[np.ix_(seen, seen)] + np.diag(noise[seen]), self.offsets[:, seen]
+        return FisherRatio(trace, float((offsets * np.linalg.solve(total, offsets.T).T).sum()))
