@@ -17,6 +17,7 @@ from typing import NoReturn
 from pans.runtime.cli import Command, emit, say
 
 from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS
+from .faults import check_possible, parse_faults
 from .serve import DEFAULT_SCENE, SimOptions, build_instrument, check_options
 from .shell import open_port, serve
 
@@ -24,6 +25,7 @@ from .shell import open_port, serve
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
     parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark or a .npz file")
+    parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
     parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
     parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
@@ -33,8 +35,11 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     options = check_options(
-        SimOptions(args.profile, args.scene, args.seed, offset=args.offset, drift_ppm=args.drift_ppm)
+        SimOptions(
+            args.profile, args.scene, args.seed, offset=args.offset, drift_ppm=args.drift_ppm, faults=args.faults
+        )
     )
+    check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
     instrument, clock = build_instrument(options, time.perf_counter_ns())
     port = open_port(args.listen)
     signal.signal(signal.SIGTERM, _leave)

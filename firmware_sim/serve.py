@@ -116,13 +116,23 @@ class ChildLink:
         self.name = url
         self._child = _spawn(options)
         try:
-            self._link = open_link(self._first_line())
+            self._url = self._first_line()
+            self._connect()
         except BaseException:
             self._end_child()
             raise
+
+    def _connect(self) -> None:
+        self._link = open_link(self._url)
         self.read = self._link.read
         self.write = self._link.write
         self.now_ns = self._link.now_ns
+
+    def reopen(self) -> ChildLink:
+        """Open the port of the same instrument again."""
+        self._link.close()
+        self._connect()
+        return self
 
     def close(self) -> None:
         """Close the port and end the child; idempotent."""
@@ -149,10 +159,12 @@ class ChildLink:
 
 
 def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
-    listen = "pty" if hasattr(os, "openpty") else "tcp:127.0.0.1:0"
+    breaks = parse_faults(options.faults).disconnect is not None  # which a pty cannot do
+    listen = "pty" if hasattr(os, "openpty") and not breaks else "tcp:127.0.0.1:0"
     words = [sys.executable, "-m", "pans.firmware_sim", "--profile", options.profile, "--scene", options.scene]
     words += ["--seed", str(options.seed), "--offset", str(options.offset), f"--drift-ppm={options.drift_ppm!r}"]
     words += ["--listen", listen, "--until-stdin-closes"]
+    words += ["--faults", options.faults] if options.faults else []
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
     # for the host, which then leaves the instrument in a safe state.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

@@ -36,6 +36,9 @@ class Port(Protocol):
 
     def close(self) -> None: ...
 
+    def hang_up(self) -> None:
+        """Break the connection to whoever is there."""
+
 
 def open_port(listen: str) -> Port:
     """Open `pty`, `tcp:PORT` (loopback) or `tcp:HOST:PORT`; port 0 lets the system choose."""
@@ -78,6 +81,9 @@ class PtyPort:
     def wait(self, timeout_s: float, wants_to_write: bool) -> None:
         select.select([self._master], [self._master] if wants_to_write else [], [], timeout_s)
 
+    def hang_up(self) -> None:
+        raise UsageError("a pseudo-terminal cannot break and come back under its name")
+
     def close(self) -> None:
         os.close(self._master)
         os.close(self._slave)
@@ -93,7 +99,8 @@ class TcpPort:
             raise LinkError(f"cannot listen on {host}:{number}: {error}", remedy="choose another port, or 0") from error
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
-        self.url = "serial:socket://{}:{}".format(*self._listener.getsockname()[:2])
+        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+        self.url = "serial:socket://{}:{}".format(*self.address)
 
     def read(self) -> bytes:
         if self._client is None:
@@ -107,7 +114,7 @@ class TcpPort:
         except OSError:
             data = b""
         if not data:
-            self._hang_up()
+            self.hang_up()
         return data
 
     def write(self, data: bytes) -> int:
@@ -118,7 +125,7 @@ class TcpPort:
         except BlockingIOError:
             return 0
         except OSError:
-            self._hang_up()
+            self.hang_up()
             return len(data)
 
     def wait(self, timeout_s: float, wants_to_write: bool) -> None:
@@ -126,7 +133,7 @@ class TcpPort:
         select.select([source], [source] if wants_to_write and self._client else [], [], timeout_s)
 
     def close(self) -> None:
-        self._hang_up()
+        self.hang_up()
         self._listener.close()
 
     def _accept(self) -> None:
@@ -137,7 +144,8 @@ class TcpPort:
         self._client.setblocking(False)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def _hang_up(self) -> None:
+    def hang_up(self) -> None:
+        """See `Port.hang_up`."""
         if self._client is not None:
             self._client.close()
             self._client = None
@@ -161,6 +169,9 @@ def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callab
     session = device.session
     while not stopped():
         data = port.read()
+        if not getattr(device, "connected", True):
+            port.hang_up()
+            backlog.clear()
         sent = device.step(clock.tick_at(time.perf_counter_ns()), data)
         if device.session != session:
             # A new host must not wait for what the last one never read; the delimiter ends a frame cut in its middle.

@@ -1,28 +1,30 @@
 """Device URLs -> an open link: bytes in, bytes out, and the clock they are stamped with.
 
-Owns ports and the thread that reads them; never looks into the bytes. `open_link` returns a `Link`; `LinkReader` returns
-stamped chunks from any link, through a thread of its own where the link blocks.
+Owns the schemes and the thread that reads; never looks into the bytes. `open_link` returns a `Link` (link_serial.py, link_usb.py, or a
+driver by entry point, see docs/LINKS.md); `LinkReader` returns stamped chunks from any link, through a thread of its own where
+the link blocks.
 """
 
 from __future__ import annotations
 
-import select
-import sys
 import threading
-import time
 from collections import deque
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple, Protocol
 
-from .errors import LinkError, UsageError
+from .errors import UsageError
+from .link_serial import SerialLink
+from .link_usb import UsbLink
 
-READ_BYTES = 1 << 16
 READ_POLL_S = 0.05
 MAX_QUEUED_BYTES = 1 << 24
 
 
 class Link(Protocol):
-    """An open connection to an instrument; a lab's own driver implements these five and an opener (`pans.devices`)."""
+    """An open connection to an instrument; a lab's own driver implements these and an opener (`pans.devices`).
+
+    A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again.
+    """
 
     name: str
     simulated: bool
@@ -41,66 +43,8 @@ class Link(Protocol):
         """Release the port; idempotent."""
 
 
-class SerialLink:
-    """pyserial behind the Link protocol: a device file, a COM port, a pty or `socket://`."""
-
-    simulated = False
-    virtual = False
-
-    def __init__(self, target: str, baud: int = 4_000_000) -> None:
-        import serial
-
-        self.name = f"serial:{target}"
-        self._errors: tuple[type[BaseException], ...] = (serial.SerialException, OSError, TypeError)
-        # With a file descriptor the wait is select's: then one read returns all that is there, where pyserial's own
-        # in_waiting says 1 for socket:// whatever has arrived. Windows COM handles have no descriptor.
-        self._selectable = target.startswith("socket://") or sys.platform != "win32"
-        try:
-            self._port = serial.serial_for_url(
-                target,
-                **({} if "://" in target else {"baudrate": baud, "exclusive": True}),
-                timeout=0 if self._selectable else READ_POLL_S,
-                write_timeout=2.0,
-            )
-        except (serial.SerialException, OSError, ValueError) as error:
-            raise LinkError(
-                f"cannot open {self.name}: {error}",
-                remedy="check the name, the cable and that no other program holds it",
-            ) from error
-
-    def read(self, timeout_s: float) -> bytes:
-        """See `Link.read`."""
-        try:
-            if not self._selectable:
-                return bytes(self._port.read(self._port.in_waiting or 1))
-            ready, _, _ = select.select([self._port.fileno()], [], [], timeout_s)
-            if not ready:
-                return b""
-            data = bytes(self._port.read(READ_BYTES))
-        except self._errors as error:
-            raise LinkError(f"{self.name} went away while reading: {error}") from error
-        if not data:
-            raise LinkError(f"{self.name} was closed by the other end")
-        return data
-
-    def write(self, data: bytes) -> None:
-        """See `Link.write`."""
-        try:
-            self._port.write(data)
-        except self._errors as error:
-            raise LinkError(f"{self.name} went away while writing: {error}") from error
-
-    def now_ns(self) -> int:
-        """See `Link.now_ns`."""
-        return time.perf_counter_ns()
-
-    def close(self) -> None:
-        """See `Link.close`."""
-        self._port.close()
-
-
 def open_link(url: str) -> Link:
-    """Open the device that `url` names: `serial:...`, or any scheme of the entry points `pans.devices` (`sim:` among them).
+    """Open the device that `url` names: `serial:...`, `usb:...`, or a scheme of the entry points `pans.devices` (`sim:` is one).
 
     Raises UsageError for a URL that cannot be meant and LinkError for a device that cannot be reached.
     """
@@ -110,35 +54,15 @@ def open_link(url: str) -> Link:
             f"{url!r} is no device URL", remedy="write scheme:target, for example sim:ideal or serial:/dev/ttyACM0"
         )
     if scheme == "serial":
-        target = rest.removeprefix("//") if not rest.startswith("socket://") else rest
-        return SerialLink(_port_of(target))
+        return SerialLink(rest.removeprefix("//"))
+    if scheme == "usb":
+        return UsbLink(rest)
     points = {point.name: point for point in entry_points(group="pans.devices")}
     if scheme not in points:
-        known = ", ".join(sorted({"serial", *points}))
+        known = ", ".join(sorted({"serial", "usb", *points}))
         raise UsageError(f"unknown device scheme {scheme!r} in {url!r}", remedy=f"known: {known}")
     link: Link = points[scheme].load()(url)
     return link
-
-
-def _port_of(target: str) -> str:
-    """Turn VID:PID[:SERIAL] into the port that carries it; leave every other target as it is."""
-    fields = target.split(":")
-    if "://" in target or "/" in target or not 2 <= len(fields) <= 3:
-        return target
-    try:
-        vid, pid = (int(field, 16) for field in fields[:2])
-    except ValueError:
-        return target
-    from serial.tools import list_ports
-
-    ports = [port for port in list_ports.comports() if (port.vid, port.pid) == (vid, pid)]
-    ports = [port for port in ports if len(fields) == 2 or port.serial_number == fields[2]]
-    if len(ports) != 1:
-        found = ", ".join(f"{port.device} (serial number {port.serial_number})" for port in ports) or "none"
-        raise LinkError(
-            f"serial:{target} matches {len(ports)} ports: {found}", remedy="add the serial number: VID:PID:SERIAL"
-        )
-    return str(ports[0].device)
 
 
 class Chunk(NamedTuple):

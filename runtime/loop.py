@@ -404,7 +404,11 @@ class LiveRun:
     def result(self) -> RunResult:
         """Return the run's figures."""
         welcome = self.connection.session.welcome
-        device = dict({} if welcome is None else welcome.facts) | link_facts(self.connection.link)
+        facts = dict({} if welcome is None else welcome.facts)
+        device = facts | link_facts(self.connection.link)
+        device["simulated"] = bool(
+            device["simulated"] or facts.get("simulated")
+        )  # a simulator behind an ordinary port says so
         self._decoded.update(_counts(self.connection.decoder.counters))
         tallies = self.core.windows.tallies
         fit = self._known_clock().fit
