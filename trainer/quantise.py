@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from pans.runtime.errors import UsageError
 from pans.runtime.profile import Profile
 
+DARK_MAX = 0.01  # dark counts per exposure that training accepts where the profile allows shorter exposures
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantised:
@@ -49,9 +51,16 @@ def quantise(patterns: NDArray[np.floating], levels: int, top: float | None = No
 
 
 def top_limits(profile: Profile) -> tuple[float, float]:
-    """Return the least and most photoelectrons of the brightest pixel in one exposure that `profile` allows."""
+    """Return the least and most photoelectrons of the brightest pixel in one exposure on `profile`.
+
+    They follow from the exposures that the profile allows, less those in which more than `DARK_MAX` dark counts fall: one
+    bright pixel would otherwise buy its light with dark counts in every pattern.
+    """
+    exposure = profile.exposure
+    dark_hz = profile.detector.dark_rate_hz
+    longest_us = exposure.max_us if dark_hz == 0 else min(exposure.max_us, DARK_MAX / dark_hz * 1e6)
     peak_hz = profile.projector.peak_photoelectrons_hz
-    return peak_hz * profile.exposure.min_us * 1e-6, peak_hz * profile.exposure.max_us * 1e-6
+    return peak_hz * exposure.min_us * 1e-6, peak_hz * max(longest_us, exposure.min_us) * 1e-6
 
 
 def exposure_us_of(profile: Profile, top: float) -> float:
