@@ -15,10 +15,11 @@ from pans.runtime.clicks import click_probability, object_transmission
 from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import load_profile
 from pans.trainer.evaluate import evaluate_exactly, light_of
+from pans.trainer.head_fit import fit_head_exactly, joint_distribution
 from pans.trainer.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks import load_task
-from pans.trainer.train import fit_head_exactly, joint_distribution, train
+from pans.trainer.train import train
 
 PROFILE = load_profile("oled-qcmos")
 SMALL = Options(features=4, alpha=1e-3, epochs=10, hidden=32, batch=64, front_rate=3e-2, head_rate=1e-2)
@@ -57,7 +58,7 @@ def test_head_fits_a_joint_distribution_to_its_entropy():
     assert entropy <= loss <= entropy + 1e-3
 
 
-@pytest.mark.parametrize("estimator", ["ste", "exact"])
+@pytest.mark.parametrize("estimator", ["ste", "exact", "local", "disarm", "loo"])
 def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     options = Options(**(vars_of(SMALL) | {"estimator": estimator}))
     reports = []

@@ -3,12 +3,8 @@
 Owns the physics between light and clicks during training, and its gradients; never the patterns before it and never the
 head behind it. Shapes: n objects, d_f patterns; tensors in, tensors out, all differentiable in the photoelectrons.
 
-Two estimators (paper, appendix on gradient estimation):
-
-- **straight-through**: clicks are sampled, the gradient passes the sampling unchanged, and the click law behind it damps it:
-  for a plain Poisson detector dL/dlambda = dL/da * slope * exp(-slope * lambda). Not unbiased unless the loss is affine
-  in every click; it trains well all the same.
-- **exact**: the probability of every one of the 2**d_f click words is a product; the loss is its exact expectation.
+`sample_clicks` passes gradients straight through (the estimators are in estimators.py); the click law behind it damps them: for
+a plain Poisson detector dL/dlambda = dL/da * slope * exp(-slope * lambda) (paper, appendix on gradient estimation).
 """
 
 from __future__ import annotations
@@ -71,9 +67,3 @@ def click_words(n_features: int) -> Tensor:
     """Return all click words as rows of 0.0 and 1.0, float32 (2**d_f, d_f), in the order of `word_probabilities`."""
     index = torch.arange(1 << n_features)[:, None] >> torch.arange(n_features)
     return (index & 1).float()
-
-
-def expected_cross_entropy(words: Tensor, scores: Tensor, labels: Tensor) -> Tensor:
-    """Return the mean over objects of E[-log q(label | word)]: words (n, w), scores of every word (w, classes)."""
-    log_q = torch.log_softmax(scores, dim=1)
-    return -(words * log_q.T[labels]).sum() / len(labels)

@@ -23,10 +23,15 @@ class ActiveIllumination(nn.Module):
     """
 
     def __init__(
-        self, n_features: int, n_pixels: int, top_limits: tuple[float, float], generator: torch.Generator
+        self,
+        n_features: int,
+        n_pixels: int,
+        top_limits: tuple[float, float],
+        generator: torch.Generator,
+        light: float = 1.0,
     ) -> None:
         super().__init__()
-        bound = math.sqrt(6 / ((1 + KAIMING_A**2) * n_pixels))  # Kaiming uniform
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_pixels))  # Kaiming uniform, times the wanted light
         self.weight = nn.Parameter((torch.rand(n_features, n_pixels, generator=generator) * 2 - 1) * bound)
         self.log_top = nn.Parameter(torch.tensor(math.log(top_limits[1])))
         self.top_limits = top_limits

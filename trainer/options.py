@@ -12,6 +12,7 @@ from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
+ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
 
 
@@ -27,22 +28,32 @@ class Options:
     epochs: int = 60
     seed: int = 0
     restarts: int = 1
+    starts: int = 1  # runs of stage 1 per restart; the best on validation goes on
+    warm: float = 0.3  # part of the epochs that stage 1 takes, when another estimator follows it
     hidden: int = 512
     batch: int = 512
     front_rate: float = 1e-2
     head_rate: float = 1e-3
     slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
     clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+    light: float = 1.0  # of the initial patterns, times the paper's
+    shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
 
 
 def check_options(options: Options, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained on this profile."""
-    limits = {"features": (1, 4096), "epochs": (1, 100_000), "restarts": (1, 1000), "hidden": (1, 65536)}
-    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1)}
+    limits = {
+        "features": (1, 4096),
+        "epochs": (1, 100_000),
+        "restarts": (1, 1000),
+        "starts": (1, 1000),
+        "hidden": (1, 65536),
+    }
+    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1), "shots": (1, 64), "warm": (0, 1)}
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:
             raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
-    for name in ("alpha", "photons", "clicks"):
+    for name in ("alpha", "photons", "clicks", "light"):
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
             raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
@@ -50,13 +61,13 @@ def check_options(options: Options, profile: Profile) -> None:
         raise UsageError(
             f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
         )
-    if options.estimator not in ("ste", "exact"):
-        raise UsageError(f"--estimator is {options.estimator!r}, allowed: ste, exact")
+    if options.estimator not in ESTIMATOR_NAMES:
+        raise UsageError(f"--estimator is {options.estimator!r}, allowed: {', '.join(ESTIMATOR_NAMES)}")
     if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
         raise UsageError(
             f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
             f"{EXACT_FEATURES_MAX} patterns",
-            remedy="use --estimator ste",
+            remedy="use --estimator local",
         )
     channels = profile.detector.channels
     if profile.mode == "parallel" and options.features > channels:

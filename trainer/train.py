@@ -26,20 +26,17 @@ from pans.runtime.clicks import ClickLaw, click_law, object_transmission
 from pans.runtime.profile import Profile
 
 from .checkpoint import read_checkpoint, write_checkpoint
-from .detection import (
-    click_probability,
-    click_words,
-    expected_cross_entropy,
-    sample_clicks,
-    word_probabilities,
-)
+from .detection import click_probability, click_words, sample_clicks, word_probabilities
 from .encoders import ActiveIllumination
+from .estimators import ESTIMATORS, cross_entropy
+from .head_fit import fit_head
 from .heads import MlpHead
 from .options import EXACT_FEATURES_MAX, Options, check_options
 from .quantise import Quantised, exposure_us_of, quantise, top_limits
 from .tasks import Objects, Task
 
 VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
+VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
 CHUNK = 2000  # objects per pass where no gradient is needed
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
@@ -93,13 +90,23 @@ def train(
     best: dict[str, Any] | None = saved.get("best")
     losses: list[float] = saved.get("losses", [])
     for restart in range(len(losses), options.restarts):
-        run = _Run(data, profile, options, restart)
-        if "run" in saved:
-            run.restore(saved.pop("run"))
-        while run.epoch < options.epochs:
-            report(run.one_epoch())
-            if checkpoint:
-                write_checkpoint(checkpoint, options, task.sha256, {"run": run.state(), "best": best, "losses": losses})
+        started: list[float] = saved.pop("started", [])  # losses of the starts of this restart
+        chosen: dict[str, Any] | None = saved.pop("chosen", None)  # and the best of them
+        for start in range(len(started), options.starts + 1):  # the last round goes on with the best start
+            run = _Run(data, profile, options, restart * options.starts + min(start, options.starts - 1))
+            if "run" in saved:
+                run.restore(saved.pop("run"))
+            elif start == options.starts and chosen is not None:
+                run.restore(chosen)
+            until = run.first_exact if start < options.starts else options.epochs
+            while run.epoch < until:
+                report(run.one_epoch())
+                if checkpoint:
+                    now = {"run": run.state(), "best": best, "losses": losses, "started": started, "chosen": chosen}
+                    write_checkpoint(checkpoint, options, task.sha256, now)
+            if start < options.starts:
+                started.append(run.validation_loss())
+                chosen = run.state() if started[-1] <= min(started) else chosen
         losses = [*losses, run.validation_loss()]
         if losses[-1] <= min(losses):
             best = run.state()
@@ -132,7 +139,7 @@ class _Run:
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = torch.Generator().manual_seed(options.seed + restart)
         limits = top_limits(profile)
-        self.encoder = ActiveIllumination(options.features, data.gray.shape[1], limits, self.random)
+        self.encoder = ActiveIllumination(options.features, data.gray.shape[1], limits, self.random, options.light)
         self.head = MlpHead(options.features, options.hidden, data.n_classes, self.random)
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
@@ -145,7 +152,9 @@ class _Run:
     @property
     def first_exact(self) -> int:
         """The epoch at which stage 2 begins; the end when there is no stage 2."""
-        return round(0.3 * self.options.epochs) if self.options.estimator == "exact" else self.options.epochs
+        return (
+            round(self.options.warm * self.options.epochs) if self.options.estimator != "ste" else self.options.epochs
+        )
 
     @property
     def first_whole(self) -> int:
@@ -154,7 +163,7 @@ class _Run:
 
     def stage(self) -> str:
         """Name of the stage of the present epoch."""
-        name = "ste" if self.epoch < self.first_exact else "exact"
+        name = "ste" if self.epoch < self.first_exact else self.options.estimator
         return f"{name}, levels" if self.epoch >= self.first_whole else name
 
     def rates(self, progress: float) -> tuple[float, float]:
@@ -173,7 +182,7 @@ class _Run:
     def floor(self, progress: float) -> float:
         """Transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
         now, total = self.epoch + progress, self.options.epochs
-        start = self.first_exact if self.options.estimator == "exact" else 0.3 * total
+        start = 0.3 * total if self.options.estimator == "ste" else self.first_exact
         return self.data.floor * min(1.0, max(0.0, (now - start) / (0.4 * total)))
 
     # ---- the loop ----
@@ -185,7 +194,8 @@ class _Run:
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
         if self.epoch == self.first_whole:
             self.encoder.start_quantising(self.profile.projector.levels)
-        exact, law = self.epoch >= self.first_exact, self.law()
+        loss_of_clicks = ESTIMATORS["ste" if self.epoch < self.first_exact else options.estimator]
+        law = self.law()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
         sums = torch.zeros(4, dtype=torch.float64)
@@ -195,8 +205,7 @@ class _Run:
             light, photons = self.light(batch, self.floor(progress))
             slope, clamp = self._slope_and_clamp(progress)
             p = click_probability(light.clamp(max=clamp), law, slope)
-            labels = data.labels[batch]
-            loss = self._exact_loss(p, labels) if exact else self._sampled_loss(p, labels)
+            loss = loss_of_clicks(p, data.labels[batch], self.head, cross_entropy, self.random)
             clicks = p.sum(dim=1).mean()
             illumination = self.encoder.patterns().sum()
             total = loss + self._penalty(clicks, photons, illumination)
@@ -222,13 +231,6 @@ class _Run:
         with torch.no_grad():
             brightest = self.encoder.patterns().max() if self.encoder.levels is None else self.encoder.top()
         return click_law(self.profile, exposure_us_of(self.profile, min(max(float(brightest), low), high)))
-
-    def _sampled_loss(self, p: Tensor, labels: Tensor) -> Tensor:
-        return torch.nn.functional.cross_entropy(self.head(sample_clicks(p, self.random)), labels)
-
-    def _exact_loss(self, p: Tensor, labels: Tensor) -> Tensor:
-        scores = self.head(click_words(self.options.features), mean=p.mean(dim=0))
-        return expected_cross_entropy(word_probabilities(p), scores, labels)
 
     def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
         """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
@@ -266,13 +268,14 @@ class _Run:
         """Cross-entropy on the validation objects: exact where the words can be enumerated, else of one sample."""
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
         labels = self.data.labels[self.data.n_fit :]
+        random = torch.Generator().manual_seed(self.options.seed)
         self.head.eval()
         with torch.no_grad():
-            if self.options.features > EXACT_FEATURES_MAX:
-                generator = torch.Generator().manual_seed(self.options.seed)
-                return float(torch.nn.functional.cross_entropy(self.head(sample_clicks(p, generator).float()), labels))
-            scores = self.head(click_words(self.options.features)).double()
-            return float(expected_cross_entropy(word_probabilities(p), scores, labels))
+            if self.options.features <= EXACT_FEATURES_MAX:
+                scores = self.head(click_words(self.options.features)).double()
+                return float((word_probabilities(p) * cross_entropy(scores.unsqueeze(0), labels.unsqueeze(1))).sum() / len(p))
+            drawn = [self.head(sample_clicks(p, random).float()) for _ in range(VALIDATION_SAMPLES)]
+            return float(torch.stack([cross_entropy(scores, labels).mean() for scores in drawn]).mean())
 
     def finish(self, losses: tuple[float, ...]) -> Trained:
         """Freeze the patterns as levels, then fit the head to what they show of all training objects."""
@@ -280,26 +283,19 @@ class _Run:
             floats = (self.encoder.weight**2).numpy().copy()
         quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
         p = self.probabilities(0, len(self.data.labels))
-        mean = p.mean(dim=0)
-        self.head.norm.running_mean.copy_(mean)
-        if self.options.features <= EXACT_FEATURES_MAX:
-            fit_head_exactly(self.head, joint_distribution(p, self.data.labels, self.data.n_classes))
-        else:
-            self._fit_head_by_samples(p)
-        self.head.eval()
-        return Trained(quantised, floats, self.head, mean, self.law(), min(losses), losses, self.options)
-
-    def _fit_head_by_samples(self, p: Tensor, epochs: int = 10) -> None:
-        optimiser = torch.optim.Adam(self.head.parameters(), lr=self.options.head_rate)
-        self.head.eval()  # the normalisation stays: its mean is exact
-        for epoch in range(epochs):
-            optimiser.param_groups[0]["lr"] = self.options.head_rate * (1 - epoch / epochs)
-            for batch in torch.randperm(len(p), generator=self.random).split(self.options.batch):
-                clicks = sample_clicks(p[batch], self.random).float()
-                optimiser.zero_grad()
-                loss = torch.nn.functional.cross_entropy(self.head(clicks), self.data.labels[batch])
-                loss.backward()
-                optimiser.step()
+        fit_head(
+            self.head,
+            p,
+            self.data.labels,
+            cross_entropy,
+            self.random,
+            exact=self.options.features <= EXACT_FEATURES_MAX,
+            n_outputs=self.data.n_classes,
+            shots=self.options.shots,
+            batch=self.options.batch,
+            rate=self.options.head_rate,
+        )
+        return Trained(quantised, floats, self.head, p.mean(dim=0), self.law(), min(losses), losses, self.options)
 
     # ---- checkpoints ----
 
@@ -326,26 +322,3 @@ class _Run:
 
     def _modules(self) -> tuple[tuple[str, torch.nn.Module], ...]:
         return ("encoder", self.encoder), ("head", self.head)
-
-
-def joint_distribution(p: Tensor, labels: Tensor, n_classes: int) -> Tensor:
-    """Return P(word, class) over objects with click probabilities `p` (n, d_f), float64 (2**d_f, classes); sums to 1."""
-    joint = torch.zeros(1 << p.shape[1], n_classes, dtype=torch.float64)
-    for start in range(0, len(p), CHUNK):
-        words = word_probabilities(p[start : start + CHUNK].double())
-        of_class = torch.nn.functional.one_hot(labels[start : start + CHUNK], n_classes).double()
-        joint += words.T @ of_class
-    return joint / len(p)
-
-
-def fit_head_exactly(head: MlpHead, joint: Tensor, steps: int = 1500, rate: float = 2e-3) -> None:
-    """Fit the head to `joint` (2**d_f, classes): the whole training set at every step, with a falling rate."""
-    words, target = click_words(head.norm.gain.numel()), joint.float()
-    optimiser = torch.optim.Adam(head.parameters(), lr=rate)
-    head.eval()  # the normalisation stays: its mean is exact
-    for step in range(steps):
-        optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
-        optimiser.zero_grad()
-        loss = -(target * torch.log_softmax(head(words), dim=1)).sum()
-        loss.backward()
-        optimiser.step()

@@ -1,0 +1,125 @@
+"""Gradient estimators: the training loss of random clicks, with a gradient that reaches the light in front of them.
+
+Owns how a loss on clicks is differentiated; never the click law before it (detection.py) and never the head behind it. Every
+estimator is a function `(p, target, head, loss_of, random) -> loss`: click probabilities p (n, d_f), a scalar whose value is
+the mean loss of the batch and whose gradient is the estimate. Heads normalise by the mean of p
+(`ste`: by that of the sampled clicks, as in the paper).
+
+| name | gradient in p | cost |
+| --- | --- | --- |
+| `ste` | straight-through: passed on from the sampled click. Biased unless the loss is affine in every click | 1 pass |
+| `exact` | expectation over all 2**d_f words | 2**d_f words, once per batch |
+| `local` | L(click i) - L(no click i), the other clicks sampled: unbiased | d_f + 1 passes, only the last layer in full |
+| `disarm` | antithetic pairs (Dong, Mnih, Tucker 2020): unbiased | 2 passes |
+| `loo` | REINFORCE, other samples as the baseline (Kool, van Hoof, Welling 2019): unbiased | `LOO_SAMPLES` passes |
+
+The true gradient is dp/dlambda * E[L(1) - L(0)], with dp/dlambda = exp(-lambda) for a plain detector (science of the paper's
+appendix on gradient estimation, which calls `ste` unbiased; it is not, see docs/results/estimators.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from .detection import click_words, sample_clicks, word_probabilities
+
+LOO_SAMPLES = 4
+_P_MIN = 1e-4  # least chance by which a score-function gradient is divided: beyond it, one event would undo an epoch
+
+LossOf = Callable[[Tensor, Tensor], Tensor]  # scores (..., out), target (..., or broadcast) -> losses (...)
+
+
+class Head(Protocol):
+    """What an estimator asks of a digital back end."""
+
+    def __call__(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Scores (n, out) of clicks (n, d_f), normalised by `mean` (d_f,)."""
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Scores (n, d_f, out): column i is that of the same clicks with click i inverted."""
+
+
+Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator], Tensor]
+
+
+def cross_entropy(scores: Tensor, labels: Tensor) -> Tensor:
+    """Return -log q(label): scores (..., classes) and whole-number labels (...), broadcast against each other."""
+    log_q = torch.log_softmax(scores, dim=-1)
+    return -torch.take_along_dim(log_q, labels.unsqueeze(-1), dim=-1).squeeze(-1)
+
+
+def squared_error(scores: Tensor, images: Tensor) -> Tensor:
+    """Return the mean squared difference over the last axis."""
+    return (scores - images).square().mean(dim=-1)
+
+
+def straight_through(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+    """The paper's: the gradient of a sampled click is given to its probability."""
+    return loss_of(head(sample_clicks(p, random), None), target).mean()  # normalised by the clicks of the batch
+
+
+def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator) -> Tensor:
+    """All click words, each once: no sampling noise in loss or gradient."""
+    words = word_probabilities(p)
+    scores = head(click_words(p.shape[1]), p.mean(dim=0))
+    if loss_of is cross_entropy:  # the same as below, by two matrix products instead of n * 2**d_f losses
+        of_class = torch.nn.functional.one_hot(target, scores.shape[1]).to(words.dtype)
+        return -((words.T @ of_class) * torch.log_softmax(scores, dim=1)).sum() / len(p)
+    return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p)
+
+
+def local_expectation(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+    """Every click in both states, with the others as sampled."""
+    clicks, mean = _draw(p, random), p.mean(dim=0)
+    loss = loss_of(head(clicks, mean), target)
+    with torch.no_grad():
+        change = loss_of(head.flipped(clicks, mean), target.unsqueeze(1)) - loss.unsqueeze(1)
+        slope = (1 - 2 * clicks) * change
+    return loss.mean() + _gradient_only(p, slope)
+
+
+def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+    """Two words from the same random numbers, one from u and one from 1 - u; only clicks that differ get a gradient."""
+    uniform = torch.rand(p.shape, generator=random, dtype=torch.float64)
+    first, second = (uniform < p).to(p.dtype), (1 - uniform < p).to(p.dtype)
+    mean = p.mean(dim=0)
+    losses = [loss_of(head(clicks, mean), target) for clicks in (first, second)]
+    with torch.no_grad():
+        rarer = torch.minimum(p, 1 - p).clamp(min=_P_MIN)
+        slope = 0.5 * (losses[0] - losses[1]).unsqueeze(1) * (first - second) / rarer
+    return 0.5 * (losses[0] + losses[1]).mean() + _gradient_only(p, slope)
+
+
+def leave_one_out(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+    """Score function times how much worse a sample is than the others."""
+    mean = p.mean(dim=0)
+    drawn = [_draw(p, random) for _ in range(LOO_SAMPLES)]
+    losses = torch.stack([loss_of(head(clicks, mean), target) for clicks in drawn])
+    with torch.no_grad():
+        excess = (losses - losses.mean(dim=0)) * (LOO_SAMPLES / (LOO_SAMPLES - 1))
+        variance = (p * (1 - p)).clamp(min=_P_MIN)
+        slope = torch.stack([e.unsqueeze(1) * (c - p) / variance for e, c in zip(excess, drawn)]).mean(dim=0)
+    return losses.mean() + _gradient_only(p, slope)
+
+
+def _draw(p: Tensor, random: torch.Generator) -> Tensor:
+    return (torch.rand(p.shape, generator=random, dtype=torch.float64) < p).to(p.dtype)
+
+
+def _gradient_only(p: Tensor, slope: Tensor) -> Tensor:
+    """Value 0; gradient `slope` / n in p."""
+    weighted = (slope * p).sum() / len(p)
+    return weighted - weighted.detach()
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "ste": straight_through,
+    "exact": exact,
+    "local": local_expectation,
+    "disarm": disarm,
+    "loo": leave_one_out,
+}
