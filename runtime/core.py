@@ -75,10 +75,10 @@ class Core:
         self._decider = decider
         self._exposure_ticks = plan.exposure_ticks
         self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
-        self._end_exposure = self._exposures_of(n_cycles)
+        self.end_exposure = self._exposures_of(n_cycles)
         self._begun = False
         self._visits_before = 0  # in streams that have ended
-        self._last_tick = 0
+        self.last_tick = 0
         self._status: Status | None = None  # the latest of this stream
         self._told_end: int | None = None  # tick of the first STATUS that told of the end
 
@@ -88,13 +88,11 @@ class Core:
         if self._begun:
             self._visits_before += self.windows.visits_begun
             windows = self.windows.restart()
-            output.decisions.extend(
-                self._decide(window, self._last_tick, DecisionFlag.INCOMPLETE) for window in windows
-            )
+            output.decisions.extend(self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows)
             self.tracker.restart()
             self.marks.clear()
         self._begun, self.completed, self._told_end, self._status = True, False, None, None
-        self.start_tick, self._end_exposure = start_tick, self._exposures_of(n_cycles)
+        self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
         return output
 
     def end(self) -> Output:
@@ -127,11 +125,11 @@ class Core:
             return Output([], [], None)
         events = [] if gap is None else [_gap_event(gap)]
         n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
-        if message.exposure_index + n_exposures > self._end_exposure or not self.windows.fits(message):
+        if message.exposure_index + n_exposures > self.end_exposure or not self.windows.fits(message):
             self.tracker.counters.malformed += 1
             return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
-        self._last_tick = end_tick
+        self.last_tick = end_tick
         decisions = self._missed(message.exposure_index, message.tick)
         for window in self.windows.push(message):
             before_end = (message.exposure_index + n_exposures - 1 - window.last_exposure) * message.period_ticks
@@ -156,7 +154,7 @@ class Core:
         self._status = status
         if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
             return Output([], [], None)
-        missing = min(status.next_exposure, self._end_exposure) > self.tracker.next_exposure
+        missing = min(status.next_exposure, self.end_exposure) > self.tracker.next_exposure
         if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
             self._told_end = status.tick
             return Output([], [], None)
@@ -164,7 +162,7 @@ class Core:
 
     def _finish(self, status: Status) -> Output:
         self.completed = True
-        end = min(status.next_exposure, self._end_exposure)
+        end = min(status.next_exposure, self.end_exposure)
         gap = self.tracker.finish(end, status.drops)
         return Output(self._missed(end, status.tick), [] if gap is None else [_gap_event(gap)], None)
 

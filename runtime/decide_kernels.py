@@ -2,21 +2,23 @@
 
 Owns the loops; never allocates and never judges. Imported only where it pays: a look-up in a table must not wait for numba.
 
-The heads' kernels add in a fixed order (rows of 8 in a fixed tree), so that batch, single decision and loop give the same bits. They are
-compiled with `contract` alone of fastmath, which lets a product and a sum be one instruction; tests/test_decide_mlp.py bounds the error.
+The heads' kernels give the same bits for one object and for many. Two freedoms of fastmath are taken where they pay: `contract` (a product
+and a sum in one instruction) and `reassoc` (the order of a sum), so that another processor may round another last bit;
+tests/test_decide_mlp.py holds the error below the bound that any order has. NaN and infinity keep their meaning.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-STEP = 8  # rows taken at once; hidden sizes are padded to it
-LANES = 16  # columns are padded to it: one vector of float32 or int32 at most
+STEP = 8  # rows of the first matrix taken at once
+_U = np.uint64  # unsigned indices: a signed one is tested for being negative, and then nothing is vectorised
+LANES = 16  # hidden widths are padded to it: one vector of float32 or int32 at most
 
 
 @njit(cache=True, nogil=True)
@@ -59,116 +61,94 @@ def warm_up(label_dtype: Any = np.uint8, word_dtype: Any = np.uint64) -> None:
     label_checked_words(np.zeros(2, dtype=label_dtype), np.zeros(1, dtype=word_dtype), np.zeros(1, dtype=label_dtype))
 
 
-class FloatLayers(NamedTuple):
-    """A chain of layers: `sizes` int64 (layers + 1,): d_f, then padded widths; weights row by row, biases one after the other, float32.
-
-    `relu` int64 (layers,). Padding is zero, so that it changes no sum.
-    """
-
-    sizes: NDArray[np.int64]
-    weights: NDArray[np.float32]
-    biases: NDArray[np.float32]
-    relu: NDArray[np.int64]
-
-
-class Int8Layers(NamedTuple):
-    """As FloatLayers, with int8 weights, float32 `scales` per column, and hidden values that are whole steps 0..255."""
-
-    sizes: NDArray[np.int64]
-    weights: NDArray[np.int8]
-    scales: NDArray[np.float32]
-    biases: NDArray[np.float32]
-
-
-class Scratch(NamedTuple):
-    """Room for one decision: values float32 and sums int32 (2, widest), rows int64 and steps int32 (d_f + STEP,), factors float32."""
-
-    values: NDArray[np.float32]
-    sums: NDArray[np.int32]
-    rows: NDArray[np.int64]
-    factors: NDArray[np.float32]
-    steps: NDArray[np.int32]
+# A chain of layers is two arrays: `meta` int64: number of layers L, then L + 1 sizes (d_f, then padded widths), then L flags "rectified";
+# and `numbers` float32: the first matrix row by row (n_in, n_out), the others column by column, then all biases. For int8 the matrices are
+# an array of their own and `affine` float32 (2, sum of widths) holds scales and biases. Padding is zero, so that it changes no sum. Few
+# arrays, because each one costs a call from Python a tenth of a microsecond. Room for one decision: `work` (3, widest), whose last row
+# holds the clicks that fired, `rows` int64, and for int8 `hidden` int16.
 
 
 # ------------------------------------------------------------------------------------------------------------ float32 heads
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_rows(weights, start, width, n_rows, scratch, out):  # type: ignore[no-untyped-def]
-    """out[j] += sum over r < n_rows (padded to STEP) of factors[r] * row rows[r] of the matrix at weights[start:]."""
-    rows, f = scratch.rows, scratch.factors
+def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-def]
+    """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of the matrix at the start of weights."""
+    columns = _U(width)
     for r in range(0, n_rows, STEP):
         f0, f1, f2, f3, f4, f5, f6, f7 = f[r], f[r + 1], f[r + 2], f[r + 3], f[r + 4], f[r + 5], f[r + 6], f[r + 7]
-        a0, a1 = start + rows[r] * width, start + rows[r + 1] * width
-        a2, a3 = start + rows[r + 2] * width, start + rows[r + 3] * width
-        a4, a5 = start + rows[r + 4] * width, start + rows[r + 5] * width
-        a6, a7 = start + rows[r + 6] * width, start + rows[r + 7] * width
-        for j in range(width):
-            out[j] += (
+        a0, a1 = _U(rows[r]) * columns, _U(rows[r + 1]) * columns
+        a2, a3 = _U(rows[r + 2]) * columns, _U(rows[r + 3]) * columns
+        a4, a5 = _U(rows[r + 4]) * columns, _U(rows[r + 5]) * columns
+        a6, a7 = _U(rows[r + 6]) * columns, _U(rows[r + 7]) * columns
+        for j in range(columns):
+            out[0, j] += (
                 (f0 * weights[a0 + j] + f1 * weights[a1 + j]) + (f2 * weights[a2 + j] + f3 * weights[a3 + j])
             ) + ((f4 * weights[a4 + j] + f5 * weights[a5 + j]) + (f6 * weights[a6 + j] + f7 * weights[a7 + j]))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_all(weights, start, width, n_rows, x, out):  # type: ignore[no-untyped-def]
-    """out[j] += sum over r < n_rows (a multiple of STEP) of x[r] * row r of the matrix at weights[start:]."""
-    for r in range(0, n_rows, STEP):
-        b = start + r * width
-        f0, f1, f2, f3, f4, f5, f6, f7 = x[r], x[r + 1], x[r + 2], x[r + 3], x[r + 4], x[r + 5], x[r + 6], x[r + 7]
-        for j in range(width):
-            out[j] += (
-                (f0 * weights[b + j] + f1 * weights[b + width + j])
-                + (f2 * weights[b + 2 * width + j] + f3 * weights[b + 3 * width + j])
-            ) + (
-                (f4 * weights[b + 4 * width + j] + f5 * weights[b + 5 * width + j])
-                + (f6 * weights[b + 6 * width + j] + f7 * weights[b + 7 * width + j])
-            )
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _dots(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
+    """out[k] += x . weights[start + k * n_in:][:n_in], two rows at a time; n_out is even, n_in a multiple of LANES."""
+    for k in range(0, n_out, 2):
+        w = weights[start + k * n_in : start + (k + 1) * n_in]
+        v = weights[start + (k + 1) * n_in : start + (k + 2) * n_in]
+        a, b = np.float32(0), np.float32(0)
+        for j in range(n_in):
+            a += x[j] * w[j]
+            b += x[j] * v[j]
+        out[k] += a
+        out[k + 1] += b
 
 
 @njit(cache=True, nogil=True)
-def float_scores(counts, shots, layers, scratch):  # type: ignore[no-untyped-def]
-    """Scores of one object from its clicks per pattern (integers (d_f,)); they stand in the row of scratch.values that is returned."""
-    sizes, n_features = layers.sizes, layers.sizes[0]
-    n_fired = 0
-    for i in range(n_features):
-        if counts[i]:
-            scratch.rows[n_fired] = i
-            scratch.factors[n_fired] = np.float32(counts[i]) / np.float32(shots)
+def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[no-untyped-def]
+    """Scores of the object whose clicks are counts[i], integers (n, d_f); they stand in the row of `work` that is returned."""
+    n_layers, n_features, width, n_fired = meta[0], meta[1], meta[2], 0
+    factors = work[2]
+    for feature in range(n_features):
+        count = counts[i, feature]
+        if count:
+            rows[n_fired] = feature
+            factors[n_fired] = np.float32(count) / np.float32(shots)
             n_fired += 1
     for r in range(n_fired, -(-n_fired // STEP) * STEP):
-        scratch.rows[r] = 0
-        scratch.factors[r] = 0
-    width = sizes[1]
-    values = scratch.values[0]
+        rows[r] = 0
+        factors[r] = 0
+    bias = 0
+    for layer in range(n_layers):
+        bias += meta[layer + 1] * meta[layer + 2]
+    first, constants = work[0], numbers[bias : bias + width]
     for j in range(width):
-        values[j] = layers.biases[j]
-    _add_rows(layers.weights, 0, width, n_fired, scratch, values)
-    start, bias = n_features * width, width
-    for layer in range(1, sizes.size - 1):
-        if layers.relu[layer - 1]:
+        first[j] = constants[j]
+    _add_rows(numbers, width, n_fired, rows, factors, work)
+    start, source = n_features * width, 0
+    bias += width
+    for layer in range(1, n_layers + 1):
+        if meta[n_layers + 1 + layer]:
+            values = work[source]
             for j in range(width):
                 values[j] = np.float32(0) if values[j] < 0 else values[j]  # written so that a NaN stays one
-        n_rows, width = width, sizes[layer + 1]
-        following = scratch.values[layer & 1]
+        if layer == n_layers:
+            break
+        n_rows, width = width, meta[layer + 2]
+        values, following, constants = work[source], work[1 - source], numbers[bias : bias + width]
         for j in range(width):
-            following[j] = layers.biases[bias + j]
-        _add_all(layers.weights, start, width, n_rows, values, following)
-        values = following
+            following[j] = constants[j]
+        _dots(numbers, start, width, n_rows, values, following)
         start += n_rows * width
         bias += width
-    if layers.relu[sizes.size - 2]:
-        for j in range(width):
-            values[j] = np.float32(0) if values[j] < 0 else values[j]
-    return (sizes.size - 2) & 1
+        source = 1 - source
+    return source
 
 
 @njit(cache=True, nogil=True)
-def winner(values, n_classes):  # type: ignore[no-untyped-def]
-    """Label and softmax probability of one row of scores, as verdict.softmax_winner; probability 0.0 if not finite."""
-    label, best = 0, np.float64(values[0])
+def winner(rows, i, n_classes):  # type: ignore[no-untyped-def]
+    """Label and softmax probability of the scores rows[i], as verdict.softmax_winner; probability 0.0 if not finite."""
+    label, best = 0, np.float64(rows[i, 0])
     total = 0.0
     for k in range(n_classes):
-        score = np.float64(values[k])
+        score = np.float64(rows[i, k])
         if math.isnan(score):
             return k, 0.0
         if score > best:
@@ -176,36 +156,40 @@ def winner(values, n_classes):  # type: ignore[no-untyped-def]
     if math.isinf(best):
         return label, 0.0
     for k in range(n_classes):
-        total += math.exp(np.float64(values[k]) - best)
+        total += math.exp(np.float64(rows[i, k]) - best)
     return label, 1.0 / total
 
 
 @njit(cache=True, nogil=True)
-def float_run(counts, shots, layers, scratch, scores, labels, probabilities):  # type: ignore[no-untyped-def]
-    """Decide many objects or one: counts int64 (n, d_f) -> scores float32 (n, classes), labels uint16 (n,), probabilities float32 (n,)."""
+def float_run(counts, shots, meta, numbers, room, scores, labels, probabilities):  # type: ignore[no-untyped-def]
+    """Decide many objects or one: counts int64 (n, d_f) -> scores float32 (n, classes), labels uint16 (n,), probabilities float32 (n,).
+
+    `room` is (work, rows). The clicks that fired select rows of the first matrix; the other layers are dense.
+    """
+    work, rows = room
     n_classes = scores.shape[1]
     for i in range(counts.shape[0]):
-        values = scratch.values[float_scores(counts[i], shots, layers, scratch)]
+        last = float_scores(counts, i, shots, meta, numbers, work, rows)
         for k in range(n_classes):
-            scores[i, k] = values[k]
-        labels[i], probabilities[i] = winner(values, n_classes)
+            scores[i, k] = work[last, k]
+        labels[i], probabilities[i] = winner(scores, i, n_classes)
 
 
 # --------------------------------------------------------------------------------------------------------------- int8 heads
 
 
 @njit(cache=True, nogil=True)
-def _add_steps(weights, start, width, n_rows, scratch, out):  # type: ignore[no-untyped-def]
-    """out[j] += sum over r < n_rows (padded to STEP) of steps[r] * row rows[r] of an int8 matrix; exact in int32."""
-    rows, f = scratch.rows, scratch.steps
+def _add_steps(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-def]
+    """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of an int8 matrix; exact in int32."""
+    columns = _U(width)
     for r in range(0, n_rows, STEP):
         f0, f1, f2, f3, f4, f5, f6, f7 = f[r], f[r + 1], f[r + 2], f[r + 3], f[r + 4], f[r + 5], f[r + 6], f[r + 7]
-        a0, a1 = start + rows[r] * width, start + rows[r + 1] * width
-        a2, a3 = start + rows[r + 2] * width, start + rows[r + 3] * width
-        a4, a5 = start + rows[r + 4] * width, start + rows[r + 5] * width
-        a6, a7 = start + rows[r + 6] * width, start + rows[r + 7] * width
-        for j in range(width):
-            out[j] += np.int32(
+        a0, a1 = _U(rows[r]) * columns, _U(rows[r + 1]) * columns
+        a2, a3 = _U(rows[r + 2]) * columns, _U(rows[r + 3]) * columns
+        a4, a5 = _U(rows[r + 4]) * columns, _U(rows[r + 5]) * columns
+        a6, a7 = _U(rows[r + 6]) * columns, _U(rows[r + 7]) * columns
+        for j in range(columns):
+            out[0, j] += np.int32(
                 (f0 * weights[a0 + j] + f1 * weights[a1 + j])
                 + (f2 * weights[a2 + j] + f3 * weights[a3 + j])
                 + (f4 * weights[a4 + j] + f5 * weights[a5 + j])
@@ -214,65 +198,58 @@ def _add_steps(weights, start, width, n_rows, scratch, out):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _add_all_steps(weights, start, width, n_rows, x, out):  # type: ignore[no-untyped-def]
-    """out[j] += sum over r < n_rows (a multiple of STEP) of x[r] * row r of an int8 matrix; exact in int32."""
-    for r in range(0, n_rows, STEP):
-        b = start + r * width
-        f0, f1, f2, f3, f4, f5, f6, f7 = x[r], x[r + 1], x[r + 2], x[r + 3], x[r + 4], x[r + 5], x[r + 6], x[r + 7]
-        for j in range(width):
-            out[j] += np.int32(
-                (f0 * weights[b + j] + f1 * weights[b + width + j])
-                + (f2 * weights[b + 2 * width + j] + f3 * weights[b + 3 * width + j])
-                + (f4 * weights[b + 4 * width + j] + f5 * weights[b + 5 * width + j])
-                + (f6 * weights[b + 6 * width + j] + f7 * weights[b + 7 * width + j])
-            )
+def _dots_of_steps(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
+    """out[k] = x . weights[start + k * n_in:][:n_in], x int16, weights int8; exact in int32."""
+    for k in range(n_out):
+        w = weights[start + k * n_in : start + (k + 1) * n_in]
+        total = np.int32(0)
+        for j in range(n_in):
+            total += np.int32(np.int32(x[j]) * np.int32(w[j]))
+        out[k] = total
 
 
 @njit(cache=True, nogil=True)
-def int8_scores(counts, shots, layers, scratch):  # type: ignore[no-untyped-def]
-    """Scores of one object by integer sums; they stand in scratch.values[0].
+def int8_scores(counts, i, shots, meta, weights, affine, work, rows, hidden, scores):  # type: ignore[no-untyped-def]
+    """Scores scores[i] of the object whose clicks are counts[i], integers (n, d_f), by integer sums.
 
     Layer one is an exact integer column sum of the clicks. A hidden value is rounded to a whole step (the export has folded its range
     into the scales) and cut to 0..255.
     """
-    sizes, n_features = layers.sizes, layers.sizes[0]
-    n_fired = 0
-    for i in range(n_features):
-        if counts[i]:
-            scratch.rows[n_fired] = i
-            scratch.steps[n_fired] = counts[i]
+    n_layers, n_features, width, n_fired = meta[0], meta[1], meta[2], 0
+    steps = work[2]
+    for feature in range(n_features):
+        count = counts[i, feature]
+        if count:
+            rows[n_fired] = feature
+            steps[n_fired] = count
             n_fired += 1
     for r in range(n_fired, -(-n_fired // STEP) * STEP):
-        scratch.rows[r] = 0
-        scratch.steps[r] = 0
-    width = sizes[1]
-    sums = scratch.sums[0]
-    sums[:width] = 0
-    _add_steps(layers.weights, 0, width, n_fired, scratch, sums)
-    start, column = n_features * width, 0
-    unit = np.float32(1) / np.float32(shots)
-    for layer in range(1, sizes.size - 1):
-        for j in range(width):
-            value = np.float32(sums[j]) * (layers.scales[column + j] * unit) + layers.biases[column + j]
-            sums[j] = np.int32(min(max(value, np.float32(0)), np.float32(255)) + np.float32(0.5))
-        column += width
-        n_rows, width, unit = width, sizes[layer + 1], np.float32(1)
-        following = scratch.sums[layer & 1]
-        following[:width] = 0
-        _add_all_steps(layers.weights, start, width, n_rows, sums, following)
-        sums = following
-        start += n_rows * width
-    values = scratch.values[0]
+        rows[r] = 0
+        steps[r] = 0
     for j in range(width):
-        values[j] = np.float32(sums[j]) * (layers.scales[column + j] * unit) + layers.biases[column + j]
+        work[0, j] = 0
+    _add_steps(weights, width, n_fired, rows, steps, work)
+    start, column, sums = n_features * width, 0, work[0]
+    unit = np.float32(1) / np.float32(shots)
+    for layer in range(1, n_layers):
+        scales, biases = affine[0, column : column + width], affine[1, column : column + width]
+        for j in range(width):
+            value = np.float32(sums[j]) * (scales[j] * unit) + biases[j]
+            hidden[j] = np.int16(min(max(value, np.float32(0)), np.float32(255)) + np.float32(0.5))
+        column += width
+        n_rows, width, unit = width, meta[layer + 2], np.float32(1)
+        _dots_of_steps(weights, start, width, n_rows, hidden, sums)
+        start += n_rows * width
+    for k in range(scores.shape[1]):
+        scores[i, k] = np.float32(sums[k]) * (affine[0, column + k] * unit) + affine[1, column + k]
 
 
 @njit(cache=True, nogil=True)
-def int8_run(counts, shots, layers, scratch, scores, labels, probabilities):  # type: ignore[no-untyped-def]
-    """As `float_run`, with the quantised head."""
+def int8_run(counts, shots, meta, numbers, room, scores, labels, probabilities):  # type: ignore[no-untyped-def]
+    """As `float_run`, with the quantised head; `numbers` is (weights int8, affine), `room` (work int32, rows, hidden)."""
+    weights, affine = numbers
+    work, rows, hidden = room
     n_classes = scores.shape[1]
     for i in range(counts.shape[0]):
-        int8_scores(counts[i], shots, layers, scratch)
-        for k in range(n_classes):
-            scores[i, k] = scratch.values[0, k]
-        labels[i], probabilities[i] = winner(scratch.values[0], n_classes)
+        int8_scores(counts, i, shots, meta, weights, affine, work, rows, hidden, scores)
+        labels[i], probabilities[i] = winner(scores, i, n_classes)

@@ -7,7 +7,8 @@ bits for one object alone, in a batch and from the streaming core. Not for sever
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,24 +24,31 @@ SHOTS_MAX = 16  # of golden vectors
 Room = tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.float32]]  # scores, labels, probabilities
 
 
+class Padded(NamedTuple):
+    """A chain of layers as decide_kernels.py describes it."""
+
+    meta: NDArray[np.int64]
+    numbers: Any
+
+
 class _KernelDecider:
     """What the two compiled heads share: one kernel for one object and for many."""
 
     name = ""
 
-    def __init__(self, bundle: Bundle, run: Callable[..., None], layers: Any) -> None:
+    def __init__(self, bundle: Bundle, run: Callable[..., None], layers: Padded, dtype: Any) -> None:
         self.choice: Mapping[str, Any] = {}
         self.n_features, self.n_classes = bundle.n_features, bundle.n_classes
-        self.layers, self.scratch = layers, make_scratch(layers.sizes)
+        self.layers, self.room = layers, make_room(layers.meta, dtype)
         self._run = run
         self._one = np.zeros((1, self.n_features), np.int64)
         self._out = _room(1, self.n_classes)
-        run(self._one, 1, layers, self.scratch, *self._out)  # compiles or loads the kernel
+        run(self._one, 1, *layers, self.room, *self._out)  # compiles or loads the kernel
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots and shots >= 1."""
         self._one[0] = counts
-        self._run(self._one, shots, self.layers, self.scratch, *self._out)
+        self._run(self._one, shots, *self.layers, self.room, *self._out)
         return Verdict(int(self._out[1][0]), float(self._out[2][0]))
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
@@ -57,7 +65,7 @@ class _KernelDecider:
 
     def _decide_all(self, counts: NDArray[np.int64], shots: int) -> Room:
         room = _room(len(counts), self.n_classes)
-        self._run(np.ascontiguousarray(counts), shots, self.layers, self.scratch, *room)
+        self._run(np.ascontiguousarray(counts), shots, *self.layers, self.room, *room)
         return room
 
 
@@ -67,7 +75,7 @@ class SparseDecider(_KernelDecider):
     name = "sparse"
 
     def __init__(self, bundle: Bundle) -> None:
-        super().__init__(bundle, kernels.float_run, pad_float(bundle_layers(bundle)))
+        super().__init__(bundle, kernels.float_run, pad_float(bundle_layers(bundle)), np.float32)
         rows, counts, shots = golden_counts(bundle.golden_means)
         found = np.empty((len(rows), self.n_classes), np.float32)
         for k in np.unique(shots):
@@ -85,7 +93,7 @@ class Int8Decider(_KernelDecider):
             raise UsageError(
                 f"{bundle.name} has no int8 head", remedy="export it again with one, or use another back end"
             )
-        super().__init__(bundle, kernels.int8_run, pad_int8(bundle.int8_head))
+        super().__init__(bundle, kernels.int8_run, pad_int8(bundle.int8_head), np.int32)
 
 
 class ReferenceDecider:
@@ -145,47 +153,46 @@ def bundle_layers(bundle: Bundle) -> tuple[Layer, ...]:
     return chain
 
 
-def pad_float(chain: tuple[Layer, ...]) -> kernels.FloatLayers:
+def pad_float(chain: tuple[Layer, ...]) -> Padded:
     """Return the layers as the kernel reads them, padded with zeros."""
-    sizes = [chain[0].weights.shape[0], *(_padded(layer.weights.shape[1]) for layer in chain)]
-    weights, biases = [], []
-    for n_in, n_out, layer in zip(sizes, sizes[1:], chain):
-        weights.append(_pad(layer.weights, (n_in, n_out)).ravel())
-        biases.append(_pad(layer.bias, (n_out,)))
-    relu = np.array([layer.relu for layer in chain], np.int64)
-    return kernels.FloatLayers(np.array(sizes, np.int64), np.concatenate(weights), np.concatenate(biases), relu)
+    sizes = _padded_sizes([chain[0].weights.shape[0], *(layer.weights.shape[1] for layer in chain)])
+    weights = _laid_out([_pad(layer.weights, size) for size, layer in zip(pairwise(sizes), chain)])
+    biases = [_pad(layer.bias, (n_out,)) for n_out, layer in zip(sizes[1:], chain)]
+    meta = np.array([len(chain), *sizes, *(layer.relu for layer in chain)], np.int64)
+    return Padded(meta, np.concatenate([*weights, *biases]))
 
 
-def pad_int8(head: Int8Head) -> kernels.Int8Layers:
+def pad_int8(head: Int8Head) -> Padded:
     """Return the quantised layers as the kernel reads them, padded with zeros."""
     matrices = head.matrices()
-    sizes = [int(head.sizes[0]), *(_padded(weights.shape[1]) for weights, _, _ in matrices)]
-    parts = [
-        (_pad(weights, (n_in, n_out)).ravel(), _pad(scale, (n_out,)), _pad(bias, (n_out,)))
-        for n_in, n_out, (weights, scale, bias) in zip(sizes, sizes[1:], matrices)
-    ]
-    arrays = [np.concatenate(column) for column in zip(*parts)]
-    return kernels.Int8Layers(np.array(sizes, np.int64), *arrays)
+    sizes = _padded_sizes(head.sizes.tolist())
+    weights = _laid_out([_pad(matrix, size) for size, (matrix, _, _) in zip(pairwise(sizes), matrices)])
+    affine = [np.stack([_pad(scale, (n,)), _pad(bias, (n,))]) for n, (_, scale, bias) in zip(sizes[1:], matrices)]
+    meta = np.array([len(matrices), *sizes, *[1] * (len(matrices) - 1), 0], np.int64)
+    return Padded(meta, (np.concatenate(weights), np.concatenate(affine, axis=1)))
 
 
-def make_scratch(sizes: NDArray[np.int64]) -> kernels.Scratch:
-    """Return the room that one decision through layers of these sizes needs."""
-    widest, rows = int(sizes[1:].max()), int(sizes[0]) + kernels.STEP
-    return kernels.Scratch(
-        np.zeros((2, widest), np.float32),
-        np.zeros((2, widest), np.int32),
-        np.zeros(rows, np.int64),
-        np.zeros(rows, np.float32),
-        np.zeros(rows, np.int32),
-    )
+def make_room(meta: NDArray[np.int64], dtype: Any) -> tuple[NDArray[Any], ...]:
+    """Return the kernel's room for one decision through layers of these sizes: (work, rows), with `hidden` for int32."""
+    n_layers, n_features = int(meta[0]), int(meta[1])
+    widest = max(int(meta[2 : n_layers + 2].max()), n_features + kernels.STEP)
+    room = np.zeros((3, widest), dtype), np.zeros(n_features + kernels.STEP, np.int64)
+    return room if dtype == np.float32 else (*room, np.zeros(widest, np.int16))
 
 
 def _room(n: int, n_classes: int) -> Room:
     return np.empty((n, n_classes), np.float32), np.empty(n, np.uint16), np.empty(n, np.float32)
 
 
-def _padded(width: int) -> int:
-    return -(-width // kernels.LANES) * kernels.LANES
+def _padded_sizes(sizes: list[int]) -> list[int]:
+    """Hidden widths become multiples of LANES, the last one even; d_f stays."""
+    hidden = [-(-width // kernels.LANES) * kernels.LANES for width in sizes[1:-1]]
+    return [sizes[0], *hidden, sizes[-1] + sizes[-1] % 2]
+
+
+def _laid_out(matrices: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """The first matrix row by row, since clicks select rows; the others column by column, for dot products."""
+    return [matrices[0].ravel(), *(matrix.T.ravel() for matrix in matrices[1:])]
 
 
 def _pad(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

@@ -80,6 +80,24 @@ class StreamTracker:
         self.counters.exposures += n_exposures
         return message, gap
 
+    @property
+    def open(self) -> bool:
+        """Whether the stream has not been finished."""
+        return not self._finished
+
+    @property
+    def position(self) -> tuple[int, int, int]:
+        """The sequence number and exposure that come next, and the device's drop counter."""
+        return self.next_seq, self.next_exposure, self._drops
+
+    def advance(self, position: tuple[int, int], messages: int, exposures: int) -> None:
+        """Account for messages in order and without loss that were taken elsewhere (stream.py), `exposures` of them in blocks."""
+        self.next_seq, self.next_exposure = position
+        self.counters.messages += messages
+        self.counters.exposures += exposures
+        if exposures:
+            self._lost_messages = 0  # whatever was lost before them held no exposures
+
     def finish(self, next_exposure: int, drops: int) -> Gap | None:
         """Close the stream: the device says it stopped before `next_exposure`; return the gap at the end, if any.
 

@@ -146,6 +146,19 @@ class DecisionWindows:
         return self._advance_to(visit) + self._settle(relative)
 
     @property
+    def position(self) -> tuple[int, int, int]:
+        """The visit under way, its next window to be settled, and the object before the detector; stream.py continues from here."""
+        return self._visit, self._next_window, self._object
+
+    @position.setter
+    def position(self, value: tuple[int, int, int]) -> None:
+        self._visit, self._next_window, self._object = value
+
+    def arrays(self) -> tuple[npt.NDArray[np.int32], I64, I64, I64, I64]:
+        """Return the arrays that hold the visit under way: window and last exposure, counts, seen, tallies."""
+        return self._window_at, self._last, self._counts, self._seen, self.tallies
+
+    @property
     def visits_begun(self) -> int:
         """Visits of which something has been seen or settled."""
         return self._visit + (self._next_window > 0 or bool(self._seen.any()))

@@ -76,9 +76,9 @@ def test_ties_and_scores_that_are_not_finite() -> None:
     assert decider.decide(np.zeros(3, np.int64), 1).label == 1
     steep = (Layer(np.array([[3e38, 1]], np.float32), np.array([3e38, 0], np.float32), False),)
     large = SparseDecider(head_bundle((Layer(steep[0].weights * 0, steep[0].bias * 0, False),)))
-    large.layers = large.layers._replace(
-        weights=np.pad(steep[0].weights.ravel(), (0, 14)), biases=np.pad(steep[0].bias, (0, 14))
-    )
+    numbers = np.zeros(4, np.float32)
+    numbers[[0, 1, 2]] = 3e38, 1, 3e38  # one row of weights, then the biases: their sum is no float32
+    large.layers = large.layers._replace(numbers=numbers)
     verdict = large.decide(np.ones(1, np.int64), 1)
     assert verdict.probability == 0.0
 

@@ -1,0 +1,147 @@
+"""The same loops in C, compiled when a benchmark runs: what our kernels are measured against.
+
+Owns the source and the call of the compiler; never part of a run. `c_loops` returns a `CLoops`, or a word that says why there is none.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+FREE_FLAGS = (
+    "-O3",
+    "-march=native",
+    "-ffast-math",
+    "-shared",
+    "-fPIC",
+)  # the freedom to reorder sums, which our kernel takes too
+SOURCE = r"""
+#include <stdint.h>
+#include <math.h>
+
+void label_words(const uint8_t *restrict labels, const uint16_t *restrict words, uint8_t *restrict out, int64_t n) {
+    for (int64_t i = 0; i < n; i++) out[i] = labels[words[i]];
+}
+
+/* The loop as the kernel has it: eight rows a step, then dot products, two at a time; h hidden, c (even) outputs. */
+static void add8(const float *restrict w, const int64_t *rows, const float *f, int64_t n_rows, int64_t width, float *restrict out) {
+    for (int64_t r = 0; r < n_rows; r += 8) {
+        const float *a0 = w + rows[r] * width, *a1 = w + rows[r + 1] * width, *a2 = w + rows[r + 2] * width, *a3 = w + rows[r + 3] * width;
+        const float *a4 = w + rows[r + 4] * width, *a5 = w + rows[r + 5] * width, *a6 = w + rows[r + 6] * width, *a7 = w + rows[r + 7] * width;
+        float f0 = f[r], f1 = f[r + 1], f2 = f[r + 2], f3 = f[r + 3], f4 = f[r + 4], f5 = f[r + 5], f6 = f[r + 6], f7 = f[r + 7];
+        for (int64_t j = 0; j < width; j++)
+            out[j] += ((f0 * a0[j] + f1 * a1[j]) + (f2 * a2[j] + f3 * a3[j])) + ((f4 * a4[j] + f5 * a5[j]) + (f6 * a6[j] + f7 * a7[j]));
+    }
+}
+
+static void dots(const float *restrict w, const float *restrict x, int64_t n_in, int64_t n_out, float *restrict out) {
+    for (int64_t k = 0; k < n_out; k += 2) {
+        const float *p = w + k * n_in, *q = p + n_in;
+        float a = 0, b = 0;
+        for (int64_t j = 0; j < n_in; j++) { a += x[j] * p[j]; b += x[j] * q[j]; }
+        out[k] += a; out[k + 1] += b;
+    }
+}
+
+static void win(const float *scores, int64_t classes, uint16_t *label, float *probability) {
+    int64_t best = 0;
+    double total = 0;
+    for (int64_t k = 1; k < classes; k++) if (scores[k] > scores[best]) best = k;
+    for (int64_t k = 0; k < classes; k++) total += exp((double)scores[k] - (double)scores[best]);
+    *label = (uint16_t)best;
+    *probability = (float)(1 / total);
+}
+
+/* counts int64 (n, d_f) -> labels and probabilities */
+void sparse_same(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
+                 const float *numbers, float *hidden, float *scores, int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
+    const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
+    for (int64_t i = 0; i < n; i++) {
+        int64_t fired = 0;
+        for (int64_t k = 0; k < d_f; k++)
+            if (counts[i * d_f + k]) { rows[fired] = k; factors[fired++] = (float)counts[i * d_f + k]; }
+        for (int64_t r = fired; r < (fired + 7) / 8 * 8; r++) { rows[r] = 0; factors[r] = 0; }
+        for (int64_t j = 0; j < h; j++) hidden[j] = b1[j];
+        add8(w1, rows, factors, fired, h, hidden);
+        for (int64_t j = 0; j < h; j++) hidden[j] = hidden[j] < 0 ? 0 : hidden[j];
+        for (int64_t j = 0; j < c; j++) scores[j] = b2[j];
+        dots(w2, hidden, h, c, scores);
+        win(scores, classes, labels + i, probabilities + i);
+    }
+}
+
+/* The loop as one would write it down: a column at a time, then a row at a time. */
+void sparse_plain(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
+                  const float *numbers, float *restrict hidden, float *restrict scores, int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
+    const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
+    for (int64_t i = 0; i < n; i++) {
+        for (int64_t j = 0; j < h; j++) hidden[j] = b1[j];
+        for (int64_t k = 0; k < d_f; k++) {
+            float f = (float)counts[i * d_f + k];
+            if (f != 0) for (int64_t j = 0; j < h; j++) hidden[j] += f * w1[k * h + j];
+        }
+        for (int64_t j = 0; j < c; j++) scores[j] = b2[j];
+        for (int64_t j = 0; j < h; j++) {
+            float x = hidden[j] < 0 ? 0 : hidden[j];
+            for (int64_t k = 0; k < c; k++) scores[k] += x * w2[k * h + j];
+        }
+        win(scores, classes, labels + i, probabilities + i);
+    }
+}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CLoops:
+    """The compiled loops; `compiler` says with what."""
+
+    library: ctypes.CDLL
+    compiler: str
+
+    def label_words(self, labels: NDArray[np.uint8], words: NDArray[np.uint16], out: NDArray[np.uint8]) -> None:
+        """labels (2**d_f,), words (n,) -> out (n,)."""
+        self.library.label_words(_at(labels), _at(words), _at(out), ctypes.c_int64(len(words)))
+
+    def sparse(self, loop: str, counts: NDArray[np.int64], meta: NDArray[np.int64], numbers: NDArray[np.float32],
+               n_classes: int) -> NDArray[np.uint16]:  # fmt: skip
+        """Decide counts (n, d_f) with a head of two layers, padded as decide_mlp pads it; `loop` is sparse_same or sparse_plain."""
+        n_features, hidden, columns = meta[1:4].tolist()
+        labels, probabilities = np.empty(len(counts), np.uint16), np.empty(len(counts), np.float32)
+        work, rows = np.zeros((3, hidden + n_features + 8), np.float32), np.zeros(n_features + 8, np.int64)
+        sizes = [ctypes.c_int64(n) for n in (len(counts), n_features, hidden, columns, n_classes)]
+        arrays = [_at(a) for a in (numbers, work[0], work[1], rows, work[2], labels, probabilities)]
+        getattr(self.library, loop)(_at(counts), *sizes, *arrays)
+        return labels
+
+
+def c_loops(flags: tuple[str, ...] = FLAGS) -> CLoops | str:
+    """Compile the loops with the system's C compiler; a word of explanation where that is not possible."""
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        return "no C compiler (gcc or cc) on this machine: rows in C are left out"
+    with tempfile.TemporaryDirectory() as folder:
+        source, library = Path(folder) / "loops.c", Path(folder) / "loops.so"
+        source.write_text(SOURCE)
+        done = subprocess.run(
+            [compiler, *flags, "-o", str(library), str(source), "-lm"], capture_output=True, text=True
+        )
+        if done.returncode:
+            return f"{compiler} failed: {done.stderr.strip().splitlines()[-1:]}: rows in C are left out"
+        version = subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout.splitlines()[0]
+        try:
+            return CLoops(ctypes.CDLL(str(library)), f"{version}, {' '.join(flags[:-2])}")
+        except OSError as error:
+            return f"the compiled loops cannot be loaded ({error}): rows in C are left out"
+
+
+def _at(array: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)

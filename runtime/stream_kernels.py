@@ -1,0 +1,290 @@
+"""The compiled kernel of the streaming core: decoded FRAMES and MARK bodies in, rows of the decision log out.
+
+Owns the ordinary case of parallel measurements: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves
+untouched and says so: `stream.StreamCore` gives it to `core.Core`, whose state this kernel continues. Never allocates.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from .record_format import NO_LABEL, DecisionFlag
+from .window import DARK_CLICKS, DARK_EXPOSURES
+from .wire_kernels import load4, load8
+from .wire_schema import NO_OBJECT, UNKNOWN_TRUTH, MessageType
+
+# state, int64 (N_STATE,): where the walk stands, and the facts of Core, StreamTracker and DecisionWindows that it continues
+MESSAGE, FRAME, N_ROWS, SESSION, NEXT_SEQ, NEXT_EXPOSURE, DROPS, MESSAGES, EXPOSURES = range(9)
+VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, END_EXPOSURE, LAST_TICK = range(9, 16)
+EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, N_STATE = range(16, 20)
+ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_frames` returns
+MARK_SLOTS = 4096  # as many objects as core.MAX_MARKS
+
+_U = np.uint64
+_LANE = _U(0xFF)
+_FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
+_HEADER, _BLOCK_HEADER, _MARK_BYTES = 8, 36, 32
+_LARGEST = _U(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
+_ABSTAINED = int(DecisionFlag.ABSTAINED)
+_GAP = int(DecisionFlag.GAP) | _ABSTAINED
+_NOT_FINITE = int(DecisionFlag.NOT_FINITE) | _ABSTAINED
+_NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
+SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
+ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
+
+
+class WindowArrays(NamedTuple):
+    """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
+
+    `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
+    """
+
+    window_at: npt.NDArray[np.int32]
+    last: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.int64]
+    seen: npt.NDArray[np.int64]
+    tallies: npt.NDArray[np.int64]
+    lanes: npt.NDArray[np.uint64]
+    whole: npt.NDArray[np.int64]
+
+
+class DecisionTables(NamedTuple):
+    """From clicks per pattern to label, probability and checksum; without `labels` (size 0) the counts go to `counts_out`.
+
+    `radix` int64 (d_f,): the row of a table is the sum of counts * radix. `crc` uint32 (bytes of a count, d_f, 256) and `crc_zero`
+    uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte.
+    """
+
+    labels: npt.NDArray[np.uint16]
+    probabilities: npt.NDArray[np.float32]
+    radix: npt.NDArray[np.int64]
+    crc: npt.NDArray[np.uint32]
+    crc_zero: npt.NDArray[np.uint32]
+
+
+class MarkArrays(NamedTuple):
+    """The latest object numbers, truths and photons by object modulo MARK_SLOTS; int64, int16, float32 (MARK_SLOTS,)."""
+
+    objects: npt.NDArray[np.int64]
+    truths: npt.NDArray[np.int16]
+    photons: npt.NDArray[np.float32]
+
+
+@njit(cache=True, nogil=True)
+def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
+
+    buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows WindowArrays, tables DecisionTables, rows
+    DECISION_DTYPE (m,), counts_out int64 (m, d_f).
+    """
+    while state[MESSAGE] < spans.shape[0]:
+        if state[N_ROWS] == rows.size:
+            return ROWS_FULL
+        start, stop = _U(spans[state[MESSAGE], 0]), _U(spans[state[MESSAGE], 1])
+        if load4(buffer, start + _U(4)) != _U(state[SESSION]):
+            return ODD
+        kind = buffer[start]
+        payload = start + _U(_HEADER)
+        if kind == _MARK:
+            if not _take_mark(buffer, payload, stop, state, marks):
+                return ODD
+        elif kind == _FRAMES:
+            if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
+                return ODD
+            if not _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):
+                return ROWS_FULL
+            state[FRAME] = 0
+        else:
+            return ODD
+        state[MESSAGE] += 1
+    return ALL_DONE
+
+
+@njit(cache=True, nogil=True)
+def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-def]
+    """Remember an object's truth; False, and nothing done, when the message is not the next one."""
+    if stop - payload != _U(_MARK_BYTES) or load4(buffer, payload) != _U(state[NEXT_SEQ]):
+        return False
+    number = np.int64(load4(buffer, payload + _U(4)))
+    slot = number % MARK_SLOTS
+    marks.objects[slot] = number
+    marks.truths[slot] = np.int16(np.uint16(load4(buffer, payload + _U(8)) & _U(0xFFFF)))
+    bits = load4(buffer, payload + _U(28))
+    marks.photons[slot : slot + 1].view(np.uint32)[0] = np.uint32(bits)
+    state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
+    state[MESSAGES] += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
+    """Account for a block that is the next one and fits the plan; else False, and nothing done."""
+    if stop - payload <= _U(_BLOCK_HEADER):
+        return False
+    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
+    word_bytes = np.int64(load4(buffer, payload + _U(28)) >> _U(16))
+    tick, first = load8(buffer, payload + _U(8)), load8(buffer, payload + _U(16))
+    if (
+        np.int64(stop - payload) != _BLOCK_HEADER + count * word_bytes
+        or count == 0
+        or word_bytes < windows.lanes.size
+        or load4(buffer, payload) != _U(state[NEXT_SEQ])
+        or load4(buffer, payload + _U(4)) != _U(state[DROPS])
+        or tick >= _LARGEST
+        or first != _U(state[NEXT_EXPOSURE])
+        or np.int64(first) + count > state[END_EXPOSURE]
+    ):
+        return False
+    visit = np.int64(first) // state[VISIT_EXPOSURES]
+    if np.int64(first) + count > (visit + 1) * state[VISIT_EXPOSURES]:
+        return False
+    if visit != state[VISIT]:
+        if state[NEXT_WINDOW] != windows.counts.shape[0]:
+            return False
+        windows.counts[:] = 0
+        windows.seen[:] = 0
+        state[VISIT] = visit
+        state[NEXT_WINDOW] = 0
+    period = np.int64(load4(buffer, payload + _U(24)))
+    state[OBJECT] = np.int64(load4(buffer, payload + _U(32)))
+    state[LAST_TICK] = np.int64(tick) + (count - 1) * period + state[EXPOSURE_TICKS]
+    state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
+    state[MESSAGES] += 1
+    state[NEXT_EXPOSURE] += count
+    state[EXPOSURES] += count
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Count the frames of an accepted block from state[FRAME] on; False when the rows are full before its end.
+
+    Arrays are taken out of their tuples once: inside the loop that would count references for every frame.
+    """
+    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
+    word_bytes = load4(buffer, payload + _U(28)) >> _U(16)
+    first = np.int64(load8(buffer, payload + _U(16)))
+    tick, period = np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
+    relative, end_of_exposure = first - state[VISIT] * state[VISIT_EXPOSURES], state[EXPOSURE_TICKS]
+    window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
+    lanes, whole = windows.lanes, windows.whole
+    tallies, objects, truths = windows.tallies, marks.objects, marks.truths
+    labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
+    crc_zero, number, shots, n_lanes = tables.crc_zero[0], state[OBJECT], state[SHOTS], lanes.size
+    n_features = counts.shape[1]
+    top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
+    known = number != _NO_OBJECT and objects[number % MARK_SLOTS] == number
+    truth = np.int64(truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
+    n_rows, n_decisions = state[N_ROWS], state[N_DECISIONS]
+    at = payload + _U(_BLOCK_HEADER) + _U(state[FRAME]) * word_bytes
+    window, held, done = -1, 0, int(count)  # `held` frames of `window` are in the lanes
+    for i in range(state[FRAME], count):
+        here = int(window_at[relative + i])
+        if here < 0:
+            for p in range(n_lanes):
+                tallies[DARK_CLICKS] += ONES[np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)]
+            tallies[DARK_EXPOSURES] += n_features
+            at += word_bytes
+            continue
+        window = here
+        for p in range(n_lanes):
+            lane = SPREAD[buffer[at + _U(p)]]
+            lanes[p] = lane if held == 0 else lanes[p] + lane
+        held += 1
+        at += word_bytes
+        if relative + i != last[here]:
+            if held == 255:
+                _spill(lanes, counts, seen, here, held)
+                held = 0
+        else:
+            if seen[here, 0] != 0:  # the window began in an earlier block
+                _spill(lanes, counts, seen, here, held)
+                _gather(counts, here, whole)
+            else:
+                _unpack(lanes, whole)
+                seen[here, 0] = held * n_features
+            held = 0
+            clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
+            flags, label, probability = 0, _NO_LABEL, np.float32(0.0)
+            if seen[here, 0] != shots * n_features:
+                flags = _GAP
+            elif labels.size:
+                probability = probabilities[index]
+                if probability > 0:
+                    label = int(labels[index])
+                else:
+                    flags = _NOT_FINITE
+            else:
+                for feature in range(n_features):
+                    counts_out[n_rows, feature] = whole[feature]
+            row = rows[n_rows]
+            row["index"] = n_decisions
+            row["tick"] = tick + i * period + end_of_exposure
+            row["exposure_index"] = first + i
+            row["object"] = number
+            row["shot"] = here * shots
+            row["clicks"] = clicks
+            row["label"] = label
+            row["truth"] = truth
+            row["flags"] = flags
+            row["probability"] = probability
+            row["counts_crc"] = crc
+            n_rows += 1
+            n_decisions += 1
+            state[N_ABSTAINED] += flags != 0
+            state[NEXT_WINDOW] = here + 1
+            if n_rows == rows.size:
+                done = i + 1
+                break
+    if held:
+        _spill(lanes, counts, seen, window, held)
+    state[N_ROWS], state[N_DECISIONS], state[FRAME] = n_rows, n_decisions, done
+    return done == count
+
+
+@njit(cache=True, nogil=True)
+def _spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
+    """Add the byte lanes to the counts of their window."""
+    n_features = counts.shape[1]
+    for p in range(lanes.size):
+        lane = lanes[p]
+        for feature in range(8 * p, min(8 * p + 8, n_features)):
+            counts[window, feature] += np.int64(lane & _LANE)
+            lane >>= _U(8)
+    seen[window, 0] += held * n_features
+
+
+@njit(cache=True, nogil=True)
+def _unpack(lanes, whole):  # type: ignore[no-untyped-def]
+    """The byte lanes as counts: all of a window that one block holds."""
+    for p in range(lanes.size):
+        lane = lanes[p]
+        for feature in range(8 * p, min(8 * p + 8, whole.size)):
+            whole[feature] = np.int64(lane & _LANE)
+            lane >>= _U(8)
+
+
+@njit(cache=True, nogil=True)
+def _gather(counts, window, whole):  # type: ignore[no-untyped-def]
+    """The counts of a window that several blocks held."""
+    for feature in range(whole.size):
+        whole[feature] = counts[window, feature]
+
+
+@njit(cache=True, nogil=True)
+def _sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
+    """Clicks, row of the table and checksum of a window's counts."""
+    clicks, index = np.int64(0), np.int64(0)
+    for feature in range(whole.size):
+        count = whole[feature]
+        clicks += count
+        index += count * radix[feature]
+        crc ^= crc_table[0, feature, count & 0xFF]
+    for byte in range(1, crc_table.shape[0]):
+        for feature in range(whole.size):
+            crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
+    return clicks, index, crc
