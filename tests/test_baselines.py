@@ -12,9 +12,10 @@ import pytest
 
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
 from pans.runtime.errors import UsageError
-from pans.trainer import baselines
+from pans.trainer import baseline_bayes, baselines
+from pans.trainer.baseline_bayes import FLOORS, bayes, choose_floor, log_joint
 from pans.trainer.baseline_compressive import patterns, walsh
-from pans.trainer.baselines import Trials, bayes, choose_floor, detect, log_joint, measure, run_trials
+from pans.trainer.baselines import Trials, detect, measure, run_trials
 from pans.trainer.tasks import Objects, Task, load_task
 
 SIDE = 8
@@ -110,7 +111,7 @@ def test_the_posterior_is_that_of_plain_loops(
     task: Task, detector: str, brightness: str, floor: float, dark: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(baselines, "_BLOCK", 7)
-    monkeypatch.setattr(baselines, "_CHUNK", 4)
+    monkeypatch.setattr(baseline_bayes, "_CHUNK", 4)
     few = Task("bars", task.classes, bars(40, 3), bars(9, 4), "0" * 64, "made here")
     measurement = measure(few, None, brightness)
     light = measurement.photoelectrons(measurement.test, 6.0)
@@ -166,7 +167,7 @@ def test_the_floor_is_chosen_without_the_test_labels(task: Task) -> None:
     wrong = Task(task.name, task.classes, task.train, other, task.sha256, task.split)
     chosen = [choose_floor(measure(one, None), 30.0, "counting", np.random.default_rng(7)) for one in (task, wrong)]
     assert chosen[0] == chosen[1]
-    assert chosen[0] in baselines.FLOORS
+    assert chosen[0] in FLOORS
 
 
 # ---- the score ----

@@ -5,7 +5,7 @@ reconstruction: the classifier sees the d_f readouts (paper, appendix on fixed o
 
 - `mlp`: the paper's back end trained on noisy readouts of the very photon level.
 - `clean-mlp`: the same trained on noiseless features and shown noisy ones (the paper's baseline).
-- `bayes` (baselines.py): the exact posterior over the training objects.
+- `bayes` (baseline_bayes.py): the exact posterior over the training objects.
 """
 
 from __future__ import annotations

@@ -162,7 +162,8 @@ def _paradigm(task: Task, args: argparse.Namespace, report: Report) -> tuple[Mea
     """The measurement, and what gives the decision at a photon level, with facts about it."""
     if args.paradigm == "e2e":
         return _end_to_end(task, args, report)
-    from .baselines import bayes, measure
+    from .baseline_bayes import bayes
+    from .baselines import measure
 
     patterns, facts = None, {}
     if args.paradigm == "compressive":
@@ -188,7 +189,8 @@ def _information(measurement: Measurement, photons: float, floor: float, args: a
     """One more readout of every test object, judged by the posterior; and what its statistics alone say."""
     import numpy as np
 
-    from .baselines import detect, log_joint
+    from .baseline_bayes import log_joint
+    from .baselines import detect
     from .information import fisher, posterior_information
 
     light = measurement.photoelectrons(measurement.test, photons)
