@@ -156,7 +156,7 @@ def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
     return crc
 
 
-def block_bytes(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
+def block_bytes(kind: int, index: int, chain: int, payload: bytes | memoryview) -> tuple[bytes, int]:
     """Return a block's bytes and the next chain value; each CRC is seeded with the one before it, so order is covered."""
     start = _BLOCK_HEADER.pack(len(payload), index, kind, 0)[:-4]
     header_crc = zlib.crc32(start, chain)

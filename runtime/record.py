@@ -163,6 +163,16 @@ class Recorder:
         if self._decisions.add(record):
             self._empty(self._decisions)
 
+    def add_decisions(self, rows: NDArray[np.void]) -> None:
+        """Keep many decisions, DECISION_DTYPE (n,), behind those already added; whole blocks go out at once."""
+        self._empty(self._decisions)
+        most = LIMITS[Kind.DECISIONS] // DECISION_DTYPE.itemsize
+        for start in range(0, len(rows), most):
+            payload = np.ascontiguousarray(rows[start : start + most], dtype=DECISION_DTYPE).view(np.uint8).data
+            self._write_block(Kind.DECISIONS, payload)
+            self._log_hash.update(payload)
+            self._n_decisions += len(payload) // DECISION_DTYPE.itemsize
+
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
         if self._timings.add(record):
@@ -229,7 +239,7 @@ class Recorder:
             self._log_hash.update(payload)
             self._n_decisions += count
 
-    def _write_block(self, kind: Kind, payload: bytes) -> None:
+    def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
         if len(payload) > LIMITS[kind]:
             raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
         data, chain = block_bytes(kind, self._n_blocks, self._chain, payload)

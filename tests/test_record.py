@@ -393,3 +393,18 @@ def test_a_header_that_json_cannot_hold_makes_no_file(tmp_path: Path) -> None:
         with pytest.raises((ValueError, TypeError)):
             Recorder.open(tmp_path / "a.pansrec", {"value": strange})
     assert os.listdir(tmp_path) == []
+
+
+def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
+    wanted = np.array([decision(i) for i in range(50_000)], dtype=DECISION_DTYPE)
+    one, many = tmp_path / "one.pansrec", tmp_path / "many.pansrec"
+    with Recorder.open(one, HEADER) as recorder:
+        for row in wanted[:10].tolist():
+            recorder.add_decision(row)
+        recorder.add_decisions(wanted[10:])
+        digest = recorder.close({})
+    with Recorder.open(many, HEADER) as recorder:
+        recorder.add_decisions(wanted)
+        assert recorder.close({}) == digest == decision_log_sha256(wanted)
+    for path in (one, many):
+        np.testing.assert_array_equal(read_recording(path).decisions(), wanted)
