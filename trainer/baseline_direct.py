@@ -3,7 +3,8 @@
 Owns the networks that decide from a frame; the light, the detector and the score are those of baselines.py. Each way is a
 function from a photon level to a decision `readouts -> labels`. SIMULATED, ideal shot noise unless dark counts are asked for.
 
-- `bayes` (baseline_bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise; the strong one at few photons.
+- `bayes` (baseline_bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise;
+  the strong one at few photons.
 - `cnn`: an AlexNet-style network trained on noisy frames of the very photon level. Knows the noise; strong at many photons.
 - `clean-cnn`: the same network trained on noiseless frames (the paper's baseline, which cannot know what noise looks like).
 """

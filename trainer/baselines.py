@@ -1,7 +1,8 @@
 """Baselines, the common ground: light, detection and the score.
 
 Owns what every alternative to PANS shares: how N photons are dealt out, how they are detected, and how a result is counted.
-Never decides (baseline_bayes.py, baseline_nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a frame, or m = d_f patterns.
+Never decides (baseline_bayes.py, baseline_nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a
+frame, or m = d_f patterns.
 
 Two conventions of "N photons" (`brightness`), both SIMULATED:
 
