@@ -86,9 +86,7 @@ class Core:
         """Follow the stream that an ARM starts; the output settles what the one before left open (INCOMPLETE, never guessed)."""
         output = self.end()
         if self._begun:
-            self._visits_before += self.windows.visits_begun
-            windows = self.windows.restart()
-            output.decisions.extend(self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows)
+            output.decisions.extend(self._give_up())
             self.tracker.restart()
             self.marks.clear()
         self._begun, self.completed, self._told_end, self._status = True, False, None, None
@@ -104,7 +102,15 @@ class Core:
             return self._finish(status)
         self.completed = True
         unknown = {"kind": "stream_end_unknown", "first_exposure": self.tracker.next_exposure}
-        return Output([], [unknown], None)
+        decisions: list[Decision] = []
+        if self.windows.visits_begun * self.windows.visit_exposures >= self.end_exposure:
+            decisions = self._give_up()  # nothing is left for another stream: the last object's windows stay open
+        return Output(decisions, [unknown], None)
+
+    def _give_up(self) -> list[Decision]:
+        self._visits_before += self.windows.visits_begun
+        windows = self.windows.restart()
+        return [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""
