@@ -23,8 +23,11 @@ from pans.runtime.bundle import Bundle, load_bundle, make_bundle, word_means, wr
 from pans.runtime.bundle_facts import GOLDEN_TOLERANCE
 from pans.runtime.decide import make_decider
 from pans.runtime.errors import PansError
+from pans.runtime.head_layers import read_layers
+from pans.runtime.int8_head import quantise_head
 
 from .heads import EPSILON, MlpHead
+from .int8_onnx import int8_onnx
 
 OPSET = 17
 IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
@@ -103,6 +106,8 @@ def export(
 ) -> Exported:
     """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ."""
     graph, dead = head_onnx(head, click_mean)
+    layers = read_layers(graph, len(pattern_levels), len(classes))
+    int8 = None if layers is None else quantise_head(layers)
     bundle = make_bundle(
         name=name,
         task=task,
@@ -112,6 +117,8 @@ def export(
         pattern_levels=pattern_levels,
         photons_per_level=photons_per_level,
         head_onnx=graph,
+        int8_head=int8,
+        int8_onnx=None if int8 is None else int8_onnx(int8),
         provenance={**provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
     )
     unchecked = path.with_name(path.name + ".unchecked")  # a wrong bundle must not stand where a right one may be
