@@ -20,9 +20,10 @@ from pans.runtime.clicks import ClickLaw, click_law, click_probability
 from pans.runtime.profile import Profile
 
 DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
-_GOLDEN = 0x9E3779B97F4A7C15
-_CHANNEL_STEP = 0xD1342543DE82EF95
+GOLDEN = 0x9E3779B97F4A7C15
+CHANNEL_STEP = 0xD1342543DE82EF95
 _MASK = (1 << 64) - 1
+KERNEL_EXPOSURES = 256  # from here on the compiled loop pays
 CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM = 0, 1, 2
 
 
@@ -57,14 +58,19 @@ def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.flo
     return click_probability(replace(model.law, dark_per_exposure=0.0), counted)
 
 
+def stream_key(seed: int, stream: int) -> int:
+    """Return the 64-bit key of one stream of random numbers."""
+    return _mix_int(_mix_int(seed & _MASK) ^ _mix_int(stream + 1))
+
+
 def uniform_numbers(
     seed: int, first_exposure: int, n_exposures: int, n_channels: int, stream: int = CLICK_STREAM
 ) -> NDArray[np.float64]:
     """Return float64 (n_exposures, n_channels) in [0, 1) of 53 bits, each a function of (seed, stream, exposure, channel)."""
-    key = _mix_int(_mix_int(seed & _MASK) ^ _mix_int(stream + 1))
+    key = stream_key(seed, stream)
     exposures = np.arange(n_exposures, dtype=np.uint64) + np.uint64(first_exposure & _MASK)
-    state = _mix(exposures * np.uint64(_GOLDEN) + np.uint64(key))
-    steps = np.arange(1, n_channels + 1, dtype=np.uint64) * np.uint64(_CHANNEL_STEP)
+    state = _mix(exposures * np.uint64(GOLDEN) + np.uint64(key))
+    steps = np.arange(1, n_channels + 1, dtype=np.uint64) * np.uint64(CHANNEL_STEP)
     words = _mix(state[:, None] + steps[None, :])
     words >>= np.uint64(11)
     return words.astype(np.float64) * 2.0**-53
@@ -82,6 +88,8 @@ def sample_clicks(
     `first_exposure` counts over the detector's whole life. `previous` is uint8 (n_channels,): the clicks of the exposure
     before, which only afterpulsing looks at.
     """
+    if model.afterpulse_probability and model.crosstalk_probability and len(probability) >= KERNEL_EXPOSURES:
+        return _by_kernel(model, probability, seed, first_exposure, previous)
     numbers = uniform_numbers(seed, first_exposure, *probability.shape)
     primary = numbers < probability
     if not model.afterpulse_probability and not model.crosstalk_probability:
@@ -91,6 +99,22 @@ def sample_clicks(
     if not model.crosstalk_probability:
         return _after(primary, primed, previous).view(np.uint8)
     return _after_and_across(model, primary, primed, previous, seed, first_exposure)
+
+
+def _by_kernel(
+    model: DetectorModel,
+    probability: NDArray[np.float64],
+    seed: int,
+    first_exposure: int,
+    previous: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """Afterpulsing and crosstalk feed each other, so that only a loop over exposures draws them: a compiled one, the same bits."""
+    from .detector_kernels import sample_words  # numba is loaded only for profiles that declare both
+
+    n_exposures, n_channels = probability.shape
+    words = np.zeros((n_exposures, -(-n_channels // 8)), np.uint8)
+    sample_words(model, probability, np.arange(n_exposures), seed, first_exposure, previous.copy(), words)
+    return np.unpackbits(words, axis=1, bitorder="little", count=n_channels)
 
 
 def _after(primary: NDArray[np.bool_], primed: NDArray[np.bool_], previous: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -147,7 +171,7 @@ def _mix(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _mix_int(word: int) -> int:
-    word = (word + _GOLDEN) & _MASK
+    word = (word + GOLDEN) & _MASK
     word = ((word ^ (word >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     word = ((word ^ (word >> 27)) * 0x94D049BB133111EB) & _MASK
     return word ^ (word >> 31)
