@@ -67,8 +67,10 @@ def _grey_sums(
     """Sum of level times grey step, an exact integer: float64 (n_objects, n_patterns)."""
     if scene.any_shape:
         return grey[scene.images.reshape(-1, 1)] * total
+    lit = np.flatnonzero(levels.any(axis=1))  # trained patterns are dark nearly everywhere: dark pixels add nothing
+    seen = levels[lit]
     sums = np.empty((scene.n_objects, levels.shape[1]))
     for first in range(0, scene.n_objects, _OBJECTS_PER_BLOCK):
         block = scene.images[first : first + _OBJECTS_PER_BLOCK]
-        np.matmul(grey[block.reshape(len(block), -1)], levels, out=sums[first : first + len(block)])
+        np.matmul(grey[block.reshape(len(block), -1)[:, lit]], seen, out=sums[first : first + len(block)])
     return sums
