@@ -244,12 +244,14 @@ def _table(task: Task, args: argparse.Namespace, rows: list[dict[str, Any]]) -> 
         f"{rows[0]['trials']} trials, {rows[0]['train_objects']} training objects\n"
         "   photons    clicks  illumination  accuracy %  spread(trials)  error(objects)  first 200 %"
     )
-    lines = [
-        f"{row['photons_mean']:10.2f}{row['clicks_mean']:10.2f}{row['illumination']:14.1f}{100 * row['accuracy_mean']:12.2f}"
-        f"{100 * row['accuracy_std']:16.2f}{100 * row['accuracy_se_objects']:16.2f}"
-        f"{100 * row['first_200']['accuracy_mean']:13.2f}"
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        spread = f"{100 * row['accuracy_std']:.2f}" if row["trials"] > 1 else "one trial"
+        lines.append(
+            f"{row['photons_mean']:10.2f}{row['clicks_mean']:10.2f}{row['illumination']:14.1f}"
+            f"{100 * row['accuracy_mean']:12.2f}{spread:>16}{100 * row['accuracy_se_objects']:16.2f}"
+            f"{100 * row['first_200']['accuracy_mean']:13.2f}"
+        )
     return "\n".join([head, *lines])
 
 
