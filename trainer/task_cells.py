@@ -7,14 +7,14 @@ The scene: a cell flows through the light field; one organelle is stained, and i
 
 - membrane: a thin bright outline (1.2 to 2.2 px), uneven along the circumference, with up to 5 vesicles inside;
 - nucleolus: 1 to 4 compact spots (sigma 1.6 to 3.4 px) in a faint nucleus;
-- mitochondria: 10 to 22 short threads in the cytoplasm around a dark nucleus;
+- mitochondria: 10 to 22 short threads of beads in the cytoplasm around a dark nucleus;
 - null: no cell in focus: haze of cells out of focus and up to 4 specks of debris.
 
-Every cell varies in size (radius 18 to 30 px), outline (aspect 0.72 to 1, waves), place (up to 13 px off in y and x),
-orientation, share of light in the stain (0.35 to 0.8, the rest glows from the whole cell) and brightness.
+Every cell varies in size (radius 24 to 30 px), outline (aspect 0.72 to 1, waves), place (up to 4 px off in y and x: a sheath
+flow centres cells), orientation, share of light in the stain (0.7 to 0.98, the rest glows from the whole cell) and brightness.
 
-What makes it hard: the mean of an image is set to a value drawn without regard to the class (mean grey 4 to 12 of 255), so
-total intensity tells nothing, for the null class neither; place, size and diffuse light hide the texture.
+What makes it hard: the mean of an image is set to a value drawn without regard to the class (mean grey 6 to 12 of 255), so
+total intensity tells nothing, for the null class neither; outlines, vesicles and diffuse light hide the texture.
 
 The paper (appendix "Cell-organelle classification") derives its images from an imaging flow cytometer (Schraivogel et al.,
 2022), 10 000 training and 1000 test images per class, four classes; its public release has three, without null. Those

@@ -4,15 +4,16 @@ Owns the drawing of mode fields on 64 x 64 pixels; never any image of the paper.
 is a field amplitude, for passive encoders (a small part of the signal light is tapped).
 
 The scene: light of the fundamental mode leaves the fibre: a Gaussian amplitude of radius 13 to 15 px (1/e), misaligned by up to
-2 px, a little elliptical (0.94 to 1), with surface roughness (smooth noise of sigma 1.5 px, 0.02 of the amplitude) and detector
-noise (0.006 of full scale). On a contaminated end face 1 to 3 defects lie where the light is:
+1.5 px in y and x, a little elliptical (0.94 to 1), with surface roughness (smooth noise of sigma 1.5 px, 0.01 of the amplitude)
+and detector noise (0.0035 of full scale). On a contaminated end face 2 to 4 defects lie where the light is:
 
-- dirt: a round patch (sigma 1.2 to 3 px) that passes 0.1 to 0.7 of the amplitude;
-- pit: a small dark ring (radius 1.5 to 3.5 px, width 0.8 px) around a spot that is brighter by a third of its depth;
-- scratch: a thin line (sigma 0.6 to 1.1 px, 12 to 40 px long) that takes 0.2 to 0.6 of the amplitude.
+- dirt: a round patch (sigma 2 to 4 px) that takes 0.5 to 1 of the amplitude;
+- pit: a dark ring (radius 2 to 4 px, width 1 px, depth 0.5 to 0.9) around a spot that is brighter by a third of its depth;
+- scratch: a straight line (sigma 0.8 to 1.4 px, 16 to 40 px long) that takes 0.4 to 0.8 of the amplitude.
 
-What makes it hard: a defect takes a few per cent of the power or less, the power itself varies by +-40 % without regard to the class,
-and alignment, size and roughness change the field everywhere.
+What makes it hard: the power at the tap varies by a factor of 2 without regard to the class. (Defects also shadow 10 to 35 % of
+the light; that is taken out, as behind a levelled source, or brightness alone would tell.) Alignment and size change the
+field everywhere, a defect may lie anywhere on it and be darker or brighter.
 
 The paper (appendix "Fiber end-face inspection") calls it a toy model: clean end faces are uniform, contaminated ones have
 localised anomalies; 64 x 64, 4000 training and 1000 test images. Its images are not public; shapes and sizes are ours.
@@ -42,9 +43,9 @@ SIDE_PX = 64
 CLASSES = ("clean", "contaminated")
 MODE_PX = (13.0, 15.0)
 MISALIGNED_PX = 1.5
-MEAN_INTENSITY = (0.045, 0.085)  # of full scale; its brightest mode stays below full scale
+MEAN_INTENSITY = (0.03, 0.06)  # of full scale; the centre of a mode stays below full scale
 ROUGHNESS = 0.01
-NOISE = 0.004
+NOISE = 0.0035
 DEFECTS_MAX = 4
 
 

@@ -5,16 +5,16 @@ level is a field amplitude (the square root of the intensity that a narrow-band 
 flat phase across the field is the paper's assumption (a compact, quasi-monochromatic source): real nebulae are incoherent, and
 for them the incoherent encoder on the square of these amplitudes is the physical one.
 
-- planetary: one or two elliptical shells (radius 6 to 15 px, thickness 0.12 to 0.35 of it, axis ratio 0.6 to 1), brighter
+- planetary: one or two elliptical shells (radius 9 to 14 px, thickness 0.15 to 0.3 of it, axis ratio 0.75 to 1), brighter
   towards one side or both poles, a faint filling, often a central star;
 - emission: turbulent gas (fractal noise, amplitude falling as frequency**-1.7, exponentiated) under an irregular envelope of
   about the same size, with dark lanes.
 
-Both: place within +-5 px, any orientation, 3 to 10 field stars of random brightness, sky background, seeing (blur of sigma 0.9 px),
-noise (0.008 of full scale in amplitude).
+Both: place within +-2 px in y and x, any orientation, 2 to 8 field stars of random brightness (3 to 12 % of the light), sky (2 to
+10 %), seeing (blur of sigma 0.9 px), noise (0.008 of full scale in amplitude).
 
-What makes it hard: the mean intensity is drawn log-uniformly over a factor of 3 without regard to the class; extent and
-central brightness overlap (some shells are filled, some clouds are hollow); stars give both classes bright points.
+What makes it hard: the mean intensity is drawn log-uniformly over a factor of 2.25 without regard to the class; extent
+and central brightness overlap (some shells are filled, some clouds are hollow); stars give both classes bright points.
 
 The paper (appendix "Compact nebula classification"): synthetic, 64 x 64, 4000 training and 1000 test images per class,
 mean intensities overlap. Its images are not public; ours share the description alone.

@@ -8,10 +8,10 @@ pupil, grain 3 to 5 px). Static scatterers keep it; flowing blood changes it dur
 intensities of what it passes through: share s of static light and the rest averaged over M independent patterns:
 I = s I_static + (1 - s) mean of I_1 .. I_M.
 
-- static (ischaemic): s from 0.85 to 1, M = 2: contrast (standard deviation over mean) about 0.85 to 1;
-- perfused: s from 0 to 0.35, M from 6 to 12: contrast about 0.3 to 0.45.
+- static (ischaemic): s from 0.85 to 1, M = 2: contrast (standard deviation over mean) 0.76 to 1.1;
+- perfused: s from 0 to 0.25, M from 8 to 12: contrast 0.28 to 0.44.
 
-Both: uneven light and absorption (smooth, sigma 14 px, +-20 %), brightness log-uniform over a factor of 3.
+Both: uneven light and absorption (smooth, sigma 14 px, +-20 %), brightness log-uniform over a factor of 2.5.
 
 What makes it hard: the mean intensity follows the same distribution in both classes; a speckle is random in every pixel, so no
 pixel and no linear sum of intensities differs in mean: the classes differ only in their fluctuation.

@@ -4,13 +4,13 @@ Owns the drawing of monitored scenes on 64 x 64 pixels; never any image of the p
 level is a field amplitude (the square root of intensity), for passive encoders.
 
 The scene: uniform coherent light falls on a scene; its background is a bright field that varies slowly in space (sigma of
-the unevenness 12 px, +-25 % in amplitude) and in total (power of one frame to the next: +-30 %), with fine noise on every pixel
-(0.012 of full scale). An event is one compact object (sigma 1.6 to 2.6 px, elongated up to 1.6 times, turned at random) anywhere
-inside the inner 40 x 40 pixels, which adds or removes a peak amplitude of 0.10 to 0.20 of full scale, in phase or in antiphase.
+the unevenness 16 px, +-25 % in amplitude) and in total (power of one frame to the next: +-30 %), with fine noise on every pixel
+(0.012 of full scale). An event is one compact object (sigma 2 to 3 px, elongated up to 1.6 times, turned at random) anywhere
+inside the inner 40 x 40 pixels, which adds or removes a peak amplitude of 0.18 to 0.32 of full scale, in phase or in antiphase.
 
-What makes it hard: the event changes the power of a frame by about 1 % or less, up or down, the background by 30 %; it may be
-anywhere; and a photon from the background looks like one from the event. A coherent encoder can dim the slow background by
-interference; counting light cannot.
+What makes it hard: the event changes the power of a frame by 1 % (median; at most about 5 %), up or down, while the background
+fluctuates by 40 % (standard deviation); it may be anywhere; and a photon from the background looks like one from the event. A
+coherent encoder can dim the slow background by interference; counting light cannot.
 
 The paper (appendix "Transient event detection"): synthetic, 64 x 64, 4000 training and 1000 test images, mean intensities
 annotated to show that they overlap. Its images are not public; the size, place, contrast and noise here are ours.
