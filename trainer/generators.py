@@ -19,6 +19,7 @@ from pans.runtime.errors import UsageError
 
 from . import task_barcode, task_cells, task_fiber, task_nebula, task_tissue, task_transient
 from .draw import Labels
+from .incident import Light
 
 Draw = Callable[[int, str, int], tuple[NDArray[np.uint8], Labels]]
 
@@ -31,7 +32,7 @@ class Recipe:
     summary: str
     classes: tuple[str, ...]
     image_shape: tuple[int, int]
-    light: str
+    light: Light
     encoder: str  # that the physics asks for: active, coherent or incoherent
     paper_encoder: str
     n_train: int

@@ -1,8 +1,8 @@
-"""Tasks: labelled 8-bit images, from pinned public files or from a user's own.
+"""Tasks: labelled 8-bit images, from pinned public files, from generators or from a user's own.
 
 Owns the reading of .npz files and class folders, with limits, and the split into training and held-out objects; never
-trains and never shows an image. The public sets are in public_sets.py. `load_task` returns a `Task` whose images are uint8
-(n, height, width): 0 is black.
+trains and never shows an image. The public sets are in public_sets.py, the drawn ones in generators.py. `load_task` returns a
+`Task` whose images are uint8 (n, height, width): 0 is black.
 
 A user's file or folder without a test part is split by position: every fifth object is held out.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError, UsageError
 
+from .generators import GENERATORS, generate
+from .grey import read_grey
+from .incident import Light, Optics
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
 
 FILE_MAX_BYTES = 1 << 30
@@ -48,6 +51,10 @@ class Task:
     test: Objects
     sha256: str
     split: str
+    light: Light = "transmission"  # what grey is: of an object that we light, or a field amplitude that reaches us
+    optics: Optics = "none"  # between the scene and a passive encoder
+    target: str = "class"  # what is asked for: the class, or the `image`
+    source: str = ""  # of drawn images: whose generator, which seed
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -76,25 +83,46 @@ class Task:
 
 _SPLIT_BY_POSITION = f"every {HOLD_OUT_EVERY}th object held out"
 _SPLIT_OF_FILE = "the test part of the data"
+_SPLIT_OF_SEED = "drawn from other random streams"
+FIBRE_TASKS = {"mmf-mnist": "class", "mmf-mnist-image": "image"}  # MNIST behind a multimode fibre: what is asked for
 
 
 def load_task(name_or_path: str, data_dir: str | Path | None = None) -> Task:
-    """Return the public set of that name, or the .npz file or folder of class folders at that path.
+    """Return the public set or drawn task of that name, or the .npz file or folder of class folders at that path.
 
     `data_dir` (default: the environment variable PANS_DATA) holds the folders of the public sets. UsageError says what
     is missing or unfit, DamagedFileError which file is not the pinned one.
     """
     if name_or_path in PUBLIC_SETS:
         return _load_public(name_or_path, data_folder(data_dir))
+    if name_or_path in FIBRE_TASKS:
+        digits = _load_public("mnist", data_folder(data_dir))
+        return replace(digits, name=name_or_path, light="field", optics="mmf", target=FIBRE_TASKS[name_or_path])
+    if name_or_path in GENERATORS:
+        return draw_task(name_or_path)
     path = Path(name_or_path)
     if path.is_dir():
         return _load_folder(path)
     if path.is_file() and path.suffix == ".npz":
         return _load_npz(path)
     raise UsageError(
-        f"task {name_or_path!r} is neither one of {', '.join(PUBLIC_SETS)}, nor a .npz file, nor a folder",
+        f"task {name_or_path!r} is neither one of {', '.join(task_names())}, nor a .npz file, nor a folder",
         remedy="a .npz file holds `images` uint8 (n, height, width) and `labels`; a folder holds one folder per class",
     )
+
+
+def task_names() -> tuple[str, ...]:
+    """Return the names that `load_task` knows."""
+    return (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)
+
+
+def draw_task(name: str, seed: int = 0, n_train: int | None = None, n_test: int | None = None) -> Task:
+    """Return a drawn task (see generators.py) with its recipe's or other numbers of objects; UsageError as `generate`."""
+    drawn = generate(name, seed, n_train, n_test)
+    recipe = drawn.recipe
+    train, test = Objects(drawn.train_images, drawn.train_labels), Objects(drawn.test_images, drawn.test_labels)
+    source = f"{recipe.source}, seed {seed}"
+    return Task(name, recipe.classes, train, test, drawn.sha256, _SPLIT_OF_SEED, light=recipe.light, source=source)
 
 
 def _load_public(name: str, folder: Path) -> Task:
@@ -146,24 +174,16 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _load_folder(folder: Path) -> Task:
-    """One folder per class, images of one size inside; colours become grey."""
-    from PIL import Image
-
-    classes = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
+    """One folder per class, images of one size inside (see grey.py); names that begin with a dot are passed over."""
+    classes = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
     images: list[NDArray[np.uint8]] = []
     labels: list[int] = []
     digest = hashlib.sha256()
     n_bytes = 0
     for label, name in enumerate(classes):
-        for path in sorted(entry for entry in (folder / name).iterdir() if entry.is_file()):
-            try:
-                with Image.open(path) as picture:
-                    n_bytes += picture.width * picture.height
-                    if n_bytes > IMAGES_MAX_BYTES:
-                        raise UsageError(f"{folder}: more than {IMAGES_MAX_BYTES} pixels")
-                    image = np.asarray(picture.convert("L"), dtype=np.uint8)
-            except OSError as error:
-                raise DamagedFileError(f"{path}: not an image that can be read: {error}") from error
+        for path in sorted(entry for entry in (folder / name).iterdir() if entry.is_file() and entry.name[0] != "."):
+            image = read_grey(path, IMAGES_MAX_BYTES - n_bytes)
+            n_bytes += image.size
             if images and image.shape != images[0].shape:
                 raise UsageError(
                     f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the first image has "
