@@ -5,7 +5,7 @@ is a field amplitude, for passive encoders (a small part of the signal light is 
 
 The scene: light of the fundamental mode leaves the fibre: a Gaussian amplitude of radius 13 to 15 px (1/e), misaligned by up to
 1.5 px in y and x, a little elliptical (0.94 to 1), with surface roughness (smooth noise of sigma 1.5 px, 0.01 of the amplitude)
-and detector noise (0.0035 of full scale). On a contaminated end face 2 to 4 defects lie where the light is:
+and detector noise (0.003 of full scale). On a contaminated end face 2 to 4 defects lie where the light is:
 
 - dirt: a round patch (sigma 2 to 4 px) that takes 0.5 to 1 of the amplitude;
 - pit: a dark ring (radius 2 to 4 px, width 1 px, depth 0.5 to 0.9) around a spot that is brighter by a third of its depth;
@@ -43,9 +43,9 @@ SIDE_PX = 64
 CLASSES = ("clean", "contaminated")
 MODE_PX = (13.0, 15.0)
 MISALIGNED_PX = 1.5
-MEAN_INTENSITY = (0.03, 0.06)  # of full scale; the centre of a mode stays below full scale
+MEAN_INTENSITY = (0.025, 0.05)  # of full scale; the centre of a mode stays below full scale
 ROUGHNESS = 0.01
-NOISE = 0.0035
+NOISE = 0.003
 DEFECTS_MAX = 4
 
 
