@@ -44,6 +44,16 @@ def test_no_pixel_is_brighter_than_the_projector():
     assert float(light.patterns().detach().max()) == 2.0
 
 
+def test_a_pixel_at_the_limit_can_become_darker_again():
+    light = encoder()
+    with torch.no_grad():
+        light.weight[0, 0] = -5.0
+    light.dim_to_top()
+    assert float(light.weight.detach()[0, 0]) == pytest.approx(-math.sqrt(2.0))
+    light.patterns().sum().backward()
+    assert float(light.weight.grad[0, 0]) != 0
+
+
 def test_patterns_are_whole_levels_once_quantised():
     light = encoder()
     with torch.no_grad():

@@ -49,6 +49,12 @@ class ActiveIllumination(nn.Module):
         low, high = self.top_limits
         return self.log_top.exp().clamp(low, high)
 
+    def dim_to_top(self) -> None:
+        """Take brighter pixels back to the brightest level: beyond it no gradient would ever make them darker again."""
+        with torch.no_grad():
+            bound = math.sqrt(self.top_limits[1] if self.levels is None else float(self.top()))
+            self.weight.clamp_(-bound, bound)
+
     def patterns(self) -> Tensor:
         """Return the patterns as they are shown, (d_f, pixels)."""
         light = self.weight**2

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.errors import UsageError
 from pans.runtime.profile import Profile
 
-DARK_MAX = 0.01  # dark counts per exposure that training accepts where the profile allows shorter exposures
+DARK_MAX = 0.05  # dark counts per exposure that training accepts where the profile allows shorter exposures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
