@@ -30,17 +30,31 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
     parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
     parser.add_argument("--drift-ppm", type=float, default=DEFAULT_DRIFT_PPM, help="rate error of the device's clock")
+    parser.add_argument(
+        "--buffer", type=int, default=256, help="stream messages that the device can hold back (default 256)"
+    )
+    parser.add_argument(
+        "--echo", type=int, metavar="BYTES", help="no instrument: answer each frame with BYTES bytes (for benchmarks)"
+    )
     parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started this one")
 
 
 def _run(args: argparse.Namespace) -> int:
     options = check_options(
         SimOptions(
-            args.profile, args.scene, args.seed, offset=args.offset, drift_ppm=args.drift_ppm, faults=args.faults
+            args.profile,
+            args.scene,
+            args.seed,
+            offset=args.offset,
+            drift_ppm=args.drift_ppm,
+            faults=args.faults,
+            buffer=args.buffer,
         )
     )
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
     instrument, clock = build_instrument(options, time.perf_counter_ns())
+    if args.echo is not None:
+        instrument = FrameEcho(args.echo)
     port = open_port(args.listen)
     signal.signal(signal.SIGTERM, _leave)
     orphaned = _watch_stdin() if args.until_stdin_closes else threading.Event()
@@ -53,6 +67,23 @@ def _run(args: argparse.Namespace) -> int:
     finally:
         port.close()
     return 0
+
+
+class FrameEcho:
+    """No instrument at all: as many bytes back for every delimiter that comes, to know what the port alone costs."""
+
+    session = 0
+
+    def __init__(self, n_bytes: int) -> None:
+        self._answer = bytes(n_bytes)
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        """See `SteppedDevice`."""
+        return self._answer * data.count(0)
+
+    def next_event_tick(self) -> int | None:
+        """See `SteppedDevice`."""
+        return None
 
 
 def _watch_stdin() -> threading.Event:

@@ -19,7 +19,7 @@ from pans.runtime.link import Link, open_link
 from pans.runtime.profile import load_profile
 
 from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
-from .device import Instrument
+from .device import BUFFER_MESSAGES, Instrument
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
 from .scene import load_scene
@@ -28,6 +28,7 @@ from .virtual import START_NS, VirtualLink
 DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
 CHILD_GOODBYE_S = 2.0
+MAX_BUFFER_MESSAGES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,7 @@ class SimOptions:
     offset: int = DEFAULT_OFFSET_TICKS
     drift_ppm: float = DEFAULT_DRIFT_PPM
     faults: str = ""
+    buffer: int = BUFFER_MESSAGES
 
 
 def parse_sim_url(url: str) -> SimOptions:
@@ -68,6 +70,8 @@ def check_options(options: SimOptions) -> SimOptions:
         raise UsageError(f"pace={options.pace}: allowed are real and fast")
     if not 0 <= options.seed < 1 << 64:
         raise UsageError(f"seed={options.seed}: allowed are 0..2^64-1")
+    if not 1 <= options.buffer <= MAX_BUFFER_MESSAGES:
+        raise UsageError(f"buffer={options.buffer}: allowed are 1..{MAX_BUFFER_MESSAGES} messages")
     if not 0 <= options.offset < 1 << 60:
         raise UsageError(f"offset={options.offset}: allowed are 0..2^60-1 ticks")
     check_possible(parse_faults(options.faults), pace=options.pace)
@@ -87,7 +91,9 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     faults = parse_faults(options.faults)
 
     def switch_on(epoch: int, tick: int) -> Instrument:
-        return Instrument(profile, scene, seed=options.seed, power_on_tick=tick, epoch=epoch)
+        return Instrument(
+            profile, scene, seed=options.seed, power_on_tick=tick, epoch=epoch, buffer_messages=options.buffer
+        )
 
     start_tick = clock.tick_at(host_ns)
     if faults == NO_FAULTS:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pans.runtime.clock import ClockModel
+from pans.firmware_sim.clockrun import CASES, REQUIRED, run_clock_case
+from pans.runtime.clock import CLOCK_DTYPE, ClockModel, unwrap_tick
 from pans.runtime.errors import LinkError
 
 TICK_HZ = 10_000_000
@@ -80,3 +81,64 @@ def test_slow_probes_do_not_pull_the_line() -> None:
 def test_before_the_first_probe_nothing_is_converted() -> None:
     with pytest.raises(LinkError, match="no probe"):
         ClockModel(TICK_HZ).to_host_ns(0)
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_coverage_under_drift_wander_jitter_and_asymmetry(case: object) -> None:
+    """A short form of `python -m pans.firmware_sim.clockrun`."""
+    row = run_clock_case(case, 40.0, 7)  # type: ignore[arg-type]
+    assert row["within"] >= REQUIRED
+    assert row["steps"] == 0
+    assert row["error_us_median"] < row["uncertainty_us_median"]
+
+
+def test_an_uncertainty_that_is_too_small_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = ClockModel.to_host_ns
+
+    def proud(self: ClockModel, tick: int) -> tuple[int, int]:
+        host_ns, bound = original(self, tick)
+        return host_ns, bound // 2
+
+    monkeypatch.setattr(ClockModel, "to_host_ns", proud)
+    asymmetric = next(case for case in CASES if "asymmetric" in case.name)
+    assert run_clock_case(asymmetric, 40.0, 7)["within"] < REQUIRED
+
+
+def probed(model: ClockModel, step: int, jump_ticks: int = 0) -> object:
+    sent = step * 97_000_000
+    tick = (sent + 50_000) // NS_PER_TICK + jump_ticks
+    return model.add_probe(sent, tick, tick, sent + 100_000)
+
+
+def test_a_counter_that_jumps_starts_a_new_epoch_and_is_told() -> None:
+    model = ClockModel(TICK_HZ)
+    assert all(probed(model, step) is None for step in range(30))
+    step = probed(model, 30, 50_000)  # 5 ms ahead
+    assert step is not None
+    assert step.off_ns == pytest.approx(-5_000_000, abs=200_000)  # type: ignore[attr-defined]
+    assert model.epoch == 1
+    for later in range(31, 40):
+        assert probed(model, later, 50_000) is None
+    host_ns, bound = model.to_host_ns(39 * 970_000 + 50_000)
+    assert abs(host_ns - 39 * 97_000_000) < bound < 500_000
+
+
+def test_every_probe_is_kept_for_the_recording_once() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(10):
+        probed(model, step)
+    samples = model.take_samples()
+    assert samples.dtype == CLOCK_DTYPE
+    assert samples["host_ns"].tolist() == [step * 97_000_000 + 50_000 for step in range(10)]
+    assert len(model.take_samples()) == 0
+
+
+@pytest.mark.parametrize("bits", [8, 32])
+def test_a_narrow_counter_is_extended_over_its_wraps(bits: int) -> None:
+    latest = 0
+    for true in range(0, 5 << bits, (1 << bits) // 3):
+        latest = unwrap_tick(true % (1 << bits), latest, bits)
+        assert latest == true
+        assert unwrap_tick((true - 1) % (1 << bits), latest, bits) == max(true - 1, (true - 1) % (1 << bits))
+    with pytest.raises(ValueError, match="does not fit"):
+        unwrap_tick(1 << bits, 0, bits)

@@ -5,10 +5,15 @@ The instrument behind each is the simulator, reached through real pyserial and r
 from __future__ import annotations
 
 import os
+import select
+import sys
 import threading
 import time
+import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -355,3 +360,71 @@ def test_an_instrument_in_a_thread_ends(monkeypatch: pytest.MonkeyPatch) -> None
     instrument.connect().close()
     instrument.close()
     assert not instrument._thread.is_alive()
+
+
+# -- a driver of one's own ---------------------------------------------------------------------------------------------
+
+
+class FifoPort:
+    """The instrument's end of two named pipes."""
+
+    url = "fifo"
+
+    def __init__(self, name: str) -> None:
+        os.mkfifo(f"{name}.in")
+        os.mkfifo(f"{name}.out")
+        self._in = os.open(f"{name}.in", os.O_RDWR | os.O_NONBLOCK)
+        self._out = os.open(f"{name}.out", os.O_RDWR | os.O_NONBLOCK)
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self._in, 1 << 16)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> int:
+        try:
+            return os.write(self._out, data)
+        except BlockingIOError:
+            return 0
+
+    def wait(self, timeout_s: float, wants_to_write: bool) -> None:
+        select.select([self._in], [self._out] if wants_to_write else [], [], timeout_s)
+
+    def hang_up(self) -> None:
+        pass
+
+    def close(self) -> None:
+        os.close(self._in)
+        os.close(self._out)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "LINKS.md").read_text()
+    source = text.partition("```python\n")[2].partition("```")[0]
+    assert len(source.splitlines()) <= 60
+    driver = types.ModuleType("mylab_pipe")
+    exec(compile(source, "docs/LINKS.md", "exec"), driver.__dict__)
+    monkeypatch.setitem(sys.modules, "mylab_pipe", driver)
+    point = EntryPoint("pipe", "mylab_pipe:open_pipe", "pans.devices")
+    monkeypatch.setattr(link_module, "entry_points", lambda group: [point])
+    with pytest.raises(LinkError, match="start the instrument first"):
+        open_link(f"pipe:{tmp_path}/none")
+    device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
+    port, stopped = FifoPort(f"{tmp_path}/lab"), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        link = open_link(f"pipe:{tmp_path}/lab")
+        profile, bundle, plan = grid_setup("sequential")
+        config = RunConfig(n_cycles=100, deadline_us=1e9, realtime=False)
+        result = run_live(link, profile, bundle, plan, make_decider(bundle), config)
+        assert (result.ended, result.tally.decisions) == ("completed", 100)
+        link.close()
+        with pytest.raises(LinkError, match="is closed"):
+            link.read(0.01)
+    finally:
+        stopped.set()
+        thread.join(PATIENCE_S)
+        port.close()
