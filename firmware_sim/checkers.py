@@ -41,7 +41,7 @@ class Entry(NamedTuple):
     """One block as it left the detector; `dropped` when the device's buffer was full."""
 
     first: int
-    count: int
+    exposures: int
     clicks: bytes
     object_index: int
     dropped: bool
@@ -113,7 +113,7 @@ class Checker:
         stream = self._stream(session)
         raw = message.bits if isinstance(message, ClickBlock) else message.words
         entry = Entry(message.exposure_index, len(raw), raw.tobytes(), message.object_index, dropped)
-        stream.emitted_to = entry.first + entry.count
+        stream.emitted_to = entry.first + entry.exposures
         if stream.open_end:
             self.counts.blocks_lost_open_end += 1
             return
@@ -231,10 +231,10 @@ class Checker:
         wanted = stream.entries.popleft() if stream.entries else None
         if wanted != got or got.first != stream.accounted_to:
             self.fail(
-                f"delivered were exposures {got.first} to {got.first + got.count}, due were {stream.accounted_to} "
+                f"delivered were exposures {got.first} to {got.first + got.exposures}, due were {stream.accounted_to} "
                 f"and {None if wanted is None else wanted[:2]}: repeated, changed, or skipped in silence"
             )
-        stream.accounted_to = got.first + got.count
+        stream.accounted_to = got.first + got.exposures
         stream.state[np.arange(got.first, stream.accounted_to) % RING] = DELIVERED
         self.counts.blocks_delivered += 1
 
@@ -245,9 +245,9 @@ class Checker:
         end = gap.first_exposure + gap.exposures
         while stream.entries and stream.entries[0].first < end:
             entry = stream.entries.popleft()
-            if entry.first != stream.accounted_to or entry.first + entry.count > end:
+            if entry.first != stream.accounted_to or entry.first + entry.exposures > end:
                 self.fail(f"the gap {gap[:2]} cuts the block of exposures {entry[:2]}")
-            stream.accounted_to = entry.first + entry.count
+            stream.accounted_to = entry.first + entry.exposures
             self.counts.blocks_lost += 1
         if stream.accounted_to != end:
             self.fail(f"the gap {gap[:2]} ends at {end}, but only exposures up to {stream.accounted_to} were emitted")

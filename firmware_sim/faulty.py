@@ -41,6 +41,15 @@ class FaultCounters:
     resets: int = 0
 
 
+@dataclass(slots=True)
+class Held:
+    """A frame that lets others pass: so many, or until a tick."""
+
+    to_pass: int
+    leave_by: int
+    frame: bytes
+
+
 class Lane:
     """One direction: whole frames in, damaged bytes out, in the order in which they are due."""
 
@@ -48,7 +57,7 @@ class Lane:
         self._faults, self._dice, self._hold_ticks, self._counters = faults, dice, hold_ticks, counters
         self._clean = not faults.any_frame_fault
         self._due: deque[tuple[int, bytes]] = deque()
-        self._held: list[list[int | bytes]] = []  # [frames to let pass, tick to leave by, frame]
+        self._held: list[Held] = []
         self._partial = b""
         self._queued_bytes = 0
         self.blocked_until = 0
@@ -65,10 +74,8 @@ class Lane:
     def next_tick(self) -> int | None:
         """When the next bytes leave; None when there are none."""
         first = self._due[0][0] if self._due else None
-        for entry in self._held:
-            leave_by = entry[1]
-            assert isinstance(leave_by, int)
-            first = leave_by if first is None else min(first, leave_by)
+        for held in self._held:
+            first = held.leave_by if first is None else min(first, held.leave_by)
         return None if first is None else max(first, self.blocked_until)
 
     def take(self, tick: int) -> bytes:
@@ -76,9 +83,9 @@ class Lane:
         if tick < self.blocked_until:
             return b""
         if self._held:
-            for entry in [entry for entry in self._held if entry[1] <= tick]:  # type: ignore[operator]
-                self._held.remove(entry)
-                self._queue(tick, bytes(entry[2]))  # type: ignore[arg-type]
+            for held in [held for held in self._held if held.leave_by <= tick]:
+                self._held.remove(held)
+                self._queue(tick, held.frame)
         if not self._due or self._due[0][0] > tick:
             return b""
         arrived = []
@@ -111,15 +118,15 @@ class Lane:
             counters.lost += 1
         elif faults.reorder and dice.random() < faults.reorder:
             counters.reordered += 1
-            self._held.append([dice.randint(1, MAX_REORDER_FRAMES), tick + self._hold_ticks, frame])
+            self._held.append(Held(dice.randint(1, MAX_REORDER_FRAMES), tick + self._hold_ticks, frame))
             return
         else:
             self._deliver(tick, frame)
-        for entry in list(self._held):
-            entry[0] -= 1  # type: ignore[operator]
-            if entry[0] <= 0:  # type: ignore[operator]
-                self._held.remove(entry)
-                self._queue(tick, bytes(entry[2]))  # type: ignore[arg-type]
+        for held in list(self._held):
+            held.to_pass -= 1
+            if held.to_pass <= 0:
+                self._held.remove(held)
+                self._queue(tick, held.frame)
 
     def _deliver(self, tick: int, frame: bytes) -> None:
         faults, dice, counters = self._faults, self._dice, self._counters

@@ -13,6 +13,7 @@ import struct
 import time
 import traceback
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -276,7 +277,8 @@ class Fuzzer:
                 (("mode", 8), ("n_patterns", 16), ("n_slots", 32), ("first_slot", 32), ("exposure_ticks", 32),
                  ("slot_period_ticks", 32), ("cycle_ticks", 64), ("block_exposures", 16), ("cycles_per_object", 32))
             )  # fmt: skip
-            chunk = chunk._replace(**{name: self._number(bits)})
+            changes: dict[str, Any] = {name: self._number(bits)}
+            chunk = chunk._replace(**changes)
         if dice.random() < 0.1:
             slots["offset_ticks"][dice.randrange(n_slots)] = self._number(64)
         return pack_plan(chunk)

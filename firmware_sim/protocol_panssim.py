@@ -6,6 +6,8 @@ name (`protocol_SCHEME`) once `register` has been called.
 
 from __future__ import annotations
 
+from typing import Any
+
 import serial
 from serial.urlhandler import protocol_socket
 
@@ -22,6 +24,8 @@ class Serial(protocol_socket.Serial):  # type: ignore[misc]
     """pyserial's socket port, connected to an instrument that lives as long as the port is open."""
 
     _instrument: ThreadedInstrument | None = None
+    _socket: Any
+    is_open: bool
 
     def open(self) -> None:
         """Switch an instrument on and connect to it; SerialException like any port that cannot be opened."""

@@ -99,7 +99,7 @@ class UsbLink:
             device.set_configuration()
             configuration = device.get_active_configuration()
         for interface in configuration:
-            ends = {}
+            ends: dict[int, Any] = {}
             for endpoint in interface:
                 if util.endpoint_type(endpoint.bmAttributes) == util.ENDPOINT_TYPE_BULK:
                     ends.setdefault(util.endpoint_direction(endpoint.bEndpointAddress), endpoint)
