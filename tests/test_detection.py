@@ -11,7 +11,6 @@ from pans.runtime.clicks import click_probability as reference_probability
 from pans.trainer.detection import (
     click_probability,
     click_words,
-    expected_cross_entropy,
     sample_clicks,
     word_probabilities,
 )
@@ -79,32 +78,3 @@ def test_words_are_products_in_the_order_of_the_table():
             chances = [p[row, i] if bit else 1 - p[row, i] for i, bit in enumerate(bits)]
             assert found[row, word] == pytest.approx(np.prod(chances), rel=1e-12)
     assert found.sum(axis=1) == pytest.approx(1.0)
-
-
-def test_exact_gradient_is_the_finite_difference():
-    rng = np.random.default_rng(1)
-    light = rng.uniform(0.1, 2.5, (6, 3))
-    scores = torch.from_numpy(rng.normal(size=(8, 4)))
-    labels = torch.from_numpy(rng.integers(0, 4, 6))
-
-    def loss(values):
-        return expected_cross_entropy(word_probabilities(click_probability(values, READ_NOISE)), scores, labels)
-
-    tensor = torch.from_numpy(light).requires_grad_()
-    loss(tensor).backward()
-    for i, j in [(0, 0), (2, 1), (5, 2)]:
-        step = np.zeros_like(light)
-        step[i, j] = 1e-6
-        up, down = (float(loss(torch.from_numpy(light + sign * step))) for sign in (1, -1))
-        assert float(tensor.grad[i, j]) == pytest.approx((up - down) / 2e-6, rel=1e-6, abs=1e-10)
-
-
-def test_exact_loss_is_the_mean_of_sampled_losses():
-    rng = np.random.default_rng(2)
-    p = torch.from_numpy(rng.uniform(0.05, 0.95, (5, 3)))
-    scores, labels = torch.from_numpy(rng.normal(size=(8, 3))), torch.from_numpy(rng.integers(0, 3, 5))
-    exact = float(expected_cross_entropy(word_probabilities(p), scores, labels))
-    clicks = sample_clicks(p.expand(20_000, 5, 3), torch.Generator().manual_seed(5))
-    words = (clicks @ torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)).long()
-    loss = -torch.log_softmax(scores, 1)[words, labels].mean(dim=1)
-    assert abs(float(loss.mean()) - exact) < 5 * float(loss.std()) / np.sqrt(len(loss))

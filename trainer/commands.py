@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import PansError, UsageError
 
+from .options import ESTIMATOR_NAMES
+
 if TYPE_CHECKING:
     from pans.runtime.bundle import Bundle
     from pans.runtime.profile import Profile
@@ -40,7 +42,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--features", type=int, required=True, metavar="D", help="number of patterns")
     parser.add_argument("--profile", default=DEFAULT_PROFILE, metavar="P", help=f"default: {DEFAULT_PROFILE}")
     parser.add_argument("--encoder", choices=("active",), default="active", help="how light meets the object")
-    parser.add_argument("--estimator", choices=("ste", "exact"), help="default: exact up to 12 patterns, else ste")
+    parser.add_argument("--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
         "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
@@ -51,6 +53,18 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         "--epochs", type=int, default=60, metavar="E", help="passes over the training objects (default 60)"
     )
     parser.add_argument("--restarts", type=int, default=1, metavar="R", help="trainings; the best on validation stays")
+    parser.add_argument(
+        "--starts", type=int, default=1, metavar="S", help="runs of the first stage per restart; the best goes on"
+    )
+    parser.add_argument("--warm", type=float, default=0.3, metavar="W", help="part of the epochs in the first stage")
+    parser.add_argument(
+        "--polish",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="last part of the epochs, trained for decisions (default 0)",
+    )
+    parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
     parser.add_argument("--batch", type=int, default=512, metavar="B", help="objects per step (default 512)")
@@ -118,41 +132,26 @@ def _train(args: argparse.Namespace) -> int:
 def _options(args: argparse.Namespace) -> Options:
     from .options import DEFAULT_ALPHA, EXACT_FEATURES_MAX, Options
 
-    estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "ste")
+    estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = ("features", "photons", "clicks", "epochs", "restarts", "seed", "hidden", "batch", "slope", "clamp")
+    same = ("features", "photons", "clicks", "epochs", "restarts", "starts", "warm", "polish", "shots")
+    same += ("seed", "hidden", "batch", "slope", "clamp")
     return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same})
 
 
 def _export_and_measure(
     args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float
 ) -> tuple[Any, Measured]:
-    from .export import export
+    from .export import export_trained
     from .public_sets import PUBLIC_SETS
 
     known = asdict(trained.options) | {"threads": args.threads}
-    exported = export(
-        args.out,
-        trained.head,
-        trained.click_mean.numpy(),
-        trained.quantised.levels,
-        trained.quantised.photons_per_level,
-        name=args.name or args.out.stem,
-        task=task.name,
-        classes=task.classes,
-        image_shape=task.image_shape,
-        levels=profile.projector.levels,
-        provenance={
-            "task_argument": args.task if args.task in PUBLIC_SETS else Path(args.task).name,
-            "data_sha256": task.sha256,
-            "data_split": task.split,
-            "profile": profile.name,
-            "profile_sha256": profile.sha256,
-            "options": {key: str(value) if value == math.inf else value for key, value in known.items()},
-            "validation_losses": list(trained.validation_losses),
-            "training_seconds": round(seconds, 1),
-        },
-    )
+    provenance = {
+        "task_argument": args.task if args.task in PUBLIC_SETS else Path(args.task).name,
+        "options": {key: str(value) if value == math.inf else value for key, value in known.items()},
+        "training_seconds": round(seconds, 1),
+    }
+    exported = export_trained(args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance)
     return exported, _measure(exported.bundle, profile, task.test, 1, None, 0, fall_back=True)
 
 

@@ -28,6 +28,8 @@ from torch import Tensor
 from .detection import click_words, sample_clicks, word_probabilities
 
 LOO_SAMPLES = 4
+SHARPNESS = 2.0  # of the soft decision in `decision_loss`
+WRONG = 3.0  # cost of a wrong decision there: about what cross-entropy charges for one
 _P_MIN = 1e-4  # least chance by which a score-function gradient is divided: beyond it, one event would undo an epoch
 
 LossOf = Callable[[Tensor, Tensor], Tensor]  # scores (..., out), target (..., or broadcast) -> losses (...)
@@ -52,6 +54,23 @@ def cross_entropy(scores: Tensor, labels: Tensor) -> Tensor:
     return -torch.take_along_dim(log_q, labels.unsqueeze(-1), dim=-1).squeeze(-1)
 
 
+def decision_loss(weight: float) -> LossOf:
+    """Return a loss between cross-entropy (`weight` 0) and the rate of wrong decisions (towards 1).
+
+    With few click words the two want different patterns: cross-entropy pays for being less wrong about every class, a decision
+    only for the likeliest. A fifth of the cross-entropy stays, so that the scores remain those of a posterior.
+    """
+
+    def loss_of(scores: Tensor, labels: Tensor) -> Tensor:
+        entropy = cross_entropy(scores, labels)
+        if weight == 0:
+            return entropy
+        wrong = 1 - torch.exp(-cross_entropy(SHARPNESS * scores, labels))
+        return (1 - 0.8 * weight) * entropy + WRONG * weight * wrong
+
+    return loss_of
+
+
 def squared_error(scores: Tensor, images: Tensor) -> Tensor:
     """Return the mean squared difference over the last axis."""
     return (scores - images).square().mean(dim=-1)
@@ -66,9 +85,11 @@ def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch
     """All click words, each once: no sampling noise in loss or gradient."""
     words = word_probabilities(p)
     scores = head(click_words(p.shape[1]), p.mean(dim=0))
-    if loss_of is cross_entropy:  # the same as below, by two matrix products instead of n * 2**d_f losses
-        of_class = torch.nn.functional.one_hot(target, scores.shape[1]).to(words.dtype)
-        return -((words.T @ of_class) * torch.log_softmax(scores, dim=1)).sum() / len(p)
+    if not target.is_floating_point():  # the same as below, by a matrix product instead of n * 2**d_f losses
+        n_classes = scores.shape[1]
+        of_class = torch.nn.functional.one_hot(target, n_classes).to(words.dtype)
+        losses = loss_of(scores.unsqueeze(1), torch.arange(n_classes, device=p.device).unsqueeze(0))  # (words, classes)
+        return ((words.T @ of_class) * losses).sum() / len(p)
     return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p)
 
 

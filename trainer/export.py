@@ -25,9 +25,12 @@ from pans.runtime.decide import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.head_layers import read_layers
 from pans.runtime.int8_head import quantise_head
+from pans.runtime.profile import Profile
 
 from .heads import EPSILON, MlpHead
 from .int8_onnx import int8_onnx
+from .tasks import Task
+from .train import Trained
 
 OPSET = 17
 IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
@@ -130,6 +133,32 @@ def export(
     finally:
         unchecked.unlink(missing_ok=True)
     return Exported(bundle, digest, words, difference, dead)
+
+
+def export_trained(
+    path: Path, trained: Trained, task: Task, profile: Profile, *, name: str, provenance: Mapping[str, Any]
+) -> Exported:
+    """Write what `train` returned to `path`; `provenance` is added to what the task, profile and training say of themselves."""
+    return export(
+        path,
+        trained.head,
+        trained.click_mean.numpy(),
+        trained.quantised.levels,
+        trained.quantised.photons_per_level,
+        name=name,
+        task=task.name,
+        classes=task.classes,
+        image_shape=task.image_shape,
+        levels=profile.projector.levels,
+        provenance={
+            "data_sha256": task.sha256,
+            "data_split": task.split,
+            "profile": profile.name,
+            "profile_sha256": profile.sha256,
+            "validation_losses": list(trained.validation_losses),
+            **provenance,
+        },
+    )
 
 
 def compare(bundle: Bundle, head: MlpHead, click_mean: F64) -> tuple[int, float]:

@@ -36,6 +36,7 @@ class Options:
     head_rate: float = 1e-3
     slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
     clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+    polish: float = 0.0  # last part of the epochs, in which the loss turns from cross-entropy to wrong decisions
     light: float = 1.0  # of the initial patterns, times the paper's
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
 
@@ -49,7 +50,7 @@ def check_options(options: Options, profile: Profile) -> None:
         "starts": (1, 1000),
         "hidden": (1, 65536),
     }
-    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1), "shots": (1, 64), "warm": (0, 1)}
+    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1), "shots": (1, 64), "warm": (0, 1), "polish": (0, 1)}
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:
             raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")

@@ -28,7 +28,7 @@ from pans.runtime.profile import Profile
 from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import click_probability, click_words, sample_clicks, word_probabilities
 from .encoders import ActiveIllumination
-from .estimators import ESTIMATORS, cross_entropy
+from .estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss
 from .head_fit import fit_head
 from .heads import MlpHead
 from .options import EXACT_FEATURES_MAX, Options, check_options
@@ -41,6 +41,8 @@ CHUNK = 2000  # objects per pass where no gradient is needed
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
+DUAL_GAIN = 5.0  # the full rate from an excess of 20 % on
+DUAL_WEIGHT_MIN = 3e-4  # a weight that sank further while a budget was met would not be back in time
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +181,12 @@ class _Run:
         front = self.options.front_rate * (1.0 if self.epoch < self.first_exact else 0.5)
         return front * cycle + 1e-6, self.options.head_rate * cycle + 1e-6
 
+    def loss_of(self, progress: float) -> LossOf:
+        """Cross-entropy, turning towards the rate of wrong decisions in the last part of the epochs."""
+        part = self.options.polish * self.options.epochs
+        into = self.epoch + progress - (self.options.epochs - part)
+        return decision_loss(min(1.0, into / (0.3 * part)) if part > 0 and into > 0 else 0.0)
+
     def floor(self, progress: float) -> float:
         """Transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
         now, total = self.epoch + progress, self.options.epochs
@@ -205,7 +213,7 @@ class _Run:
             light, photons = self.light(batch, self.floor(progress))
             slope, clamp = self._slope_and_clamp(progress)
             p = click_probability(light.clamp(max=clamp), law, slope)
-            loss = loss_of_clicks(p, data.labels[batch], self.head, cross_entropy, self.random)
+            loss = loss_of_clicks(p, data.labels[batch], self.head, self.loss_of(progress), self.random)
             clicks = p.sum(dim=1).mean()
             illumination = self.encoder.patterns().sum()
             total = loss + self._penalty(clicks, photons, illumination)
@@ -240,8 +248,9 @@ class _Run:
             target = getattr(self.options, name)
             if target is not None:
                 penalty = penalty + self.weights[name] * measured
-                excess = min(1.0, max(-1.0, float(measured.detach()) / target - 1))
-                self.weights[name] = min(10.0, max(1e-5, self.weights[name] * math.exp(self.dual_rate * excess)))
+                excess = min(1.0, max(-1.0, DUAL_GAIN * (float(measured.detach()) / target - 1)))
+                weight = self.weights[name] * math.exp(self.dual_rate * excess)
+                self.weights[name] = min(10.0, max(DUAL_WEIGHT_MIN, weight))
         return penalty
 
     def _slope_and_clamp(self, progress: float) -> tuple[float, float]:
@@ -274,7 +283,9 @@ class _Run:
         with torch.no_grad():
             if self.options.features <= EXACT_FEATURES_MAX:
                 scores = self.head(click_words(self.options.features)).double()
-                return float((word_probabilities(p) * cross_entropy(scores.unsqueeze(0), labels.unsqueeze(1))).sum() / len(p))
+                return float(
+                    (word_probabilities(p) * cross_entropy(scores.unsqueeze(0), labels.unsqueeze(1))).sum() / len(p)
+                )
             drawn = [self.head(sample_clicks(p, random).float()) for _ in range(VALIDATION_SAMPLES)]
             return float(torch.stack([cross_entropy(scores, labels).mean() for scores in drawn]).mean())
 

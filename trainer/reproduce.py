@@ -1,0 +1,116 @@
+"""`pans reproduce NAME`: the paper's tables and figures, ours beside the paper's, as Markdown, JSON and PNG.
+
+Owns the arguments, the walk over the rows and the files; what a row is, is in the reproduce_*.py modules. Every figure is SIMULATED.
+Finished rows lie in a cache folder: a killed run goes on, and several processes may share the rows of a table (`--rows`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.errors import UsageError
+
+from .paper_tables import ACTIVE
+
+CACHE = Path("~/.cache/pans-runtime/reproduce")
+NEEDS_TORCH = "pip install 'pans-runtime[train]'"
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=(*NAMES, "all", "list"), help="which table or figure")
+    parser.add_argument("--rows", type=int, nargs="+", metavar="D", help="only the rows with that many patterns")
+    parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and NAME.png there")
+    parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
+    parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
+    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.name == "list":
+        emit(args, {"rows": list(NAMES)}, "\n".join(NAMES))
+        return EXIT_FINE
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise UsageError("training needs the package torch, which is not installed", remedy=NEEDS_TORCH) from error
+    torch.set_num_threads(args.threads)
+    args.cache = args.cache.expanduser()
+    args.cache.mkdir(parents=True, exist_ok=True)
+    results = {}
+    try:
+        for name in NAMES if args.name == "all" else (args.name,):
+            results[name] = NAMES[name](name, args)
+    except KeyboardInterrupt:
+        say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
+        return EXIT_INTERRUPTED
+    rows = [row for result in results.values() for row in result["rows"]]
+    emit(args, {"rows": rows, "simulated": True}, "\n\n".join(result["markdown"] for result in results.values()))
+    return EXIT_FINE
+
+
+def _active(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from . import reproduce_active as active
+    from .figures import accuracy_against_photons
+    from .report_active import markdown
+
+    wanted = [row for row in active.rows_of(name) if args.rows is None or row.features in args.rows]
+    if not wanted:
+        raise UsageError(
+            f"--rows {args.rows}", remedy=f"{name} has {', '.join(str(row.features) for row in active.rows_of(name))}"
+        )
+    done = []
+    for row in wanted:
+        figures = active.finished_row(args.cache, name, row)
+        if figures is None and not args.collect:
+            figures = active.make_row(args.cache, name, row, args.data_dir, say)
+        if figures is None:
+            say(f"{name} d_f={row.features}: not trained yet")
+            continue
+        done.append((row, figures))
+        ahead, clicks_fine = active.passed(row, figures)
+        say(f"{name} d_f={row.features}: {ahead:+.2f} points, clicks {'fine' if clicks_fine else 'above +5 %'}")
+    text = markdown(name, done)
+    result = {"rows": [{"task": name, "paper": _facts(row), **figures} for row, figures in done], "markdown": text}
+    if args.out:
+        _write(args.out, name, result, lambda path: accuracy_against_photons(path, name, done))
+    return result
+
+
+def _facts(row: Any) -> dict[str, Any]:
+    return {key: getattr(row, key) for key in row.__dataclass_fields__}
+
+
+def _estimators(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from .reproduce_estimators import estimator_table
+
+    result = estimator_table(args.cache, args.data_dir, say)
+    if args.out:
+        _write(args.out, name, result, None)
+    return result
+
+
+def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path], None] | None) -> None:
+    """Write NAME.json, NAME.md and, where `draw` is given, NAME.png, each whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {"json": json.dumps({"rows": result["rows"], "simulated": True}, indent=1) + "\n", "md": result["markdown"]}
+    for suffix, text in texts.items():
+        beside = folder / f"{name}.{suffix}.part"
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, folder / f"{name}.{suffix}")
+    if draw is not None:
+        draw(folder / f"{name}.png")
+
+
+NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
+    **dict.fromkeys(ACTIVE, _active),
+    "estimators": _estimators,
+}
+
+REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)
