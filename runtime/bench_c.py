@@ -35,8 +35,10 @@ void label_words(const uint8_t *restrict labels, const uint16_t *restrict words,
 /* The loop as the kernel has it: eight rows a step, then dot products, two at a time; h hidden, c (even) outputs. */
 static void add8(const float *restrict w, const int64_t *rows, const float *f, int64_t n_rows, int64_t width, float *restrict out) {
     for (int64_t r = 0; r < n_rows; r += 8) {
-        const float *a0 = w + rows[r] * width, *a1 = w + rows[r + 1] * width, *a2 = w + rows[r + 2] * width, *a3 = w + rows[r + 3] * width;
-        const float *a4 = w + rows[r + 4] * width, *a5 = w + rows[r + 5] * width, *a6 = w + rows[r + 6] * width, *a7 = w + rows[r + 7] * width;
+        const float *a0 = w + rows[r] * width, *a1 = w + rows[r + 1] * width;
+        const float *a2 = w + rows[r + 2] * width, *a3 = w + rows[r + 3] * width;
+        const float *a4 = w + rows[r + 4] * width, *a5 = w + rows[r + 5] * width;
+        const float *a6 = w + rows[r + 6] * width, *a7 = w + rows[r + 7] * width;
         float f0 = f[r], f1 = f[r + 1], f2 = f[r + 2], f3 = f[r + 3], f4 = f[r + 4], f5 = f[r + 5], f6 = f[r + 6], f7 = f[r + 7];
         for (int64_t j = 0; j < width; j++)
             out[j] += ((f0 * a0[j] + f1 * a1[j]) + (f2 * a2[j] + f3 * a3[j])) + ((f4 * a4[j] + f5 * a5[j]) + (f6 * a6[j] + f7 * a7[j]));
@@ -63,7 +65,8 @@ static void win(const float *scores, int64_t classes, uint16_t *label, float *pr
 
 /* counts int64 (n, d_f) -> labels and probabilities */
 void sparse_same(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
-                 const float *numbers, float *hidden, float *scores, int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
+                 const float *numbers, float *hidden, float *scores,
+                 int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
     const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
     for (int64_t i = 0; i < n; i++) {
         int64_t fired = 0;
@@ -81,7 +84,8 @@ void sparse_same(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64
 
 /* The loop as one would write it down: a column at a time, then a row at a time. */
 void sparse_plain(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
-                  const float *numbers, float *restrict hidden, float *restrict scores, int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
+                  const float *numbers, float *restrict hidden, float *restrict scores,
+                  int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
     const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
     for (int64_t i = 0; i < n; i++) {
         for (int64_t j = 0; j < h; j++) hidden[j] = b1[j];

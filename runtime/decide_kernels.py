@@ -43,16 +43,15 @@ def label_checked_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[
     Without a way out of the loop the compiler takes several words at once. The words before the first bad piece are labelled.
     """
     mask = np.uint64(labels.size - 1)
-    n = words.size
-    for start in range(0, n, 1024):
-        stop = min(start + 1024, n)
-        seen = np.uint64(0)
-        for i in range(start, stop):
-            seen |= np.uint64(words[i])
-        if seen & ~mask:
-            return label_words(labels, words[start:stop], out[start:stop]) + start
-        for i in range(start, stop):
-            out[i] = labels[np.uint64(words[i])]
+    for start in range(0, words.size, 1024):
+        part, result = words[start : start + 1024], out[start : start + 1024]
+        seen = part[0]
+        for i in range(part.size):
+            seen |= part[i]
+        if np.uint64(seen) & ~mask:
+            return label_words(labels, part, result) + start
+        for i in range(part.size):
+            result[i] = labels[part[i]]
     return -1
 
 

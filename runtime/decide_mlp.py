@@ -40,7 +40,7 @@ class _KernelDecider:
         self.choice: Mapping[str, Any] = {}
         self.n_features, self.n_classes = bundle.n_features, bundle.n_classes
         self.layers, self.room = layers, make_room(layers.meta, dtype)
-        self._run = run
+        self.kernel = run
         self._one = np.zeros((1, self.n_features), np.int64)
         self._out = _room(1, self.n_classes)
         run(self._one, 1, *layers, self.room, *self._out)  # compiles or loads the kernel
@@ -48,7 +48,7 @@ class _KernelDecider:
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots and shots >= 1."""
         self._one[0] = counts
-        self._run(self._one, shots, *self.layers, self.room, *self._out)
+        self.kernel(self._one, shots, *self.layers, self.room, *self._out)
         return Verdict(int(self._out[1][0]), float(self._out[2][0]))
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
@@ -65,7 +65,7 @@ class _KernelDecider:
 
     def _decide_all(self, counts: NDArray[np.int64], shots: int) -> Room:
         room = _room(len(counts), self.n_classes)
-        self._run(np.ascontiguousarray(counts), shots, *self.layers, self.room, *room)
+        self.kernel(np.ascontiguousarray(counts), shots, *self.layers, self.room, *room)
         return room
 
 

@@ -53,7 +53,7 @@ class TableDecider:
 
     def decide_words(self, words: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return the labels (n,), dtype of `labels`, of uint16, uint32 or uint64 click words (n,), written to `out` if given."""
-        from .decide_kernels import label_words
+        from .decide_kernels import label_checked_words
 
         if words.dtype not in (np.uint16, np.uint32, np.uint64) or words.ndim != 1:
             raise UsageError(f"click words are {words.dtype} {words.shape}, allowed: uint16, uint32 or uint64 (n,)")
@@ -61,7 +61,7 @@ class TableDecider:
         if result.shape != words.shape or result.dtype != self.labels.dtype:
             allowed = f"{self.labels.dtype} {words.shape}"
             raise UsageError(f"out is {result.dtype} {result.shape}, allowed: {allowed}")
-        bad = label_words(self.labels, words, result)
+        bad = label_checked_words(self.labels, words, result)
         if bad >= 0:
             raise UsageError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
         return result
