@@ -75,6 +75,8 @@ class Bench:
 
     def hello(self) -> list[Any]:
         self.command_id = 0
+        if self.device.session == NONCE:  # another host in between, or it would be a repetition
+            self.device.step(self.device.tick, wire.encode_hello(NONCE + 1))
         return self.send(wire.encode_hello(NONCE))
 
     def command(self, opcode: int, body: bytes = b"", command_id: int | None = None) -> Any:
@@ -182,7 +184,7 @@ def test_the_first_block_byte_by_byte() -> None:
     sent = bench.device.step(2290, b"")
     frame = uncobs(sent[: sent.index(0)])
     body = frame[:-4]
-    assert zlib.crc32(body, 0xB4F41654) == struct.unpack("<I", frame[-4:])[0]
+    assert zlib.crc32(body, 0x2E64AFC4) == struct.unpack("<I", frame[-4:])[0]
     assert body[:44] == struct.pack("<BBHI", 0x90, 0, 0, NONCE) + struct.pack("<IIQQIHHI", 1, 0, 2000, 0, 100, 3, 0, 0)
     assert body[44:50] == struct.pack("<HHH", 0, 1, 0xFFFF)
     assert len(body) == 51
@@ -606,9 +608,8 @@ def test_hello_ends_a_run_and_forgets_uploads() -> None:
     bench.run_to(2100)
     bench.send(wire.encode_hello(NONCE))  # a repetition changes nothing
     assert bench.device.state is DeviceState.RUNNING
-    bench.send(wire.encode_hello(NONCE + 1))
-    assert (bench.device.state, bench.device.reason) == (DeviceState.IDLE, StateReason.STOPPED)
     bench.hello()
+    assert (bench.device.state, bench.device.reason) == (DeviceState.IDLE, StateReason.STOPPED)
     assert bench.refused(Opcode.ARM, pack_arm(Arm(5000, 1, 100)))[1] == "no complete plan is loaded"
 
 
