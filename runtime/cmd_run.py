@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
 from . import __version__
 from .cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
@@ -26,7 +26,20 @@ from .errors import UsageError
 from .link import open_link
 from .profile import Profile, load_profile
 
+if TYPE_CHECKING:
+    from .verdict import Decider
+
 T = TypeVar("T")
+BACKENDS = (
+    "auto",
+    "table",
+    "count-table",
+    "sparse",
+    "onnx",
+    "int8",
+    "int8-onnx",
+    "float64",
+)  # decide.BACKENDS, unloaded
 DEMO_BUNDLE = "fashion10.pans"
 DEMO_PROFILE = "oled-qcmos"
 DEMO_SCENE = "fashion200"
@@ -68,7 +81,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
         "--order", default="auto", choices=("auto", "pattern-major", "shot-major"), help="pattern order"
     )
     parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
-    parser.add_argument("--backend", default="auto", choices=("auto", "table", "onnx"), help="decision back end")
+    parser.add_argument("--backend", default="auto", choices=BACKENDS, help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
     parser.add_argument(
@@ -218,7 +231,7 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         job.out.mkdir(parents=True, exist_ok=True)
         recording = job.record or job.out / "run.pansrec"
         expected = n_objects * job.trials
-        header = _header(job, bundle_sha256, decider.name, n_objects)
+        header = _header(job, bundle_sha256, decider, n_objects)
     except BaseException:
         _close_quietly(opening)
         raise
@@ -273,11 +286,13 @@ def _close_quietly(opening: _Background[Any]) -> None:
         say(f"pans: besides, the device could not be opened: {error}")
 
 
-def _header(job: Job, bundle_sha256: str, backend: str, n_objects: int) -> dict[str, Any]:
+def _header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int) -> dict[str, Any]:
     """What a recording must say to be understood alone; units are in the keys."""
     import numba
     import numpy
     import onnxruntime
+
+    from .verdict import choice_of
 
     return {
         "bundle_sha256": bundle_sha256,
@@ -293,7 +308,8 @@ def _header(job: Job, bundle_sha256: str, backend: str, n_objects: int) -> dict[
             "deadline_us": job.deadline_us,
             "order": job.order,
             "dark_slots_per_cycle": job.dark_slots,
-            "backend": backend,
+            "backend": decider.name,
+            "backend_choice": dict(choice_of(decider)),
             "tick_hz": job.profile.clock.tick_hz,
             "realtime_requested": job.realtime,
         },

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from .wire_schema import HEADER, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, UNSEEDED, MalformedMessage
+
+if TYPE_CHECKING:
+    from .wire_bulk import BulkDecoder
 
 
 class Frame(NamedTuple):
@@ -97,9 +100,23 @@ class FrameDecoder:
         self.counters = DecoderCounters()
         self._buffer = bytearray()
         self._skipping = False
+        self._bulk: BulkDecoder | None = None
+
+    def use_kernels(self) -> None:
+        """Decode in compiled kernels from here on: before arming, where blocks are so long that Python's loops would show."""
+        if self._bulk is None:
+            from .wire_bulk import BulkDecoder  # numba is loaded only for those who need it
+
+            self._bulk = BulkDecoder()
+            self._bulk.warm_up()
+            self._bulk.resume(self.counters, bytes(self._buffer), self._skipping)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
+        if self._bulk is not None:
+            found = self._bulk.feed(data)
+            self.counters = self._bulk.counters
+            return found
         self.counters.bytes_in += len(data)
         *ended, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []

@@ -43,6 +43,7 @@ FLUSH_EVERY_NS = 500 * NS_PER_MS
 POLL_S = 0.02
 UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every second
 SILENCE_NS = 5 * NS_PER_S  # without clicks
+KERNEL_BLOCK_BYTES = 512  # on the wire: from here on, decoding a block in Python takes longer than deciding on it
 STOP_GIVE_UP_NS = 1 * NS_PER_S
 
 
@@ -127,6 +128,8 @@ def run_live(
     run = LiveRun(connection, profile, plan, decider, config, recorder, started_ns or time.perf_counter_ns())
     try:
         run.core.warm_up()
+        if plan.block_bytes >= KERNEL_BLOCK_BYTES:
+            connection.decoder.use_kernels()
         reader = connection.reader.thread_id
         with arm_realtime(config.realtime and not link.virtual, [] if reader is None else [reader]) as granted:
             run.realtime = granted

@@ -91,6 +91,13 @@ class Plan:
         return 1e6 / (self.object_ticks * self.tick_us)
 
     @property
+    def block_bytes(self) -> int:
+        """Length of the longest click block's payload, about: clicks and pattern numbers, or words."""
+        if self.mode == "parallel":
+            return self.block_exposures * -(-self.n_patterns // 8)
+        return self.block_exposures * 17 // 8
+
+    @property
     def last_light_ticks(self) -> int:
         """End of the last exposure with light within the cycle: from here the decision deadline counts."""
         lit = np.flatnonzero(self.slot_pattern != DARK_PATTERN)

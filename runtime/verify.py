@@ -95,7 +95,8 @@ def _what_survives(path: str | Path) -> list[str]:
 
 def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
     """Golden vectors on every back end, table against head on every word, and signs of a bad export."""
-    for backend, part in (("table", bundle.table), ("onnx", bundle.head_onnx)):
+    parts = {"table": bundle.table, "onnx": bundle.head_onnx, "int8": bundle.int8_head, "int8-onnx": bundle.int8_onnx}
+    for backend, part in parts.items():
         if part is not None:
             try:
                 make_decider(bundle, backend=backend)

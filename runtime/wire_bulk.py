@@ -71,6 +71,17 @@ class BulkDecoder:
             frames += [unpack_body(self.buffer[first:stop].tobytes()) for first, stop in spans.tolist()]
         return frames
 
+    def resume(self, counters: DecoderCounters, unfinished: bytes, skipping: bool) -> None:
+        """Take over from another decoder: its counts, the bytes of its unfinished frame, and whether it skips an oversized one."""
+        tally = self._tally
+        tally[kernels.FRAMES], tally[kernels.CRC_ERRORS] = counters.frames, counters.crc_errors
+        tally[kernels.COBS_ERRORS], tally[kernels.SHORT_FRAMES] = counters.cobs_errors, counters.short_frames
+        tally[kernels.OVERSIZED], tally[kernels.DISCARDED] = counters.oversized_frames, counters.bytes_discarded
+        tally[kernels.SKIPPING] = skipping
+        self._bytes_in = counters.bytes_in
+        self._held = len(unfinished)
+        self.buffer[: self._held] = np.frombuffer(unfinished, np.uint8)
+
     def warm_up(self) -> None:
         """Compile or load the kernel, without counting anything."""
         tally = np.zeros(kernels.N_TALLIES, np.int64)

@@ -33,6 +33,22 @@ def compare(pieces: list[bytes]) -> list[Frame]:
     return frames
 
 
+@pytest.mark.parametrize("when", range(0, 90, 7))
+def test_taking_over_in_the_middle(when: int) -> None:
+    data = encode_frame(0x91, bytes(30) + b"abc", 3) + b"junk\0" + encode_frame(0x90, b"xyz", 3) * 2
+    plain, switched = FrameDecoder(), FrameDecoder()
+    expected, found = plain.feed(data), switched.feed(data[:when])
+    switched.use_kernels()
+    switched.use_kernels()
+    assert found + switched.feed(data[when:]) == expected
+    assert asdict(switched.counters) == asdict(plain.counters)
+    too_long = b"\1" * (MAX_FRAME_BYTES + 5)
+    plain.feed(too_long)
+    switched.feed(too_long)
+    assert plain.feed(b"\0" + data) == switched.feed(b"\0" + data)
+    assert asdict(switched.counters) == asdict(plain.counters)
+
+
 def cut(data: bytes, rng: random.Random, n_cuts: int) -> Iterator[bytes]:
     at = sorted(rng.randrange(len(data) + 1) for _ in range(n_cuts))
     for start, stop in zip([0, *at], [*at, len(data)]):
