@@ -156,12 +156,18 @@ def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
     return crc
 
 
-def block_bytes(kind: int, index: int, chain: int, payload: bytes | memoryview) -> tuple[bytes, int]:
+def block_bytes(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
     """Return a block's bytes and the next chain value; each CRC is seeded with the one before it, so order is covered."""
+    head, tail, payload_crc = block_ends(kind, index, chain, payload)
+    return b"".join([head, payload, tail]), payload_crc
+
+
+def block_ends(kind: int, index: int, chain: int, payload: bytes | memoryview) -> tuple[bytes, bytes, int]:
+    """Return what stands before and behind a block's payload, and the next chain value; nothing of the payload is copied."""
     start = _BLOCK_HEADER.pack(len(payload), index, kind, 0)[:-4]
     header_crc = zlib.crc32(start, chain)
     payload_crc = zlib.crc32(payload, header_crc)
-    return b"".join([start, _CRC.pack(header_crc), payload, _CRC.pack(payload_crc)]), payload_crc
+    return start + _CRC.pack(header_crc), _CRC.pack(payload_crc), payload_crc
 
 
 def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int], where: str) -> Block | None:

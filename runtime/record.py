@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .clock import CLOCK_DTYPE
-from .container import MIB, block_bytes, canonical_json, file_prologue, sync_folder
+from .container import MIB, block_ends, canonical_json, file_prologue, sync_folder
 from .errors import PansError, UsageError
 from .record_format import (
     DECISION_DTYPE,
@@ -49,6 +49,7 @@ __all__ = [
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
 _BUFFER_ROWS = 4096
+_COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
 
 
 class _Rows:
@@ -242,21 +243,26 @@ class Recorder:
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
         if len(payload) > LIMITS[kind]:
             raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
-        data, chain = block_bytes(kind, self._n_blocks, self._chain, payload)
-        self._write(data)
+        head, tail, chain = block_ends(kind, self._n_blocks, self._chain, payload)
+        if len(payload) > _COPIED_BYTES:
+            self._write(head, payload, tail)
+        else:
+            self._write(head + payload + tail)
         self._chain = chain
         self._n_blocks += 1
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *pieces: bytes | memoryview) -> None:
+        """Write one whole block (or the prologue); `_end` moves when all of it is there."""
         if self._file.closed:
             raise UsageError(f"{self.path}: this recording is closed")
-        view = memoryview(data)
         try:
-            while view:
-                view = view[self._file.write(view) :]
+            for piece in pieces:
+                view = memoryview(piece)
+                while view:
+                    view = view[self._file.write(view) :]
         except OSError as error:
             raise self._broken(error) from error
-        self._end += len(data)
+        self._end += sum(len(piece) for piece in pieces)
 
     def _broken(self, error: OSError) -> PansError:
         """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""

@@ -202,7 +202,15 @@ def decision_tables(decider: Decider, shots: int) -> DecisionTables:
     if found is not None:
         labels = np.ascontiguousarray(getattr(decider, "labels"), np.uint16)  # noqa: B009
         probabilities, radix = np.array(getattr(decider, "probabilities")), found  # noqa: B009
-    return DecisionTables(labels, probabilities, radix, *count_crc_tables(n_features, shots))
+    table, zero = count_crc_tables(n_features, shots)
+    n_bytes = -(-n_features // 8) if shots == 1 and found is not None else 0
+    word_rows, word_crc = np.zeros((n_bytes, 256), np.int64), np.zeros((n_bytes, 256), np.uint32)
+    for feature in range(n_features if n_bytes else 0):
+        byte, bit = feature >> 3, feature & 7
+        clicked = np.flatnonzero(np.arange(256) >> bit & 1)
+        word_rows[byte, clicked] += radix[feature]
+        word_crc[byte, clicked] ^= table[0, feature, 1]
+    return DecisionTables(labels, probabilities, radix, table, zero, word_rows, word_crc)
 
 
 def count_crc_tables(n_features: int, shots: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32]]:

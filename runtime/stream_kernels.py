@@ -56,7 +56,8 @@ class DecisionTables(NamedTuple):
     """From clicks per pattern to label, probability and checksum; without `labels` (size 0) the counts go to `counts_out`.
 
     `radix` int64 (d_f,): the row of a table is the sum of counts * radix. `crc` uint32 (bytes of a count, d_f, 256) and `crc_zero`
-    uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte.
+    uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte. For K = 1 with a
+    table, `word_rows` int64 and `word_crc` uint32 (bytes of a word, 256) say the same of a byte of the click word; else they are empty.
     """
 
     labels: npt.NDArray[np.uint16]
@@ -64,6 +65,8 @@ class DecisionTables(NamedTuple):
     radix: npt.NDArray[np.int64]
     crc: npt.NDArray[np.uint32]
     crc_zero: npt.NDArray[np.uint32]
+    word_rows: npt.NDArray[np.int64]
+    word_crc: npt.NDArray[np.uint32]
 
 
 class MarkArrays(NamedTuple):
@@ -175,6 +178,8 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
     tallies, objects, truths = windows.tallies, marks.objects, marks.truths
     labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
     crc_zero, number, shots, n_lanes = tables.crc_zero[0], state[OBJECT], state[SHOTS], lanes.size
+    word_rows, word_crc = tables.word_rows, tables.word_crc
+    one_frame_each = word_rows.size > 0  # K = 1 and a table: a word is a window
     n_features = counts.shape[1]
     top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
     known = number != _NO_OBJECT and objects[number % MARK_SLOTS] == number
@@ -191,6 +196,40 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
             at += word_bytes
             continue
         window = here
+        if one_frame_each:
+            clicks, index, crc = 0, 0, crc_zero
+            for p in range(n_lanes):
+                byte = np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)
+                clicks += ONES[byte]
+                index += word_rows[p, byte]
+                crc ^= word_crc[p, byte]
+            at += word_bytes
+            seen[here, 0] = n_features
+            probability, label, flags = probabilities[index], np.int64(labels[index]), 0
+            if not probability > 0:
+                probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
+            _fill(
+                rows[n_rows],
+                n_decisions,
+                tick + i * period + end_of_exposure,
+                first + i,
+                number,
+                here,
+                clicks,
+                label,
+                truth,
+                flags,
+                probability,
+                crc,
+            )
+            n_rows += 1
+            n_decisions += 1
+            state[N_ABSTAINED] += flags != 0
+            state[NEXT_WINDOW] = here + 1
+            if n_rows == rows.size:
+                done = i + 1
+                break
+            continue
         for p in range(n_lanes):
             lane = SPREAD[buffer[at + _U(p)]]
             lanes[p] = lane if held == 0 else lanes[p] + lane
@@ -209,30 +248,32 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
                 seen[here, 0] = held * n_features
             held = 0
             clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
-            flags, label, probability = 0, _NO_LABEL, np.float32(0.0)
+            flags, label, probability = 0, np.int64(_NO_LABEL), np.float32(0.0)
             if seen[here, 0] != shots * n_features:
                 flags = _GAP
             elif labels.size:
                 probability = probabilities[index]
                 if probability > 0:
-                    label = int(labels[index])
+                    label = np.int64(labels[index])
                 else:
                     flags = _NOT_FINITE
             else:
                 for feature in range(n_features):
                     counts_out[n_rows, feature] = whole[feature]
-            row = rows[n_rows]
-            row["index"] = n_decisions
-            row["tick"] = tick + i * period + end_of_exposure
-            row["exposure_index"] = first + i
-            row["object"] = number
-            row["shot"] = here * shots
-            row["clicks"] = clicks
-            row["label"] = label
-            row["truth"] = truth
-            row["flags"] = flags
-            row["probability"] = probability
-            row["counts_crc"] = crc
+            _fill(
+                rows[n_rows],
+                n_decisions,
+                tick + i * period + end_of_exposure,
+                first + i,
+                number,
+                here * shots,
+                clicks,
+                label,
+                truth,
+                flags,
+                probability,
+                crc,
+            )
             n_rows += 1
             n_decisions += 1
             state[N_ABSTAINED] += flags != 0
@@ -244,6 +285,22 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
         _spill(lanes, counts, seen, window, held)
     state[N_ROWS], state[N_DECISIONS], state[FRAME] = n_rows, n_decisions, done
     return done == count
+
+
+@njit(cache=True, nogil=True)
+def _fill(row, index, tick, exposure, number, shot, clicks, label, truth, flags, probability, crc):  # type: ignore[no-untyped-def]
+    """Write one row of the decision log."""
+    row["index"] = index
+    row["tick"] = tick
+    row["exposure_index"] = exposure
+    row["object"] = number
+    row["shot"] = shot
+    row["clicks"] = clicks
+    row["label"] = label
+    row["truth"] = truth
+    row["flags"] = flags
+    row["probability"] = probability
+    row["counts_crc"] = crc
 
 
 @njit(cache=True, nogil=True)
