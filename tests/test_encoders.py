@@ -8,7 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.trainer.encoders import ActiveIllumination
+from pans.runtime.profile import load_profile
+from pans.trainer.encoders import ActiveIllumination, CoherentField, IncoherentIntensity, new_encoder
+from pans.trainer.options import Options
 
 
 def encoder(limits=(0.1, 2.0), seed=0):
@@ -85,3 +87,56 @@ def test_the_top_level_stays_within_its_limits():
     with torch.no_grad():
         light.log_top.fill_(10.0)
     assert float(light.top().detach()) == pytest.approx(2.0)
+
+
+def rng_field(n=5, pixels=9, seed=0):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy((rng.normal(size=(n, pixels)) + 1j * rng.normal(size=(n, pixels))).astype(np.complex64))
+
+
+@pytest.mark.parametrize("complex_field", [False, True])
+def test_coherent_light_is_the_squared_modulus_of_the_transformed_field(complex_field):
+    encoder = CoherentField(4, 9, torch.Generator().manual_seed(0), complex_field=complex_field)
+    field = rng_field()
+    found = encoder(field).detach().numpy()
+    matrix = encoder.matrix().detach().numpy()
+    assert np.iscomplexobj(matrix) == complex_field
+    for i in range(5):
+        for j in range(4):
+            assert found[i, j] == pytest.approx(abs(np.sum(matrix[j] * field[i].numpy())) ** 2, rel=1e-5)
+    real = field.real
+    assert encoder(real).detach().numpy() == pytest.approx(encoder(real.to(torch.complex64)).detach().numpy(), rel=1e-5)
+
+
+@pytest.mark.parametrize("complex_field", [False, True])
+def test_conserving_coherent_encoder_creates_no_light(complex_field):
+    random = torch.Generator().manual_seed(0)
+    encoder = CoherentField(6, 9, random, light=50.0, complex_field=complex_field, conserving=True)
+    assert float(torch.linalg.svdvals(encoder.matrix())[0].detach()) == pytest.approx(1.0, rel=1e-5)
+    field = rng_field(50)
+    assert bool((encoder(field).sum(dim=1) <= field.abs().square().sum(dim=1) * (1 + 1e-5)).all())
+    free = CoherentField(6, 9, torch.Generator().manual_seed(0), light=50.0, complex_field=complex_field)
+    assert bool((free(field).sum(dim=1) > field.abs().square().sum(dim=1)).any())
+    dim = CoherentField(6, 9, torch.Generator().manual_seed(0), light=1e-4, conserving=True)
+    assert torch.equal(dim.matrix(), dim.weight[0])  # below the limit nothing is changed
+
+
+def test_conserving_incoherent_encoder_creates_no_light():
+    encoder = IncoherentIntensity(6, 9, torch.Generator().manual_seed(0), light=50.0, conserving=True)
+    columns = encoder.matrix().sum(dim=0).detach().numpy()
+    assert columns.max() <= 1 + 1e-6
+    assert (encoder.matrix() >= 0).all()
+    intensity = torch.rand(20, 9, generator=torch.Generator().manual_seed(1))
+    assert encoder(intensity).detach().numpy() == pytest.approx((intensity @ encoder.matrix().T).detach().numpy())
+    assert bool((encoder(intensity).sum(dim=1) <= intensity.sum(dim=1) * (1 + 1e-6)).all())
+
+
+def test_new_encoder_is_what_the_options_ask_for():
+    profile = load_profile("ideal")
+    random = torch.Generator().manual_seed(0)
+    for name, kind in (
+        ("active", ActiveIllumination),
+        ("coherent", CoherentField),
+        ("incoherent", IncoherentIntensity),
+    ):
+        assert type(new_encoder(9, profile, Options(features=2, encoder=name), random)) is kind

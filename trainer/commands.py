@@ -77,6 +77,9 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threads", type=int, default=1, metavar="T", help="of torch (default 1); changes the rounding"
     )
+    parser.add_argument(
+        "--dark", type=float, metavar="R", help="dark photoelectrons per exposure in training, instead of the profile's"
+    )
     parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     _data_dir(parser)
@@ -117,7 +120,7 @@ def _train(args: argparse.Namespace) -> int:
         **_figures(measured),
         "first_200": _figures(_measure(exported.bundle, profile, _first(task.test, 200), 1, None, 0, fall_back=True)),
         "top_photoelectrons": exported.bundle.photons_per_level * (exported.bundle.levels - 1),
-        "quantisation_error_bound": trained.quantised.error_bound,
+        "quantisation_error_bound": trained.quantised.error_bound if trained.quantised else None,
         "score_difference": exported.score_difference,
         "words_compared": exported.words_compared,
         "dead_patterns": exported.dead_patterns,
@@ -134,9 +137,8 @@ def _options(args: argparse.Namespace) -> Options:
 
     estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = ("features", "photons", "clicks", "epochs", "restarts", "starts", "warm", "polish", "shots")
-    same += ("seed", "hidden", "batch", "slope", "clamp")
-    return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same})
+    same = "features photons clicks epochs restarts starts warm polish shots seed hidden batch slope clamp dark"
+    return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same.split()})
 
 
 def _export_and_measure(

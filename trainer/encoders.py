@@ -1,7 +1,14 @@
-"""Encoders: from an object's transmission to the photoelectrons of every exposure.
+"""Encoders: from what an object shows to the photoelectrons of every exposure or detector.
 
-Owns the trainable light and its physical limits (no negative light, a brightest pixel, whole levels); never detects.
-`ActiveIllumination` is the paper's active scheme: patterns are squared weights.
+Owns the trainable optics and their physical limits (no negative light, a brightest pixel, whole levels, no more light out than
+in); never detects. Called with `(x, floor)` an encoder gives photoelectrons (n, d_f) of objects x (n, inputs).
+
+- `ActiveIllumination`: the paper's active scheme. Patterns are squared weights; x is transmission.
+- `CoherentField`: the paper's passive scheme. x is a field, real or complex; light = |W x|**2, W real as in the paper, or complex.
+- `IncoherentIntensity`: x is an intensity; light = W x with W at least 0.
+
+The paper's passive W is unconstrained: it may create photons. With `conserving`, W's largest singular value (coherent) or its column
+sums (incoherent) are at most 1, so that the detectors together receive no more than the object gave.
 """
 
 from __future__ import annotations
@@ -10,6 +17,11 @@ import math
 
 import torch
 from torch import Tensor, nn
+
+from pans.runtime.profile import Profile
+
+from .options import Options
+from .quantise import top_limits
 
 KAIMING_A = 1.2  # paper, appendix on the training procedure
 
@@ -64,7 +76,113 @@ class ActiveIllumination(nn.Module):
         level = (light / step).clamp(max=self.levels - 1)
         return (level + (level.round() - level).detach()) * step
 
-    def forward(self, transmission: Tensor) -> Tensor:
-        """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels)."""
-        photoelectrons: Tensor = transmission @ self.patterns().T
+    def forward(self, transmission: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""
+        patterns = self.patterns()
+        photoelectrons: Tensor = (1 - floor) * (transmission @ patterns.T) + floor * patterns.sum(dim=1)
         return photoelectrons
+
+    def illumination(self) -> Tensor:
+        """Return the sum of all pattern intensities."""
+        return self.patterns().sum()
+
+    def brightest(self) -> float:
+        """Return the photoelectrons of the brightest pixel, or of the top level once there are levels."""
+        with torch.no_grad():
+            return float(self.patterns().max() if self.levels is None else self.top())
+
+
+class CoherentField(nn.Module):
+    """Transmission matrix W (d_f, inputs) for fields: light = |W x|**2. `complex_field` makes W complex."""
+
+    levels = None  # nothing to quantise: no projector
+
+    def __init__(
+        self,
+        n_features: int,
+        n_inputs: int,
+        generator: torch.Generator,
+        *,
+        light: float = 1.0,
+        complex_field: bool = False,
+        conserving: bool = False,
+    ) -> None:
+        super().__init__()
+        self.conserving = conserving
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
+        parts = 2 if complex_field else 1
+        self.weight = nn.Parameter((torch.rand(parts, n_features, n_inputs, generator=generator) * 2 - 1) * bound)
+
+    def matrix(self) -> Tensor:
+        """Return W, complex64 or float32; scaled down to a largest singular value of 1 where light is conserved."""
+        matrix = self.weight[0] if len(self.weight) == 1 else torch.complex(self.weight[0], self.weight[1])
+        if self.conserving:
+            matrix = matrix / torch.linalg.matrix_norm(matrix, ord=2).clamp(min=1.0)
+        return matrix
+
+    def forward(self, field: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of fields (n, inputs), float32 or complex64; there is no floor."""
+        matrix = self.matrix()
+        if field.is_complex() or matrix.is_complex():
+            out = field.to(torch.complex64) @ matrix.to(torch.complex64).T
+            return out.real.square() + out.imag.square()
+        return (field @ matrix.T).square()
+
+    def illumination(self) -> Tensor:
+        """Return 0: a passive encoder sends no light."""
+        return torch.zeros(())
+
+
+class IncoherentIntensity(nn.Module):
+    """Transmission matrix W >= 0 (d_f, inputs) for intensities, W = weight**2."""
+
+    levels = None
+
+    def __init__(
+        self,
+        n_features: int,
+        n_inputs: int,
+        generator: torch.Generator,
+        *,
+        light: float = 1.0,
+        conserving: bool = False,
+    ) -> None:
+        super().__init__()
+        self.conserving = conserving
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
+        self.weight = nn.Parameter((torch.rand(n_features, n_inputs, generator=generator) * 2 - 1) * bound)
+
+    def matrix(self) -> Tensor:
+        """Return W; where light is conserved, columns that sum to more than 1 are scaled down to 1."""
+        matrix = self.weight**2
+        return matrix / matrix.sum(dim=0).clamp(min=1.0) if self.conserving else matrix
+
+    def forward(self, intensity: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of intensities (n, inputs); there is no floor."""
+        photoelectrons: Tensor = intensity @ self.matrix().T
+        return photoelectrons
+
+    def illumination(self) -> Tensor:
+        """Return 0: a passive encoder sends no light."""
+        return torch.zeros(())
+
+
+Encoder = ActiveIllumination | CoherentField | IncoherentIntensity
+
+
+def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch.Generator) -> Encoder:
+    """Return the untrained encoder that `options` ask for."""
+    if options.encoder == "active":
+        return ActiveIllumination(options.features, n_inputs, top_limits(profile), random, options.light)
+    if options.encoder == "incoherent":
+        return IncoherentIntensity(
+            options.features, n_inputs, random, light=options.light, conserving=options.conserving
+        )
+    return CoherentField(
+        options.features,
+        n_inputs,
+        random,
+        light=options.light,
+        complex_field=options.complex_field,
+        conserving=options.conserving,
+    )

@@ -22,7 +22,7 @@ from pans.runtime import __version__
 from pans.runtime.bundle import Bundle, load_bundle, make_bundle, word_means, write_bundle
 from pans.runtime.bundle_facts import GOLDEN_TOLERANCE
 from pans.runtime.decide import make_decider
-from pans.runtime.errors import PansError
+from pans.runtime.errors import PansError, UsageError
 from pans.runtime.head_layers import read_layers
 from pans.runtime.int8_head import quantise_head
 from pans.runtime.profile import Profile
@@ -139,6 +139,8 @@ def export_trained(
     path: Path, trained: Trained, task: Task, profile: Profile, *, name: str, provenance: Mapping[str, Any]
 ) -> Exported:
     """Write what `train` returned to `path`; `provenance` is added to what the task, profile and training say of themselves."""
+    if trained.quantised is None:
+        raise UsageError("a bundle holds projector patterns, a passive encoder has none", remedy="use --encoder active")
     return export(
         path,
         trained.head,

@@ -13,6 +13,7 @@ from pans.runtime.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
+ENCODERS = ("active", "coherent", "incoherent")
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
 
 
@@ -37,6 +38,13 @@ class Options:
     slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
     clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
     polish: float = 0.0  # last part of the epochs, in which the loss turns from cross-entropy to wrong decisions
+    encoder: str = "active"
+    complex_field: bool = False  # of a coherent encoder: W complex; the paper's is real
+    conserving: bool = False  # of a passive encoder: no more light out than in; the paper's W is unconstrained
+    input_photons: float | None = (
+        None  # of passive sensing: mean photoelectrons that reach the encoder; None: full scale is 1
+    )
+    dark: float | None = None  # dark photoelectrons per exposure in training, instead of the profile's
     light: float = 1.0  # of the initial patterns, times the paper's
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
 
@@ -54,7 +62,7 @@ def check_options(options: Options, profile: Profile) -> None:
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:
             raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
-    for name in ("alpha", "photons", "clicks", "light"):
+    for name in ("alpha", "photons", "clicks", "light", "input_photons"):
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
             raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
@@ -62,6 +70,10 @@ def check_options(options: Options, profile: Profile) -> None:
         raise UsageError(
             f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
         )
+    if options.encoder not in ENCODERS:
+        raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
+    if options.dark is not None and not 0 <= options.dark < math.inf:
+        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
     if options.estimator not in ESTIMATOR_NAMES:
         raise UsageError(f"--estimator is {options.estimator!r}, allowed: {', '.join(ESTIMATOR_NAMES)}")
     if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
@@ -76,7 +88,7 @@ def check_options(options: Options, profile: Profile) -> None:
             f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
             remedy=f"--features {channels}, or fewer",
         )
-    if options.features > profile.projector.pattern_memory:
+    if options.encoder == "active" and options.features > profile.projector.pattern_memory:
         raise PlanError(
             f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
             remedy=f"--features {profile.projector.pattern_memory}, or fewer",

@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,9 @@ def estimator_table(cache: Path, data_dir: str | None, report: Callable[[str], N
         start = time.process_time()
         trained = train(task, profile, Options(**(asdict(BASE) | WAYS[way] | {"seed": seed})))
         seconds = time.process_time() - start
-        light = shown.double() @ torch.from_numpy(trained.quantised.patterns()).T
+        assert trained.quantised is not None, "active encoders have levels"
+        patterns = trained.quantised.patterns()
+        light = shown.double() @ torch.from_numpy(patterns).T
         p = click_probability(light, trained.law)
         with torch.no_grad():
             decided = trained.head(click_words(FEATURES)).argmax(dim=1)
@@ -105,20 +108,16 @@ def estimator_table(cache: Path, data_dir: str | None, report: Callable[[str], N
             "accuracy": float(joint[torch.arange(len(decided)), decided].sum()),
             "clicks": float(p.sum(dim=1).mean()),
             "photons": float(light.sum(dim=1).mean()),
-            "illumination": float(trained.quantised.patterns().sum()),
+            "illumination": float(patterns.sum()),
             "cpu_seconds": seconds,
         }
 
-    stages = [_kept(cache / f"estimators-gradient-{e}.json", lambda e=e: gradients(e), report) for e in STAGES]
-    runs = [
-        _kept(
-            cache / f"estimators-{way.replace(', ', '-').replace(' ', '-')}-{s}.json",
-            lambda w=way, s=s: training(w, s),
-            report,
-        )
-        for way in WAYS
-        for s in SEEDS
-    ]
+    stages = [_kept(cache / f"estimators-gradient-{e}.json", partial(gradients, e), report) for e in STAGES]
+    runs = []
+    for way in WAYS:
+        for seed in SEEDS:
+            path = cache / f"estimators-{way.replace(', ', '-').replace(' ', '-')}-{seed}.json"
+            runs.append(_kept(path, partial(training, way, seed), report))
     rows = [row for stage in stages for row in stage["rows"]]
     return {"rows": [*rows, *runs], "markdown": _markdown(rows, runs)}
 

@@ -15,29 +15,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pans.runtime.clicks import ClickLaw, click_law, object_transmission
+from pans.runtime.clicks import ClickLaw, click_law
 from pans.runtime.profile import Profile
 
 from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import click_probability, click_words, sample_clicks, word_probabilities
-from .encoders import ActiveIllumination
-from .estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss
+from .encoders import ActiveIllumination, Encoder, new_encoder
+from .estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss, squared_error
 from .head_fit import fit_head
 from .heads import MlpHead
 from .options import EXACT_FEATURES_MAX, Options, check_options
-from .quantise import Quantised, exposure_us_of, quantise, top_limits
-from .tasks import Objects, Task
+from .quantise import Quantised, exposure_us_of, quantise
+from .tasks import Task
+from .training_data import CHUNK, TrainingData
 
-VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
 VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
-CHUNK = 2000  # objects per pass where no gradient is needed
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
@@ -62,8 +61,9 @@ class EpochReport:
 class Trained:
     """A finished model: the shown patterns, the head in evaluation mode, the law it was trained for."""
 
-    quantised: Quantised
-    float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels
+    quantised: Quantised | None  # of active sensing; None of a passive encoder
+    float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
+    encoder: Encoder
     head: MlpHead
     click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
     law: ClickLaw
@@ -87,7 +87,7 @@ def train(
     through, with the state of the last whole epoch on disk.
     """
     check_options(options, profile)
-    data = _Data(task, profile, validation=max(1, len(task.train) // VALIDATION_PART))
+    data = TrainingData(task, profile, options)
     saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
     best: dict[str, Any] | None = saved.get("best")
     losses: list[float] = saved.get("losses", [])
@@ -118,31 +118,14 @@ def train(
     return run.finish(tuple(losses))
 
 
-class _Data:
-    """Training objects as float32 tensors: `gray` is the transmission with a perfect black, `floor` the real one."""
-
-    def __init__(self, task: Task, profile: Profile, validation: int) -> None:
-        self.floor = profile.min_transmission
-        self.validation = validation
-        self.gray = self._flat(profile, task.train)
-        self.labels = torch.from_numpy(task.train.labels)
-        self.n_classes = len(task.classes)
-        self.n_fit = len(self.labels) - validation
-
-    def _flat(self, profile: Profile, objects: Objects) -> Tensor:
-        shown = object_transmission(profile, objects.images.reshape(len(objects), -1), "float32")
-        return torch.from_numpy((shown - self.floor) / (1 - self.floor))
-
-
 class _Run:
     """One restart: patterns, head, optimiser, random numbers, and how far it has come."""
 
-    def __init__(self, data: _Data, profile: Profile, options: Options, restart: int) -> None:
+    def __init__(self, data: TrainingData, profile: Profile, options: Options, restart: int) -> None:
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = torch.Generator().manual_seed(options.seed + restart)
-        limits = top_limits(profile)
-        self.encoder = ActiveIllumination(options.features, data.gray.shape[1], limits, self.random, options.light)
-        self.head = MlpHead(options.features, options.hidden, data.n_classes, self.random)
+        self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
+        self.head = MlpHead(options.features, options.hidden, data.n_outputs, self.random)
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
         self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))
@@ -182,7 +165,9 @@ class _Run:
         return front * cycle + 1e-6, self.options.head_rate * cycle + 1e-6
 
     def loss_of(self, progress: float) -> LossOf:
-        """Cross-entropy, turning towards the rate of wrong decisions in the last part of the epochs."""
+        """Cross-entropy, turning towards the rate of wrong decisions in the last part of the epochs; of images the squared error."""
+        if self.data.is_image:
+            return squared_error
         part = self.options.polish * self.options.epochs
         into = self.epoch + progress - (self.options.epochs - part)
         return decision_loss(min(1.0, into / (0.3 * part)) if part > 0 and into > 0 else 0.0)
@@ -200,7 +185,7 @@ class _Run:
         options, data = self.options, self.data
         if self.epoch == self.first_exact:
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
-        if self.epoch == self.first_whole:
+        if self.epoch == self.first_whole and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
         loss_of_clicks = ESTIMATORS["ste" if self.epoch < self.first_exact else options.estimator]
         law = self.law()
@@ -210,36 +195,34 @@ class _Run:
         self.head.train()
         for i, batch in enumerate(batches):
             progress = i / len(batches)
-            light, photons = self.light(batch, self.floor(progress))
+            light = self.encoder(data.shown[batch], self.floor(progress))
+            photons = light.sum(dim=1).mean()
             slope, clamp = self._slope_and_clamp(progress)
             p = click_probability(light.clamp(max=clamp), law, slope)
-            loss = loss_of_clicks(p, data.labels[batch], self.head, self.loss_of(progress), self.random)
+            loss = loss_of_clicks(p, data.target[batch], self.head, self.loss_of(progress), self.random)
             clicks = p.sum(dim=1).mean()
-            illumination = self.encoder.patterns().sum()
+            illumination = self.encoder.illumination()
             total = loss + self._penalty(clicks, photons, illumination)
             for group, rate in zip(self.optimiser.param_groups, self.rates(progress)):
                 group["lr"] = rate
             self.optimiser.zero_grad()
             total.backward()
             self.optimiser.step()
-            self.encoder.dim_to_top()
+            if isinstance(self.encoder, ActiveIllumination):
+                self.encoder.dim_to_top()
             sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
         stage = self.stage()
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
 
-    def light(self, which: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-        """Photoelectrons (n, d_f) of the objects `which` with black at `floor`, and their mean sum per object."""
-        patterns = self.encoder.patterns()
-        light = (1 - floor) * (self.data.gray[which] @ patterns.T) + floor * patterns.sum(dim=1)
-        return light, light.sum(dim=1).mean()
-
     def law(self) -> ClickLaw:
-        """The click law at the exposure that the present brightest pixel needs."""
-        low, high = self.encoder.top_limits
-        with torch.no_grad():
-            brightest = self.encoder.patterns().max() if self.encoder.levels is None else self.encoder.top()
-        return click_law(self.profile, exposure_us_of(self.profile, min(max(float(brightest), low), high)))
+        """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
+        exposure_us = self.profile.exposure.min_us
+        if isinstance(self.encoder, ActiveIllumination):
+            low, high = self.encoder.top_limits
+            exposure_us = exposure_us_of(self.profile, min(max(self.encoder.brightest(), low), high))
+        law = click_law(self.profile, exposure_us)
+        return law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
 
     def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
         """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
@@ -271,43 +254,45 @@ class _Run:
         with torch.no_grad():
             for first in range(start, stop, CHUNK):
                 which = torch.arange(first, min(first + CHUNK, stop))
-                parts.append(click_probability(self.light(which, self.data.floor)[0].double(), law))
+                parts.append(click_probability(self.encoder(self.data.shown[which], self.data.floor).double(), law))
         return torch.cat(parts)
 
     def validation_loss(self) -> float:
         """Cross-entropy on the validation objects: exact where the words can be enumerated, else of one sample."""
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
-        labels = self.data.labels[self.data.n_fit :]
+        target = self.data.target[self.data.n_fit :]
+        loss_of = squared_error if self.data.is_image else cross_entropy
         random = torch.Generator().manual_seed(self.options.seed)
         self.head.eval()
         with torch.no_grad():
-            if self.options.features <= EXACT_FEATURES_MAX:
+            if self.options.features <= EXACT_FEATURES_MAX and not self.data.is_image:
                 scores = self.head(click_words(self.options.features)).double()
-                return float(
-                    (word_probabilities(p) * cross_entropy(scores.unsqueeze(0), labels.unsqueeze(1))).sum() / len(p)
-                )
+                return float((word_probabilities(p) * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
             drawn = [self.head(sample_clicks(p, random).float()) for _ in range(VALIDATION_SAMPLES)]
-            return float(torch.stack([cross_entropy(scores, labels).mean() for scores in drawn]).mean())
+            return float(torch.stack([loss_of(scores, target).mean() for scores in drawn]).mean())
 
     def finish(self, losses: tuple[float, ...]) -> Trained:
-        """Freeze the patterns as levels, then fit the head to what they show of all training objects."""
-        with torch.no_grad():
-            floats = (self.encoder.weight**2).numpy().copy()
-        quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
+        """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
+        quantised, floats = None, None
+        if isinstance(self.encoder, ActiveIllumination):
+            with torch.no_grad():
+                floats = (self.encoder.weight**2).numpy().copy()
+            quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
         p = self.probabilities(0, len(self.data.labels))
         fit_head(
             self.head,
             p,
-            self.data.labels,
-            cross_entropy,
+            self.data.target,
+            squared_error if self.data.is_image else cross_entropy,
             self.random,
             exact=self.options.features <= EXACT_FEATURES_MAX,
-            n_outputs=self.data.n_classes,
+            n_outputs=self.data.n_outputs,
             shots=self.options.shots,
             batch=self.options.batch,
             rate=self.options.head_rate,
         )
-        return Trained(quantised, floats, self.head, p.mean(dim=0), self.law(), min(losses), losses, self.options)
+        mean, law = p.mean(dim=0), self.law()
+        return Trained(quantised, floats, self.encoder, self.head, mean, law, min(losses), losses, self.options)
 
     # ---- checkpoints ----
 
@@ -330,7 +315,9 @@ class _Run:
             module.load_state_dict(state[name])
         self.optimiser.load_state_dict(state["optimiser"])
         self.random.set_state(state["random"])
-        self.epoch, self.weights, self.encoder.levels = state["epoch"], dict(state["weights"]), state["levels"]
+        self.epoch, self.weights = state["epoch"], dict(state["weights"])
+        if isinstance(self.encoder, ActiveIllumination):
+            self.encoder.levels = state["levels"]
 
     def _modules(self) -> tuple[tuple[str, torch.nn.Module], ...]:
         return ("encoder", self.encoder), ("head", self.head)

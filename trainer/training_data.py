@@ -1,0 +1,59 @@
+"""What a training sees: the objects of a task as tensors, in the form that the encoder takes.
+
+Owns the way from 8-bit images to transmissions, fields or intensities, and the part kept for validation; never trains and never
+touches the held-out objects.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pans.runtime.clicks import object_transmission
+from pans.runtime.profile import Profile
+
+from .incident import incident_field, incident_intensity
+from .options import Options
+from .tasks import Objects, Task
+
+VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
+CHUNK = 2000  # objects per pass where no gradient is needed
+
+
+class TrainingData:
+    """Training objects as tensors: `shown` is what the encoder gets, (n, inputs); `target` a label, or an image in [0, 1].
+
+    Active: float32 transmission with a perfect black, `floor` being the real one. Passive: incident field or intensity.
+    """
+
+    def __init__(self, task: Task, profile: Profile, options: Options) -> None:
+        self.floor = profile.min_transmission if options.encoder == "active" else 0.0
+        self.shown = encoder_input(task, task.train, profile, options)
+        self.labels = torch.from_numpy(task.train.labels)
+        self.is_image = task.target == "image"
+        if self.is_image:
+            flat = task.train.images.reshape(len(task.train), -1)
+            self.target, self.n_outputs = torch.from_numpy(flat.astype("float32") / 255), flat.shape[1]
+        else:
+            self.target, self.n_outputs = self.labels, len(task.classes)
+        self.n_fit = len(self.labels) - max(1, len(self.labels) // VALIDATION_PART)
+
+
+def encoder_input(task: Task, objects: Objects, profile: Profile, options: Options) -> Tensor:
+    """Return what the encoder of `options` gets from `objects`, (n, inputs): transmission, field or intensity.
+
+    With `input_photons`, fields and intensities are scaled so that the training objects bring that many on average.
+    """
+    flat = objects.images.reshape(len(objects), -1)
+    if options.encoder == "active":
+        black = profile.min_transmission
+        shown = (object_transmission(profile, flat, "float32") - black) / (1 - black)
+        return torch.from_numpy(shown)
+    coherent = options.encoder == "coherent"
+    incident = incident_field if coherent else incident_intensity
+    x = torch.from_numpy(incident(objects.images, task.light, task.optics)).flatten(1)
+    if options.input_photons is not None:
+        given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics).reshape(-1, x.shape[1])
+        scale = options.input_photons / float(given.sum(axis=1).mean())
+        x = x * (scale**0.5 if coherent else scale)
+    return x
