@@ -16,7 +16,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
 
-from .paper_tables import ACTIVE
+from .paper_tables import ACTIVE, PASSIVE
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
@@ -25,6 +25,7 @@ NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=(*NAMES, "all", "list"), help="which table or figure")
     parser.add_argument("--rows", type=int, nargs="+", metavar="D", help="only the rows with that many patterns")
+    parser.add_argument("--dark", type=float, nargs="+", metavar="R", help="only these dark counts (not of all tables)")
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and NAME.png there")
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
@@ -87,6 +88,30 @@ def _facts(row: Any) -> dict[str, Any]:
     return {key: getattr(row, key) for key in row.__dataclass_fields__}
 
 
+def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from . import reproduce_passive as passive
+
+    table = PASSIVE[name]
+    wanted = [row for row in table.rows if args.rows is None or row.features in args.rows]
+    levels = [dark for dark in table.dark if args.dark is None or dark in args.dark]
+    if not (wanted and levels):
+        known = f"rows {', '.join(str(row.features) for row in table.rows)}, dark {', '.join(map(str, table.dark))}"
+        raise UsageError(f"--rows {args.rows} --dark {args.dark}", remedy=f"{name} has {known}")
+    done = []
+    for row in wanted:
+        for dark in levels:
+            figures = passive.finished_cell(args.cache, name, row, dark)
+            if figures is None and not args.collect:
+                figures = passive.make_cell(args.cache, name, row, dark, args.data_dir, say)
+            if figures is not None:
+                done.append((row, figures))
+    text = passive.markdown(name, done)
+    result = {"rows": [figures for _, figures in done], "markdown": text}
+    if args.out:
+        _write(args.out, name, result, None)
+    return result
+
+
 def _estimators(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from .reproduce_estimators import estimator_table
 
@@ -110,6 +135,7 @@ def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     **dict.fromkeys(ACTIVE, _active),
+    **dict.fromkeys(PASSIVE, _passive),
     "estimators": _estimators,
 }
 
