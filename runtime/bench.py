@@ -13,6 +13,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -147,13 +148,13 @@ def mark_pareto(rows: list[Row], speed: str, error: str) -> None:
 def write_plot(rows: list[Row], path: Path) -> None:
     """Draw speed against error of the rows that have both (`ns`, `score_error`), and plain speed of the others."""
     try:
-        import matplotlib as mpl
+        mpl = import_module("matplotlib")  # an extra that only a picture needs
     except ModuleNotFoundError as error:
         raise UsageError(
             "--plot needs matplotlib, which is not installed", remedy="pip install 'pans-runtime[plot]'"
         ) from error
     mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    plt = import_module("matplotlib.pyplot")
 
     points = [row for row in rows if "ns" in row and "score_error" in row]
     others = [row for row in rows if "rate" in row]

@@ -78,7 +78,7 @@ def softmax_winners(scores: NDArray[np.floating[Any]]) -> Verdicts:
         best = wide.max(axis=1, keepdims=True)
         finite = np.isfinite(best[:, 0])
         wide -= np.where(np.isfinite(best), best, 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             probabilities[start : start + _CHUNK_ROWS] = np.where(finite, 1.0 / np.exp(wide).sum(axis=1), 0.0)
     return Verdicts(labels, probabilities)
 
