@@ -10,8 +10,8 @@ The scene: a cell flows through the light field; one organelle is stained, and i
 - mitochondria: 10 to 22 short threads of beads in the cytoplasm around a dark nucleus;
 - null: no cell in focus: haze of cells out of focus and up to 4 specks of debris.
 
-Every cell varies in size (radius 24 to 30 px), outline (aspect 0.72 to 1, waves), place (up to 4 px off in y and x: a sheath
-flow centres cells), orientation, share of light in the stain (0.7 to 0.98, the rest glows from the whole cell) and brightness.
+Every cell varies in size (radius 25 to 30 px), outline (aspect 0.72 to 1, waves), place (up to 3 px off in y and x: a sheath
+flow centres cells), orientation, share of light in the stain (0.75 to 1, the rest glows from the whole cell) and brightness.
 
 What makes it hard: the mean of an image is set to a value drawn without regard to the class (mean grey 6 to 12 of 255), so
 total intensity tells nothing, for the null class neither; outlines, vesicles and diffuse light hide the texture.
@@ -49,9 +49,9 @@ from .draw import (
 SIDE_PX = 100
 CLASSES = ("membrane", "nucleolus", "mitochondria", "null")
 MEAN_GREY = (6 / 255, 12 / 255)  # drawn log-uniformly, the same for every class
-RADIUS_PX = (24, 30)
-OFFSET_PX = 4
-STAIN_SHARE = (0.7, 0.98)
+RADIUS_PX = (25, 30)
+OFFSET_PX = 3
+STAIN_SHARE = (0.75, 1.0)
 PEAK_TO_MEAN = 20.0
 NOISE_GREY = 1.5 / 255  # of the camera, before negative values are cut
 N_THREADS, N_BEADS = 22, 9
