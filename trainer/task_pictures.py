@@ -25,7 +25,7 @@ GREY_LEVELS = 32  # keeps the files small
 def picture_of(name: str, path: Path) -> None:
     """Write the picture of a drawn task: rows are classes, grey levels as they are (0 to 255, each image to its own peak)."""
     drawn = generate(name, n_train=1, n_test=60)
-    rows = []
+    rows: list[tuple[str, NDArray[Any], NDArray[Any] | None]] = []
     for label, title in enumerate(drawn.recipe.classes):
         images = drawn.test_images[drawn.test_labels == label][:PER_CLASS]
         rows.append((title, images, total_intensity(images, drawn.recipe.light)))
