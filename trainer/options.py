@@ -35,6 +35,7 @@ class Options:
     batch: int = 512
     front_rate: float = 1e-2
     head_rate: float = 1e-3
+    constant: bool = False  # learning rates as in the paper, instead of one cycle per estimator
     slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
     clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
     polish: float = 0.0  # last part of the epochs, in which the loss turns from cross-entropy to wrong decisions

@@ -121,6 +121,15 @@ def _estimators(name: str, args: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
+def _time(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from .reproduce_time import time_table
+
+    result = time_table(args.cache, args.rows, args.data_dir, say)
+    if args.out:
+        _write(args.out, name, result, None)
+    return result
+
+
 def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path], None] | None) -> None:
     """Write NAME.json, NAME.md and, where `draw` is given, NAME.png, each whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -137,6 +146,7 @@ NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     **dict.fromkeys(ACTIVE, _active),
     **dict.fromkeys(PASSIVE, _passive),
     "estimators": _estimators,
+    "time": _time,
 }
 
 REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)

@@ -95,7 +95,7 @@ def train(
         started: list[float] = saved.pop("started", [])  # losses of the starts of this restart
         chosen: dict[str, Any] | None = saved.pop("chosen", None)  # and the best of them
         for start in range(len(started), options.starts + 1):  # the last round goes on with the best start
-            run = _Run(data, profile, options, restart * options.starts + min(start, options.starts - 1))
+            run = Run(data, profile, options, restart * options.starts + min(start, options.starts - 1))
             if "run" in saved:
                 run.restore(saved.pop("run"))
             elif start == options.starts and chosen is not None:
@@ -112,13 +112,13 @@ def train(
         losses = [*losses, run.validation_loss()]
         if losses[-1] <= min(losses):
             best = run.state()
-    run = _Run(data, profile, options, losses.index(min(losses)))
+    run = Run(data, profile, options, losses.index(min(losses)))
     if best is not None:
         run.restore(best)
     return run.finish(tuple(losses))
 
 
-class _Run:
+class Run:
     """One restart: patterns, head, optimiser, random numbers, and how far it has come."""
 
     def __init__(self, data: TrainingData, profile: Profile, options: Options, restart: int) -> None:
@@ -153,6 +153,8 @@ class _Run:
 
     def rates(self, progress: float) -> tuple[float, float]:
         """Learning rates of patterns and head: one cycle per estimator, the second one half as high in front."""
+        if self.options.constant:
+            return self.options.front_rate, self.options.head_rate
         now, total = self.epoch + progress, self.options.epochs
         start, end = (0, self.first_exact) if self.epoch < self.first_exact else (self.first_exact, total)
         at = (now - start) / (end - start)
