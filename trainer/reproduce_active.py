@@ -38,9 +38,13 @@ def recipe(name: str, row: ActiveRow) -> Options:
     shared = Options(features=row.features, clicks=CLICKS_AIM * row.clicks, alpha=5e-5, shots=5)
     if row.features <= 6:  # few words, many poor valleys: many starts, and trained for decisions
         small = replace(shared, epochs=30, warm=0.27, polish=0.6, hidden=64, head_rate=5e-3, front_rate=2e-2)
+        small = (
+            replace(small, alpha=2e-4) if name == "mnist" else small
+        )  # dark objects: light is spent more freely on them
         return replace(small, starts=8) if row.features > 4 else replace(small, starts=5, restarts=2)
     if row.features <= EXACT_FEATURES_MAX:
-        return replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
+        exact = replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
+        return exact if name != "mnist" else replace(exact, epochs=50, starts=3, alpha=3e-4, polish=0.3)
     local = replace(shared, estimator="local", warm=0.4, head_rate=2e-3)
     return replace(local, epochs=32, hidden=256) if row.features <= 36 else replace(local, epochs=24, hidden=128)
 
