@@ -3,6 +3,7 @@
 # ruff: noqa: E402  (what follows needs torch)
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,16 @@ from pans.runtime.cli import main
 from pans.runtime.clicks import click_probability, object_transmission
 from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import load_profile
+from pans.trainer.detection import click_probability as torch_probability
+from pans.trainer.detection import sample_clicks
+from pans.trainer.estimators import cross_entropy, decision_loss
 from pans.trainer.evaluate import evaluate_exactly, light_of
 from pans.trainer.head_fit import fit_head_exactly, joint_distribution
 from pans.trainer.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks import load_task
 from pans.trainer.train import train
+from pans.trainer.training_data import encoder_input
 
 PROFILE = load_profile("oled-qcmos")
 SMALL = Options(features=4, alpha=1e-3, epochs=10, hidden=32, batch=64, front_rate=3e-2, head_rate=1e-2)
@@ -117,6 +122,78 @@ def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
     assert (seen[0].restart, seen[0].epoch) == (1, 3)  # the last whole epoch on disk is the one before
     assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
     assert resumed.validation_losses == whole.validation_losses
+
+
+def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_path):
+    options = Options(**(vars_of(SMALL) | {"epochs": 6, "starts": 3, "warm": 0.34, "polish": 0.5, "shots": 3}))
+    reports = []
+    whole = train(task, PROFILE, options, report=reports.append)
+    assert [(r.restart, r.epoch) for r in reports[:6]] == [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)]
+    assert [r.epoch for r in reports[6:]] == [3, 4, 5, 6]  # stage 2 once, from the best start
+    assert {r.stage for r in reports[6:8]} == {"exact"}
+    checkpoint = tmp_path / "state"
+    for stop in ((1, 2), (2, 5)):
+
+        def interrupt(report, stop=stop):
+            if (report.restart, report.epoch) == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            train(task, PROFILE, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=interrupt)
+    resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True)
+    assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
+    assert all(torch.equal(a, b) for a, b in zip(resumed.head.state_dict().values(), whole.head.state_dict().values()))
+
+
+def test_a_checkpoint_is_plain_arrays(task, tmp_path):
+    options = Options(**(vars_of(SMALL) | {"epochs": 1}))
+    train(task, PROFILE, options, checkpoint=tmp_path / "state")
+    with np.load(tmp_path / "state", allow_pickle=False) as arrays:
+        assert all(arrays[name].dtype != object for name in arrays.files)
+        tree = json.loads(arrays["tree"].tobytes())
+    assert tree["identity"]["features"] == "4"
+    assert os.listdir(tmp_path) == ["state"]  # nothing stays beside it
+
+
+@pytest.mark.parametrize(("encoder", "given"), [("coherent", 40.0), ("incoherent", 60.0)])
+def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given):
+    changed = {"encoder": encoder, "conserving": True, "input_photons": given, "alpha": 0.0, "dark": 0.01, "epochs": 15}
+    reports = []
+    trained = train(task, PROFILE, Options(**(vars_of(SMALL) | changed)), report=reports.append)
+    assert trained.quantised is None
+    assert trained.law.dark_per_exposure == 0.01
+    shown = encoder_input(task, task.train, PROFILE, trained.options)
+    arriving = shown.square().sum(dim=1).mean() if encoder == "coherent" else shown.sum(dim=1).mean()
+    assert float(arriving) == pytest.approx(given, rel=0.02)
+    assert reports[-1].photons <= given * 1.05
+    shown = encoder_input(task, task.test, PROFILE, trained.options)
+    with torch.no_grad():
+        p = sample_clicks(
+            torch_probability(trained.encoder(shown).double(), trained.law), torch.Generator().manual_seed(0)
+        )
+        right = (trained.head(p.float()).argmax(dim=1).numpy() == task.test.labels).mean()
+    assert right > 0.5  # by chance 0.25
+
+
+def test_pictures_can_be_given_back(task):
+    pictures = replace(task, target="image")
+    options = Options(**(vars_of(SMALL) | {"estimator": "local", "encoder": "coherent", "epochs": 8, "alpha": 0.0}))
+    reports = []
+    trained = train(pictures, PROFILE, options, report=reports.append)
+    assert reports[-1].loss < reports[0].loss
+    assert trained.head(torch.zeros(1, 4)).shape == (1, 36)
+
+
+def test_a_decision_loss_lowers_errors_at_the_cost_of_entropy():
+    scores = torch.tensor([[0.4, 0.5, -1.0]])
+    right, wrong = torch.tensor([1]), torch.tensor([0])
+    entropy, decided = decision_loss(0.0), decision_loss(1.0)
+    assert float(entropy(scores, right)) == pytest.approx(float(cross_entropy(scores, right)))
+    confident = 4 * scores  # the same decision, surer of it
+    assert float(decided(confident, right)) < float(decided(scores, right))
+    far = torch.tensor([[-20.0, 1.0, 0.0]])  # being utterly wrong costs cross-entropy without end, a decision only once
+    assert float(entropy(far, wrong)) > 20
+    assert float(decided(far, wrong)) < 0.4 * float(entropy(far, wrong))
 
 
 def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_path):

@@ -149,8 +149,8 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
         for name, way in (("ours", row["ours"]), ("the paper's recipe", row["paper"])):
             lines.append(
                 f"| {row['features']} | {row['goal']:.2f} | {name} | {'yes' if way['reached'] else 'no'} | {way['seconds']:.0f} "
-                f"| {way['epochs']} | {way['accuracy']:.2f} (best {way['best_accuracy']:.2f}) | {way['accuracy_all']:.2f} | {way['clicks']:.2f} "
-                f"| {way['photons']:.1f} | {way['illumination']:.0f} |"
+                f"| {way['epochs']} | {way['accuracy']:.2f} (best {way['best_accuracy']:.2f}) | {way['accuracy_all']:.2f} "
+                f"| {way['clicks']:.2f} | {way['photons']:.1f} | {way['illumination']:.0f} |"
             )
     for row in rows:
         ratio = row["paper"]["seconds"] / row["ours"]["seconds"]
