@@ -53,7 +53,7 @@ def bench_ingest(options: BenchOptions) -> list[Row]:
         else Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans"))
     )
     bundle, _ = load_bundle(path)
-    for shots, backend in ((1, "table"), (2, "auto"), (5, "auto"), (10, "auto")):
+    for shots, backend in ((1, "table"), (2, "auto"), (5, "auto"), (10, "auto"), (20, "auto")):
         if backend == "table" and bundle.table is None:
             backend = "auto"
         rows.append(_whole_row(bundle, shots, backend, options.quick))
