@@ -19,7 +19,7 @@ from pans.trainer.export import (
     head_onnx,
     reference_scores,
 )
-from pans.trainer.heads import EPSILON, MlpHead
+from pans.trainer.heads import EPSILON, ConvHead, MlpHead
 
 RNG = np.random.default_rng(0)
 
@@ -125,3 +125,14 @@ def test_a_wrong_fold_never_leaves_the_export(tmp_path, monkeypatch):
     with pytest.raises(PansError, match="differs from the trained model"):
         written(tmp_path / "small.pans", trained_head(6), np.full(6, 0.4), 6)
     assert not (tmp_path / "small.pans").exists()
+
+
+@pytest.mark.parametrize("d_f", [2, 5, 12, 20])
+def test_a_convolutional_head_is_exported_and_compared(d_f, tmp_path):
+    head = ConvHead(d_f, 8, 4, torch.Generator().manual_seed(0)).eval()
+    mean = RNG.uniform(0.1, 0.9, d_f)
+    mean[0] = 0.0  # a dead pattern stays at its constant value
+    done = written(tmp_path / "conv.pans", head, mean, d_f)
+    assert done.dead_patterns == (0,)
+    assert done.score_difference <= 1e-5
+    assert done.words_compared == (1 << d_f if d_f <= 12 else 10_000)

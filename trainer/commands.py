@@ -67,6 +67,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
+    parser.add_argument("--head", choices=("mlp", "conv"), default="mlp", help="digital back end (default mlp)")
     parser.add_argument("--batch", type=int, default=512, metavar="B", help="objects per step (default 512)")
     parser.add_argument(
         "--slope", type=float, default=1.0, metavar="S", help="slope annealing: light at the start times S"
@@ -137,7 +138,7 @@ def _options(args: argparse.Namespace) -> Options:
 
     estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = "features photons clicks epochs restarts starts warm polish shots seed hidden batch slope clamp dark"
+    same = "features photons clicks epochs restarts starts warm polish shots seed head hidden batch slope clamp dark"
     return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same.split()})
 
 

@@ -6,6 +6,7 @@ back and raises when a score or a decision of the file differs from the torch mo
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +28,8 @@ from pans.runtime.head_layers import read_layers
 from pans.runtime.int8_head import quantise_head
 from pans.runtime.profile import Profile
 
-from .heads import EPSILON, MlpHead
+from .conv_onnx import conv_nodes
+from .heads import EPSILON, ConvHead, MlpHead, PictureHead
 from .int8_onnx import int8_onnx
 from .tasks import Task
 from .train import Trained
@@ -68,24 +70,19 @@ def fold_normalisation(
     return weight * scale, folded_bias, tuple(int(i) for i in np.flatnonzero(dead))
 
 
-def head_onnx(head: MlpHead, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
+def head_onnx(head: MlpHead | ConvHead, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
     """Return the head as ONNX (float32 click means (n, d_f) -> scores (n, classes)) and the dropped patterns."""
 
-    def wide(parameter: torch.Tensor) -> F64:
-        return np.asarray(parameter.detach().double().numpy())
-
-    weight, bias, dead = fold_normalisation(
-        wide(head.hidden.weight), wide(head.hidden.bias), wide(head.norm.gain), wide(head.norm.bias), click_mean
-    )
-    layers = {"w1": weight, "b1": bias, "w2": wide(head.output.weight), "b2": wide(head.output.bias)}
-    initializers = [numpy_helper.from_array(value.astype(np.float32), name) for name, value in layers.items()]
-    nodes = [
-        helper.make_node("Gemm", ["clicks", "w1", "b1"], ["sums"], transB=1),
-        helper.make_node("Relu", ["sums"], ["hidden"]),
-        helper.make_node("Gemm", ["hidden", "w2", "b2"], ["scores"], transB=1),
-    ]
-    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["n", weight.shape[1]])
-    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", len(layers["b2"])])
+    gain, shift = (np.asarray(part.detach().double().numpy()) for part in (head.norm.gain, head.norm.bias))
+    if isinstance(head, ConvHead):
+        one = np.eye(len(click_mean))
+        scale, offset, dead = fold_normalisation(one, np.zeros(len(click_mean)), gain, shift, click_mean)
+        nodes, constants = conv_nodes(head, np.diag(scale), offset)
+    else:
+        nodes, constants, dead = _mlp_nodes(head, gain, shift, click_mean)
+    initializers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["n", len(click_mean)])
+    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", head.output.out_features])
     graph = helper.make_graph(nodes, "head", [source], [result], initializers)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="pans-runtime")
@@ -93,9 +90,25 @@ def head_onnx(head: MlpHead, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
     return bytes(model.SerializeToString()), dead
 
 
+def _mlp_nodes(
+    head: MlpHead, gain: F64, shift: F64, click_mean: F64
+) -> tuple[list[onnx.NodeProto], dict[str, NDArray[Any]], tuple[int, ...]]:
+    """Nodes, constants by name, dropped patterns: the normalisation is folded into the first layer."""
+    layers = (head.hidden.weight, head.hidden.bias, head.output.weight, head.output.bias)
+    w1, b1, w2, b2 = (np.asarray(layer.detach().double().numpy()) for layer in layers)
+    w1, b1, dead = fold_normalisation(w1, b1, gain, shift, click_mean)
+    constants = {name: value.astype(np.float32) for name, value in (("w1", w1), ("b1", b1), ("w2", w2), ("b2", b2))}
+    nodes = [
+        helper.make_node("Gemm", ["clicks", "w1", "b1"], ["sums"], transB=1),
+        helper.make_node("Relu", ["sums"], ["hidden"]),
+        helper.make_node("Gemm", ["hidden", "w2", "b2"], ["scores"], transB=1),
+    ]
+    return nodes, constants, dead
+
+
 def export(
     path: Path,
-    head: MlpHead,
+    head: MlpHead | ConvHead,
     click_mean: F64,
     pattern_levels: NDArray[np.uint16],
     photons_per_level: float,
@@ -141,6 +154,8 @@ def export_trained(
     """Write what `train` returned to `path`; `provenance` is added to what the task, profile and training say of themselves."""
     if trained.quantised is None:
         raise UsageError("a bundle holds projector patterns, a passive encoder has none", remedy="use --encoder active")
+    if isinstance(trained.head, PictureHead):
+        raise UsageError("a bundle decides among classes, it gives back no pictures")
     return export(
         path,
         trained.head,
@@ -163,7 +178,7 @@ def export_trained(
     )
 
 
-def compare(bundle: Bundle, head: MlpHead, click_mean: F64) -> tuple[int, float]:
+def compare(bundle: Bundle, head: MlpHead | ConvHead, click_mean: F64) -> tuple[int, float]:
     """Hold every back end of `bundle` against the torch head: all click words up to d_f = 12, else 10 000 random ones.
 
     Returns the number of words and the largest score difference over max(1, |score|). PansError where it exceeds 1e-5
@@ -193,14 +208,13 @@ def compare(bundle: Bundle, head: MlpHead, click_mean: F64) -> tuple[int, float]
     return len(means), worst
 
 
-def reference_scores(head: MlpHead, click_mean: F64, means: NDArray[np.float32]) -> F64:
+def reference_scores(head: MlpHead | ConvHead, click_mean: F64, means: NDArray[np.float32]) -> F64:
     """Scores of the trained head as it stands, not folded, in float64; dead patterns at their constant value."""
     variance = click_mean * (1 - click_mean)
     clicks = means.astype(np.float64)
     dead = variance < DEAD_VARIANCE
     clicks[:, dead] = click_mean[dead]
     with torch.no_grad():
-        wide = MlpHead(len(click_mean), head.hidden.out_features, head.output.out_features, torch.Generator()).double()
-        wide.load_state_dict(head.state_dict())
+        wide = copy.deepcopy(head).double()
         wide.norm.running_mean.copy_(torch.from_numpy(click_mean))
         return np.asarray(wide.eval()(torch.from_numpy(clicks)).numpy())

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .detection import click_words, sample_clicks, word_probabilities
 from .estimators import LossOf, cross_entropy
-from .heads import MlpHead
+from .heads import Heads
 
 SHOTS = (2, 3, 5, 8, 13, 21, 34, 55)  # numbers of shots that are fitted beside one, up to the largest wanted
 SHARE_OF_SHOTS = 0.3  # of the loss, for all numbers of shots beside one
@@ -35,7 +35,7 @@ def joint_distribution(p: Tensor, labels: Tensor, n_classes: int) -> Tensor:
 
 
 def fit_head_exactly(
-    head: MlpHead,
+    head: Heads,
     joint: Tensor,
     steps: int = STEPS,
     rate: float = RATE,
@@ -60,7 +60,7 @@ def fit_head_exactly(
 
 
 def fit_head_by_samples(
-    head: MlpHead,
+    head: Heads,
     p: Tensor,
     target: Tensor,
     loss_of: LossOf,
@@ -94,7 +94,7 @@ class _Shots:
         self.p, self.target, self.loss_of, self.random, self.batch = p, target, loss_of, random, batch
         self.numbers = [number for number in SHOTS if number <= shots] or [shots]
 
-    def loss(self, head: MlpHead) -> Tensor:
+    def loss(self, head: Heads) -> Tensor:
         """Return the mean loss of one batch."""
         which = torch.randint(len(self.p), (self.batch,), generator=self.random)
         shots = self.numbers[int(torch.randint(len(self.numbers), (1,), generator=self.random))]
@@ -104,7 +104,7 @@ class _Shots:
 
 
 def fit_head(
-    head: MlpHead,
+    head: Heads,
     p: Tensor,
     target: Tensor,
     loss_of: LossOf,

@@ -1,14 +1,24 @@
 """Heads: from clicks to scores, with batch normalisation right after the detection.
 
 Owns the digital back end in torch; never samples. A head takes click means (n, d_f) in [0, 1] and returns scores
-(n, classes); `words` gives the scores of all click words under the statistics of one batch.
+(n, classes), or pixels (n, height * width); `flipped` gives them for every word that differs in one click.
+
+- `MlpHead`: one hidden layer, the paper's (512 units).
+- `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
+- `PictureHead`: an image decoder, from clicks to a coarse picture and by transposed convolutions to the full one.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
+from .options import Options
+
+KERNEL = 15
+CHANNELS = (32, 64)
 MOMENTUM = 0.05
 EPSILON = 1e-5
 
@@ -43,11 +53,7 @@ class MlpHead(nn.Module):
         self.norm = ClickNorm(n_features)
         self.hidden = nn.Linear(n_features, n_hidden)
         self.output = nn.Linear(n_hidden, n_classes)
-        with torch.no_grad():  # torch's own initial range, from our generator
-            for layer in (self.hidden, self.output):
-                bound = layer.in_features**-0.5
-                for parameter in (layer.weight, layer.bias):
-                    parameter.copy_((torch.rand(parameter.shape, generator=generator) * 2 - 1) * bound)
+        _start(generator, self.hidden, self.output)
 
     def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
         """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
@@ -62,3 +68,93 @@ class MlpHead(nn.Module):
         changed = torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0))
         scores: Tensor = self.output(changed.relu_())
         return scores
+
+
+class ConvHead(nn.Module):
+    """Normalisation, two convolutions along the patterns that halve the length, one hidden layer, scores."""
+
+    def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        half = KERNEL // 2
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(before, after, KERNEL, stride=2, padding=half) for before, after in pairwise((1, *CHANNELS))
+        )
+        self.length = -(-n_features // 4)  # each convolution rounds half the length up
+        self.hidden = nn.Linear(CHANNELS[-1] * self.length, n_hidden)
+        self.output = nn.Linear(n_hidden, n_classes)
+        _start(generator, *self.convolutions, self.hidden, self.output)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
+        maps = self.norm(clicks, mean).unsqueeze(1)
+        for convolution in self.convolutions:
+            maps = torch.relu(convolution(maps))
+        scores: Tensor = self.output(torch.relu(self.hidden(maps.flatten(1))))
+        return scores
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return scores (n, d_f, classes): in column i click i is inverted."""
+        return _flipped_one_by_one(self, clicks, mean)
+
+
+class PictureHead(nn.Module):
+    """Normalisation, a hidden layer, a coarse picture of a quarter of the size, two transposed convolutions."""
+
+    def __init__(
+        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        self.image_shape = image_shape
+        self.coarse = (-(-image_shape[0] // 4), -(-image_shape[1] // 4))
+        self.hidden = nn.Linear(n_features, n_hidden)
+        self.spread = nn.Linear(n_hidden, CHANNELS[-1] * self.coarse[0] * self.coarse[1])
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(before, after, 4, stride=2, padding=1)
+            for before, after in pairwise((CHANNELS[-1], CHANNELS[0], 1))
+        )
+        _start(generator, self.hidden, self.spread, *self.up)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f)."""
+        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
+        maps = torch.relu(self.spread(hidden)).unflatten(1, (CHANNELS[-1], *self.coarse))
+        picture = self.up[1](torch.relu(self.up[0](maps)))[:, 0, : self.image_shape[0], : self.image_shape[1]]
+        pixels: Tensor = picture.flatten(1)
+        return pixels
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
+        return _flipped_one_by_one(self, clicks, mean)
+
+
+Heads = MlpHead | ConvHead | PictureHead
+
+
+def new_head(options: Options, n_outputs: int, image_shape: tuple[int, int], random: torch.Generator) -> Heads:
+    """Return the untrained head that `options` ask for; `image_shape` is that of the picture to give back."""
+    if options.head == "picture":
+        return PictureHead(options.features, options.hidden, image_shape, random)
+    kind = ConvHead if options.head == "conv" else MlpHead
+    return kind(options.features, options.hidden, n_outputs, random)
+
+
+def _flipped_one_by_one(head: nn.Module, clicks: Tensor, mean: Tensor) -> Tensor:
+    scores = []
+    for i in range(clicks.shape[1]):
+        other = clicks.clone()
+        other[:, i] = 1 - other[:, i]
+        scores.append(head(other, mean))
+    return torch.stack(scores, dim=1)
+
+
+def _start(generator: torch.Generator, *layers: nn.Module) -> None:
+    """Torch's own initial range, from our generator."""
+    with torch.no_grad():
+        for layer in layers:
+            weight = layer.weight
+            assert isinstance(weight, Tensor)
+            inputs = weight[:, 0].numel() if isinstance(layer, nn.ConvTranspose2d) else weight[0].numel()
+            for parameter in layer.parameters():
+                parameter.copy_((torch.rand(parameter.shape, generator=generator) * 2 - 1) * inputs**-0.5)

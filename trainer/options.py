@@ -14,6 +14,7 @@ from pans.runtime.profile import Profile
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
+HEADS = ("mlp", "conv", "picture")
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
 
 
@@ -31,6 +32,7 @@ class Options:
     restarts: int = 1
     starts: int = 1  # runs of stage 1 per restart; the best on validation goes on
     warm: float = 0.3  # part of the epochs that stage 1 takes, when another estimator follows it
+    head: str = "mlp"
     hidden: int = 512
     batch: int = 512
     front_rate: float = 1e-2
@@ -73,6 +75,8 @@ def check_options(options: Options, profile: Profile) -> None:
         )
     if options.encoder not in ENCODERS:
         raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
+    if options.head not in HEADS:
+        raise UsageError(f"--head is {options.head!r}, allowed: {', '.join(HEADS)}")
     if options.dark is not None and not 0 <= options.dark < math.inf:
         raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
     if options.estimator not in ESTIMATOR_NAMES:

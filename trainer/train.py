@@ -30,7 +30,7 @@ from .detection import click_probability, click_words, sample_clicks, word_proba
 from .encoders import ActiveIllumination, Encoder, new_encoder
 from .estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss, squared_error
 from .head_fit import fit_head
-from .heads import MlpHead
+from .heads import Heads, new_head
 from .options import EXACT_FEATURES_MAX, Options, check_options
 from .quantise import Quantised, exposure_us_of, quantise
 from .tasks import Task
@@ -64,7 +64,7 @@ class Trained:
     quantised: Quantised | None  # of active sensing; None of a passive encoder
     float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
     encoder: Encoder
-    head: MlpHead
+    head: Heads
     click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
     law: ClickLaw
     validation_loss: float
@@ -125,7 +125,7 @@ class Run:
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = torch.Generator().manual_seed(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
-        self.head = MlpHead(options.features, options.hidden, data.n_outputs, self.random)
+        self.head = new_head(options, data.n_outputs, data.image_shape, self.random)
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
         self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))

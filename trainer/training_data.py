@@ -30,6 +30,7 @@ class TrainingData:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
         self.shown = encoder_input(task, task.train, profile, options)
         self.labels = torch.from_numpy(task.train.labels)
+        self.image_shape = task.image_shape
         self.is_image = task.target == "image"
         if self.is_image:
             flat = task.train.images.reshape(len(task.train), -1)
