@@ -6,7 +6,8 @@ Owns the names, defaults and limits; never trains. `check_options` returns nothi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.profile import Profile
@@ -98,3 +99,13 @@ def check_options(options: Options, profile: Profile) -> None:
             f"{options.features} patterns, the pattern memory of {profile.name} holds {profile.projector.pattern_memory}",
             remedy=f"--features {profile.projector.pattern_memory}, or fewer",
         )
+
+
+def plain_options(options: Options) -> dict[str, Any]:
+    """Return the options as JSON can hold them."""
+    return {key: str(value) if value == math.inf else value for key, value in asdict(options).items()}
+
+
+def same_options(found: dict[str, Any], options: Options) -> bool:
+    """Return whether `found` (of `plain_options`, perhaps of an earlier version) means `options`: new ones at their defaults."""
+    return plain_options(Options(features=options.features)) | found == plain_options(options)

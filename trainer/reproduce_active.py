@@ -24,7 +24,7 @@ from pans.runtime.bundle import Bundle, load_bundle
 from pans.runtime.profile import Profile, load_profile
 
 from .evaluate import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
-from .options import EXACT_FEATURES_MAX, Options
+from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .paper_tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST_OBJECTS, SHOTS, ActiveRow
 from .tasks import Objects, Task, load_task
 
@@ -60,7 +60,7 @@ def finished_row(cache: Path, name: str, row: ActiveRow) -> dict[str, Any] | Non
     if not figures.is_file():
         return None
     found: dict[str, Any] = json.loads(figures.read_text())
-    return found if found["options"] == _plain(recipe(name, row)) else None
+    return found if same_options(found["options"], recipe(name, row)) else None
 
 
 def make_row(
@@ -73,7 +73,7 @@ def make_row(
     bundle_path, figures_path = row_files(cache, name, row.features)
     task, profile, options = load_task(name, data_dir), load_profile(PROFILE), recipe(name, row)
     checkpoint = bundle_path.with_suffix(".checkpoint")
-    clock = _Clock(figures_path.with_suffix(".seconds"))
+    clock = _Clock(figures_path.with_suffix(".seconds"), goes_on=checkpoint.is_file())
 
     def said(epoch: Any) -> None:
         clock.save()
@@ -84,12 +84,12 @@ def make_row(
             )
 
     trained = train(task, profile, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=said)
-    provenance = {"task_argument": name, "command": f"pans reproduce {name}", "options": _plain(options)}
+    provenance = {"task_argument": name, "command": f"pans reproduce {name}", "options": plain_options(options)}
     exported = export_trained(bundle_path, trained, task, profile, name=f"{name}-{row.features}", provenance=provenance)
     training = clock.save()
     figures = {
         "features": row.features,
-        "options": _plain(options),
+        "options": plain_options(options),
         "sha256": exported.sha256,
         "score_difference": exported.score_difference,
         "validation_losses": list(trained.validation_losses),
@@ -136,9 +136,9 @@ def rows_of(name: str) -> tuple[ActiveRow, ...]:
 class _Clock:
     """Seconds of this process's processor, added up over the runs that a row took."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, goes_on: bool) -> None:
         self.path = path
-        self.before = float(path.read_text()) if path.is_file() else 0.0
+        self.before = float(path.read_text()) if goes_on and path.is_file() else 0.0
         self.start = time.process_time()
 
     def save(self) -> float:
@@ -157,7 +157,3 @@ def _measured(bundle: Bundle, profile: Profile, objects: Objects, shots: int) ->
 
 def _first(objects: Objects, count: int) -> Objects:
     return Objects(objects.images[:count], objects.labels[:count])
-
-
-def _plain(options: Options) -> dict[str, Any]:
-    return {key: str(value) if value == float("inf") else value for key, value in asdict(options).items()}

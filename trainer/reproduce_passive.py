@@ -15,7 +15,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from pans.runtime.profile import load_profile
 
 from . import task_barcode, task_mmf
 from .detection import click_probability, click_words, sample_clicks, word_probabilities
-from .options import EXACT_FEATURES_MAX, Options
+from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .paper_tables import CLICKS_TOLERANCE, PASSIVE, PassiveRow
 from .ssim import ssim
 from .tasks import Objects, Task, load_task
@@ -84,15 +84,11 @@ def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float) -> dict[
     if not path.is_file():
         return None
     found: dict[str, Any] = json.loads(path.read_text())
-    return found if found["options"] == _plain(recipe(name, row, dark)) else None
+    return found if same_options(found["options"], recipe(name, row, dark)) else None
 
 
 def _path(cache: Path, name: str, row: PassiveRow, dark: float) -> Path:
     return cache / f"{name}-{row.features}-{dark:g}.json"
-
-
-def _plain(options: Options) -> dict[str, Any]:
-    return {key: str(value) if value == float("inf") else value for key, value in asdict(options).items()}
 
 
 def make_cell(
@@ -109,7 +105,7 @@ def make_cell(
         "task": name,
         "features": row.features,
         "dark": dark,
-        "options": _plain(options),
+        "options": plain_options(options),
         "cpu_seconds": time.process_time() - started,
         **measure(name, task, target, trained),
     }
