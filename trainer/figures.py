@@ -34,6 +34,8 @@ def _save(figure: Any, path: Path) -> None:
 
 def accuracy_against_photons(path: Path, name: str, done: list[tuple[ActiveRow, dict[str, Any]]]) -> None:
     """Draw the first 200 test images against clicks, as the paper does, and all of them against photons."""
+    from matplotlib.ticker import ScalarFormatter
+
     figure, (left, right) = _new()
     clicks = [figures["first_200"]["1"]["clicks_mean"] for _, figures in done]
     left.plot([row.clicks for row, _ in done], [row.simulation[0] for row, _ in done], "o--", label="paper, simulation")
@@ -53,6 +55,8 @@ def accuracy_against_photons(path: Path, name: str, done: list[tuple[ActiveRow, 
             xytext=(4, -10),
         )
     right.set(xlabel="photons per decision", xscale="log", title="all test images, at equal photons (numbers: d_f)")
+    right.xaxis.set_major_formatter(ScalarFormatter())
+    right.xaxis.set_minor_formatter(ScalarFormatter())
     for axis in (left, right):
         axis.grid(alpha=0.3)
         axis.legend()

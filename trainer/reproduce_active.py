@@ -30,12 +30,13 @@ from .tasks import Objects, Task, load_task
 
 PROFILE = "ideal"
 TRIALS = {FIRST_OBJECTS: 100, 10_000: 10}  # where the outcomes are too many to enumerate
-CLICKS_AIM = 1.02  # times the paper's: the first 200 may need a few percent more than the mean
+# Times the paper's clicks, which it counted on the first 200 test images: these of MNIST are 9 % darker than the training images.
+CLICKS_AIM = {"fashion-mnist": 1.02, "mnist": 1.085}
 
 
 def recipe(name: str, row: ActiveRow) -> Options:
     """Return what a row is trained with: one schedule for all rows of a size."""
-    shared = Options(features=row.features, clicks=CLICKS_AIM * row.clicks, alpha=5e-5, shots=5)
+    shared = Options(features=row.features, clicks=CLICKS_AIM[name] * row.clicks, alpha=5e-5, shots=5)
     if row.features <= 6:  # few words, many poor valleys: many starts, and trained for decisions
         small = replace(shared, epochs=30, warm=0.27, polish=0.6, hidden=64, head_rate=5e-3, front_rate=2e-2)
         small = (
@@ -44,7 +45,7 @@ def recipe(name: str, row: ActiveRow) -> Options:
         return replace(small, starts=8) if row.features > 4 else replace(small, starts=5, restarts=2)
     if row.features <= EXACT_FEATURES_MAX:
         exact = replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
-        return exact if name != "mnist" else replace(exact, epochs=50, starts=3, alpha=3e-4, polish=0.3)
+        return exact if name != "mnist" else replace(exact, epochs=40, starts=2, restarts=3, alpha=1e-4, polish=0.5)
     local = replace(shared, estimator="local", warm=0.4, head_rate=2e-3)
     return replace(local, epochs=32, hidden=256) if row.features <= 36 else replace(local, epochs=24, hidden=128)
 
