@@ -163,32 +163,95 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
 
 
 @njit(cache=True, nogil=True)
-def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Count the frames of an accepted block from state[FRAME] on; False when the rows are full before its end.
-
-    Arrays are taken out of their tuples once: inside the loop that would count references for every frame.
-    """
+def _block_facts(buffer, payload, state, marks):  # type: ignore[no-untyped-def]
+    """Of an accepted block: exposures, bytes per word, first exposure, its end tick, period, object and its truth (-1: unknown)."""
     count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
     word_bytes = load4(buffer, payload + _U(28)) >> _U(16)
     first = np.int64(load8(buffer, payload + _U(16)))
     tick, period = np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
-    relative, end_of_exposure = first - state[VISIT] * state[VISIT_EXPOSURES], state[EXPOSURE_TICKS]
-    window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
-    lanes, whole = windows.lanes, windows.whole
-    tallies, objects, truths = windows.tallies, marks.objects, marks.truths
-    labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
-    crc_zero, number, shots, n_lanes = tables.crc_zero[0], state[OBJECT], state[SHOTS], lanes.size
-    word_rows, word_crc = tables.word_rows, tables.word_crc
-    one_frame_each = word_rows.size > 0  # K = 1 and a table: a word is a window
-    n_features = counts.shape[1]
+    number = state[OBJECT]
+    known = number != _NO_OBJECT and marks.objects[number % MARK_SLOTS] == number
+    truth = np.int64(marks.truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
+    return count, word_bytes, first, tick + state[EXPOSURE_TICKS], period, number, truth
+
+
+@njit(cache=True, nogil=True)
+def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Count the frames of an accepted block from state[FRAME] on; False when the rows are full before its end."""
+    if tables.word_rows.size:
+        return _take_words(buffer, payload, state, marks, windows, tables, rows)
+    return _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_out)
+
+
+@njit(cache=True, nogil=True)
+def _take_words(buffer, payload, state, marks, windows, tables, rows):  # type: ignore[no-untyped-def]
+    """K = 1 with a table: every frame with light is a window, every word a row.
+
+    Arrays are taken out of their tuples once: inside the loop that would count references for every frame.
+    """
+    count, word_bytes, first, tick, period, number, truth = _block_facts(buffer, payload, state, marks)
+    window_at, seen, tallies = windows.window_at, windows.seen, windows.tallies
+    labels, probabilities, word_rows, word_crc = tables.labels, tables.probabilities, tables.word_rows, tables.word_crc
+    n_features, n_lanes, crc_zero = windows.counts.shape[1], windows.lanes.size, tables.crc_zero[0]
     top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
-    known = number != _NO_OBJECT and objects[number % MARK_SLOTS] == number
-    truth = np.int64(truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
-    n_rows, n_decisions = state[N_ROWS], state[N_DECISIONS]
+    relative, n_rows, done = first - state[VISIT] * state[VISIT_EXPOSURES], state[N_ROWS], count
     at = payload + _U(_BLOCK_HEADER) + _U(state[FRAME]) * word_bytes
-    window, held, done = -1, 0, int(count)  # `held` frames of `window` are in the lanes
     for i in range(state[FRAME], count):
-        here = int(window_at[relative + i])
+        here, clicks, index, crc = np.int64(window_at[relative + i]), 0, 0, crc_zero
+        for p in range(n_lanes):
+            byte = np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)
+            clicks += ONES[byte]
+            index += word_rows[p, byte]
+            crc ^= word_crc[p, byte]
+        at += word_bytes
+        if here < 0:
+            tallies[DARK_CLICKS] += clicks
+            tallies[DARK_EXPOSURES] += n_features
+            continue
+        seen[here, 0] = n_features
+        probability, label, flags = probabilities[index], np.int64(labels[index]), 0
+        if not probability > 0:
+            probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
+        end = tick + i * period
+        _fill(
+            rows[n_rows],
+            state[N_DECISIONS],
+            end,
+            first + i,
+            number,
+            here,
+            clicks,
+            label,
+            truth,
+            flags,
+            probability,
+            crc,
+        )
+        n_rows += 1
+        state[N_DECISIONS] += 1
+        state[N_ABSTAINED] += flags != 0
+        state[NEXT_WINDOW] = here + 1
+        if n_rows == rows.size:
+            done = i + 1
+            break
+    state[N_ROWS], state[FRAME] = n_rows, done
+    return done == count
+
+
+@njit(cache=True, nogil=True)
+def _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Any K and any back end: clicks gather in byte lanes until a window, a block or a lane is full."""
+    count, word_bytes, first, tick, period, number, truth = _block_facts(buffer, payload, state, marks)
+    window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
+    lanes, whole, tallies = windows.lanes, windows.whole, windows.tallies
+    labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
+    n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state[SHOTS]
+    top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
+    relative, n_rows, done = first - state[VISIT] * state[VISIT_EXPOSURES], state[N_ROWS], count
+    at = payload + _U(_BLOCK_HEADER) + _U(state[FRAME]) * word_bytes
+    window, held = np.int64(-1), 0  # `held` frames of `window` are in the lanes
+    for i in range(state[FRAME], count):
+        here = np.int64(window_at[relative + i])
         if here < 0:
             for p in range(n_lanes):
                 tallies[DARK_CLICKS] += ONES[np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)]
@@ -196,40 +259,6 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
             at += word_bytes
             continue
         window = here
-        if one_frame_each:
-            clicks, index, crc = 0, 0, crc_zero
-            for p in range(n_lanes):
-                byte = np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)
-                clicks += ONES[byte]
-                index += word_rows[p, byte]
-                crc ^= word_crc[p, byte]
-            at += word_bytes
-            seen[here, 0] = n_features
-            probability, label, flags = probabilities[index], np.int64(labels[index]), 0
-            if not probability > 0:
-                probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
-            _fill(
-                rows[n_rows],
-                n_decisions,
-                tick + i * period + end_of_exposure,
-                first + i,
-                number,
-                here,
-                clicks,
-                label,
-                truth,
-                flags,
-                probability,
-                crc,
-            )
-            n_rows += 1
-            n_decisions += 1
-            state[N_ABSTAINED] += flags != 0
-            state[NEXT_WINDOW] = here + 1
-            if n_rows == rows.size:
-                done = i + 1
-                break
-            continue
         for p in range(n_lanes):
             lane = SPREAD[buffer[at + _U(p)]]
             lanes[p] = lane if held == 0 else lanes[p] + lane
@@ -239,52 +268,58 @@ def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out
             if held == 255:
                 _spill(lanes, counts, seen, here, held)
                 held = 0
+            continue
+        _complete(lanes, counts, seen, here, held, whole)
+        held = 0
+        clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
+        flags, label, probability = 0, np.int64(_NO_LABEL), np.float32(0.0)
+        if seen[here, 0] != shots * n_features:
+            flags = _GAP
+        elif labels.size:
+            probability, label = probabilities[index], np.int64(labels[index])
+            if not probability > 0:
+                probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
         else:
-            if seen[here, 0] != 0:  # the window began in an earlier block
-                _spill(lanes, counts, seen, here, held)
-                _gather(counts, here, whole)
-            else:
-                _unpack(lanes, whole)
-                seen[here, 0] = held * n_features
-            held = 0
-            clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
-            flags, label, probability = 0, np.int64(_NO_LABEL), np.float32(0.0)
-            if seen[here, 0] != shots * n_features:
-                flags = _GAP
-            elif labels.size:
-                probability = probabilities[index]
-                if probability > 0:
-                    label = np.int64(labels[index])
-                else:
-                    flags = _NOT_FINITE
-            else:
-                for feature in range(n_features):
-                    counts_out[n_rows, feature] = whole[feature]
-            _fill(
-                rows[n_rows],
-                n_decisions,
-                tick + i * period + end_of_exposure,
-                first + i,
-                number,
-                here * shots,
-                clicks,
-                label,
-                truth,
-                flags,
-                probability,
-                crc,
-            )
-            n_rows += 1
-            n_decisions += 1
-            state[N_ABSTAINED] += flags != 0
-            state[NEXT_WINDOW] = here + 1
-            if n_rows == rows.size:
-                done = i + 1
-                break
+            for feature in range(n_features):
+                counts_out[n_rows, feature] = whole[feature]
+        end, shot = tick + i * period, here * shots
+        _fill(
+            rows[n_rows],
+            state[N_DECISIONS],
+            end,
+            first + i,
+            number,
+            shot,
+            clicks,
+            label,
+            truth,
+            flags,
+            probability,
+            crc,
+        )
+        n_rows += 1
+        state[N_DECISIONS] += 1
+        state[N_ABSTAINED] += flags != 0
+        state[NEXT_WINDOW] = here + 1
+        if n_rows == rows.size:
+            done = i + 1
+            break
     if held:
         _spill(lanes, counts, seen, window, held)
-    state[N_ROWS], state[N_DECISIONS], state[FRAME] = n_rows, n_decisions, done
+    state[N_ROWS], state[FRAME] = n_rows, done
     return done == count
+
+
+@njit(cache=True, nogil=True)
+def _complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
+    """The counts of a window whose last exposure has come, into `whole`."""
+    if seen[window, 0] != 0:  # it began in an earlier block
+        _spill(lanes, counts, seen, window, held)
+        for feature in range(whole.size):
+            whole[feature] = counts[window, feature]
+    else:
+        _unpack(lanes, whole)
+        seen[window, 0] = held * whole.size
 
 
 @njit(cache=True, nogil=True)
@@ -323,13 +358,6 @@ def _unpack(lanes, whole):  # type: ignore[no-untyped-def]
         for feature in range(8 * p, min(8 * p + 8, whole.size)):
             whole[feature] = np.int64(lane & _LANE)
             lane >>= _U(8)
-
-
-@njit(cache=True, nogil=True)
-def _gather(counts, window, whole):  # type: ignore[no-untyped-def]
-    """The counts of a window that several blocks held."""
-    for feature in range(whole.size):
-        whole[feature] = counts[window, feature]
 
 
 @njit(cache=True, nogil=True)
