@@ -1,6 +1,7 @@
 """Detection in torch: the click law, the damped straight-through gradient, exact enumeration."""
 
 # ruff: noqa: E402  (what follows needs torch)
+import mpmath
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.clicks import ClickLaw
 from pans.runtime.clicks import click_probability as reference_probability
 from pans.trainer.detection import (
+    ThermalLaw,
     click_probability,
     click_words,
     sample_clicks,
@@ -78,3 +80,27 @@ def test_words_are_products_in_the_order_of_the_table():
             chances = [p[row, i] if bit else 1 - p[row, i] for i, bit in enumerate(bits)]
             assert found[row, word] == pytest.approx(np.prod(chances), rel=1e-12)
     assert found.sum(axis=1) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("modes", [1.0, 2.0, 7.5])
+def test_thermal_law_is_the_sum_over_its_photon_numbers(modes):
+    light = torch.tensor([0.0, 1e-9, 0.3, 4.0], dtype=torch.float64)
+    found = click_probability(light, ThermalLaw(modes, dark_per_exposure=0.02)).numpy()
+    for value, p in zip(light.tolist(), found):
+        none = float(mpmath.power(1 + mpmath.mpf(value) / modes, -modes) * mpmath.exp(-0.02))
+        assert p == pytest.approx(1 - none, rel=1e-9)
+
+
+def test_thermal_light_of_many_modes_is_poisson_and_of_one_clicks_less():
+    light = torch.linspace(0.01, 5, 20, dtype=torch.float64)
+    poisson = click_probability(light, PLAIN)
+    assert torch.allclose(click_probability(light, ThermalLaw(1e9)), poisson, atol=1e-7)
+    assert bool((click_probability(light, ThermalLaw(1.0)) < poisson).all())
+
+
+def test_a_law_of_ones_own_is_differentiated():
+    light = torch.tensor([0.5, 2.0], dtype=torch.float32, requires_grad=True)
+    p = click_probability(light, lambda mu: mu / (1 + mu))
+    p.sum().backward()
+    assert p.dtype == torch.float32
+    assert light.grad.numpy() == pytest.approx(1 / (1 + light.detach().numpy()) ** 2, rel=1e-6)

@@ -10,6 +10,8 @@ a plain Poisson detector dL/dlambda = dL/da * slope * exp(-slope * lambda) (pape
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,11 +23,33 @@ _MU_MAX = 100.0  # beyond it no detector of a profile stays dark, and high power
 _NEGLIGIBLE = 1e-13  # chance of missing that many photoelectrons, below which the term is left out
 
 
-def click_probability(photoelectrons: Tensor, law: ClickLaw, slope: float = 1.0) -> Tensor:
+@dataclass(frozen=True, slots=True)
+class ThermalLaw:
+    """Thermal light in `modes` modes: P(no click) = (1 + lambda / modes)**-modes; dark counts are Poisson (Mandel and Wolf, 14.9).
+
+    One mode bunches most: at equal light it clicks least. Many modes are a plain Poisson detector.
+    """
+
+    modes: float = 1.0
+    dark_per_exposure: float = 0.0
+
+    def __call__(self, photoelectrons: Tensor) -> Tensor:
+        """Return p for photoelectrons in float64."""
+        log_dark = -self.modes * torch.log1p(photoelectrons / self.modes) - self.dark_per_exposure
+        return -torch.expm1(log_dark)
+
+
+Law = ClickLaw | Callable[[Tensor], Tensor]  # a user's own: photoelectrons (float64) -> p, differentiable
+
+
+def click_probability(photoelectrons: Tensor, law: Law, slope: float = 1.0) -> Tensor:
     """Return p (same shape, dtype of the input) for `photoelectrons` per exposure; `slope` scales the light only.
 
-    The same law as `pans.runtime.clicks.click_probability`, in float64 inside and differentiable.
+    For a `ClickLaw` the same as `pans.runtime.clicks.click_probability`, in float64 inside and differentiable; any other law
+    is called with the photoelectrons in float64.
     """
+    if not isinstance(law, ClickLaw):
+        return law(photoelectrons.double() * slope).to(photoelectrons.dtype)
     mu = (photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX)
     coefficients = survival_coefficients(law).tolist()
     kept = [c for k, c in enumerate(coefficients) if c * math.factorial(k) > _NEGLIGIBLE]

@@ -22,13 +22,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pans.runtime.clicks import ClickLaw, click_law
+from pans.runtime.clicks import click_law
 from pans.runtime.profile import Profile
 
+from . import schedule
 from .checkpoint import read_checkpoint, write_checkpoint
-from .detection import click_probability, click_words, sample_clicks, word_probabilities
+from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from .encoders import ActiveIllumination, Encoder, new_encoder
-from .estimators import ESTIMATORS, LossOf, cross_entropy, decision_loss, squared_error
+from .estimators import ESTIMATORS, cross_entropy, squared_error
 from .head_fit import fit_head
 from .heads import Heads, new_head
 from .options import EXACT_FEATURES_MAX, Options, check_options
@@ -66,7 +67,7 @@ class Trained:
     encoder: Encoder
     head: Heads
     click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
-    law: ClickLaw
+    law: Law
     validation_loss: float
     validation_losses: tuple[float, ...]  # of all restarts
     options: Options
@@ -80,8 +81,12 @@ def train(
     checkpoint: Path | None = None,
     resume: bool = False,
     report: Callable[[EpochReport], None] = lambda _: None,
+    law: Law | None = None,
 ) -> Trained:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
+
+    `law` replaces the click law of the profile (thermal light, or any differentiable function from photoelectrons to p); what
+    is exported is still judged by the profile's. A checkpoint does not know of it.
 
     After every epoch the state goes to `checkpoint`; with `resume` a run goes on from there. KeyboardInterrupt passes
     through, with the state of the last whole epoch on disk.
@@ -95,12 +100,13 @@ def train(
         started: list[float] = saved.pop("started", [])  # losses of the starts of this restart
         chosen: dict[str, Any] | None = saved.pop("chosen", None)  # and the best of them
         for start in range(len(started), options.starts + 1):  # the last round goes on with the best start
-            run = Run(data, profile, options, restart * options.starts + min(start, options.starts - 1))
+            seed = restart * options.starts + min(start, options.starts - 1)
+            run = Run(data, profile, options, seed, law)
             if "run" in saved:
                 run.restore(saved.pop("run"))
             elif start == options.starts and chosen is not None:
                 run.restore(chosen)
-            until = run.first_exact if start < options.starts else options.epochs
+            until = schedule.second_stage(options) if start < options.starts else options.epochs
             while run.epoch < until:
                 report(run.one_epoch())
                 if checkpoint:
@@ -112,7 +118,7 @@ def train(
         losses = [*losses, run.validation_loss()]
         if losses[-1] <= min(losses):
             best = run.state()
-    run = Run(data, profile, options, losses.index(min(losses)))
+    run = Run(data, profile, options, losses.index(min(losses)), law)
     if best is not None:
         run.restore(best)
     return run.finish(tuple(losses))
@@ -121,7 +127,10 @@ def train(
 class Run:
     """One restart: patterns, head, optimiser, random numbers, and how far it has come."""
 
-    def __init__(self, data: TrainingData, profile: Profile, options: Options, restart: int) -> None:
+    def __init__(
+        self, data: TrainingData, profile: Profile, options: Options, restart: int, law: Law | None = None
+    ) -> None:
+        self.own_law = law
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = torch.Generator().manual_seed(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
@@ -132,80 +141,33 @@ class Run:
         self.weights = {"photons": 1e-3, "clicks": 1e-3}  # of the budgets; they follow the excess
         self.optimiser = self._new_optimiser()
 
-    # ---- the schedule ----
-
-    @property
-    def first_exact(self) -> int:
-        """The epoch at which stage 2 begins; the end when there is no stage 2."""
-        return (
-            round(self.options.warm * self.options.epochs) if self.options.estimator != "ste" else self.options.epochs
-        )
-
-    @property
-    def first_whole(self) -> int:
-        """The epoch at which the patterns become whole levels."""
-        return round(0.75 * self.options.epochs)
-
-    def stage(self) -> str:
-        """Name of the stage of the present epoch."""
-        name = "ste" if self.epoch < self.first_exact else self.options.estimator
-        return f"{name}, levels" if self.epoch >= self.first_whole else name
-
-    def rates(self, progress: float) -> tuple[float, float]:
-        """Learning rates of patterns and head: one cycle per estimator, the second one half as high in front."""
-        if self.options.constant:
-            return self.options.front_rate, self.options.head_rate
-        now, total = self.epoch + progress, self.options.epochs
-        start, end = (0, self.first_exact) if self.epoch < self.first_exact else (self.first_exact, total)
-        at = (now - start) / (end - start)
-        cycle = (
-            0.5 - 0.5 * math.cos(math.pi * at / 0.25)
-            if at < 0.25
-            else 0.5 + 0.5 * math.cos(math.pi * (at - 0.25) / 0.75)
-        )
-        front = self.options.front_rate * (1.0 if self.epoch < self.first_exact else 0.5)
-        return front * cycle + 1e-6, self.options.head_rate * cycle + 1e-6
-
-    def loss_of(self, progress: float) -> LossOf:
-        """Cross-entropy, turning towards the rate of wrong decisions in the last part of the epochs; of images the squared error."""
-        if self.data.is_image:
-            return squared_error
-        part = self.options.polish * self.options.epochs
-        into = self.epoch + progress - (self.options.epochs - part)
-        return decision_loss(min(1.0, into / (0.3 * part)) if part > 0 and into > 0 else 0.0)
-
-    def floor(self, progress: float) -> float:
-        """Transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
-        now, total = self.epoch + progress, self.options.epochs
-        start = 0.3 * total if self.options.estimator == "ste" else self.first_exact
-        return self.data.floor * min(1.0, max(0.0, (now - start) / (0.4 * total)))
-
     # ---- the loop ----
 
     def one_epoch(self) -> EpochReport:
         """Pass once over the training objects, in random order."""
         options, data = self.options, self.data
-        if self.epoch == self.first_exact:
+        if self.epoch == schedule.second_stage(options):
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
-        if self.epoch == self.first_whole and isinstance(self.encoder, ActiveIllumination):
+        if self.epoch == schedule.whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
-        loss_of_clicks = ESTIMATORS["ste" if self.epoch < self.first_exact else options.estimator]
+        loss_of_clicks = ESTIMATORS[schedule.estimator(options, self.epoch)]
         law = self.law()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
         sums = torch.zeros(4, dtype=torch.float64)
         self.head.train()
         for i, batch in enumerate(batches):
-            progress = i / len(batches)
-            light = self.encoder(data.shown[batch], self.floor(progress))
+            now = self.epoch + i / len(batches)
+            light = self.encoder(data.shown[batch], schedule.black(options, now, data.floor))
             photons = light.sum(dim=1).mean()
-            slope, clamp = self._slope_and_clamp(progress)
+            slope, clamp = schedule.slope_and_clamp(options, now)
             p = click_probability(light.clamp(max=clamp), law, slope)
-            loss = loss_of_clicks(p, data.target[batch], self.head, self.loss_of(progress), self.random)
+            loss_of = schedule.loss_at(options, now, is_image=data.is_image)
+            loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
             clicks = p.sum(dim=1).mean()
             illumination = self.encoder.illumination()
             total = loss + self._penalty(clicks, photons, illumination)
-            for group, rate in zip(self.optimiser.param_groups, self.rates(progress)):
+            for group, rate in zip(self.optimiser.param_groups, schedule.rates(options, now)):
                 group["lr"] = rate
             self.optimiser.zero_grad()
             total.backward()
@@ -213,12 +175,14 @@ class Run:
             if isinstance(self.encoder, ActiveIllumination):
                 self.encoder.dim_to_top()
             sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
-        stage = self.stage()
+        stage = schedule.stage(options, self.epoch)
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
 
-    def law(self) -> ClickLaw:
+    def law(self) -> Law:
         """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
+        if self.own_law is not None:
+            return self.own_law
         exposure_us = self.profile.exposure.min_us
         if isinstance(self.encoder, ActiveIllumination):
             low, high = self.encoder.top_limits
@@ -238,12 +202,6 @@ class Run:
                 self.weights[name] = min(10.0, max(DUAL_WEIGHT_MIN, weight))
         return penalty
 
-    def _slope_and_clamp(self, progress: float) -> tuple[float, float]:
-        if self.epoch >= self.first_exact:
-            return 1.0, math.inf
-        done = min(1.0, (self.epoch + progress) / (0.3 * self.options.epochs))
-        return self.options.slope ** (1 - done), self.options.clamp if done < 1 else math.inf
-
     def _new_optimiser(self) -> torch.optim.Adam:
         groups = [{"params": self.encoder.parameters()}, {"params": self.head.parameters()}]
         return torch.optim.Adam(groups, lr=1e-3)
@@ -262,7 +220,8 @@ class Run:
     def validation_loss(self) -> float:
         """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples."""
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
-        target, loss_of = self.data.target[self.data.n_fit :], self.loss_of(0.0)
+        target = self.data.target[self.data.n_fit :]
+        loss_of = schedule.loss_at(self.options, self.epoch, is_image=self.data.is_image)
         random = torch.Generator().manual_seed(self.options.seed)
         self.head.eval()
         with torch.no_grad():
