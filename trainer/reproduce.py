@@ -19,6 +19,7 @@ from pans.runtime.errors import UsageError
 from .paper_tables import ACTIVE, PASSIVE
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
+NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -139,7 +140,10 @@ def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path
         beside.write_text(text, encoding="utf-8")
         os.replace(beside, folder / f"{name}.{suffix}")
     if draw is not None:
-        draw(folder / f"{name}.png")
+        try:
+            draw(folder / f"{name}.png")
+        except ModuleNotFoundError as error:
+            raise UsageError("the picture needs matplotlib, which is not installed", remedy=NEEDS_PLOT) from error
 
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
