@@ -52,6 +52,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--epochs", type=int, default=60, metavar="E", help="passes over the training objects (default 60)"
     )
+    parser.add_argument(
+        "--budget",
+        choices=("firm", "gentle"),
+        default="firm",
+        help="how strictly --photons and --clicks hold during training (default firm)",
+    )
     parser.add_argument("--restarts", type=int, default=1, metavar="R", help="trainings; the best on validation stays")
     parser.add_argument(
         "--starts", type=int, default=1, metavar="S", help="runs of the first stage per restart; the best goes on"
@@ -138,7 +144,7 @@ def _options(args: argparse.Namespace) -> Options:
 
     estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = "features photons clicks epochs restarts starts warm polish shots seed head hidden batch slope clamp dark"
+    same = "features photons clicks epochs restarts starts warm polish shots seed head hidden batch slope clamp dark budget"
     return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same.split()})
 
 

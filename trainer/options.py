@@ -16,6 +16,9 @@ EXACT_FEATURES_MAX = 12  # 4096 click words per object
 ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
 HEADS = ("mlp", "conv", "picture")
+# (gain on the relative excess, least weight). Firm: the full rate from an excess of 20 % on, and a weight never so small that it
+# would not be back in time; it meets tight budgets. Gentle: the light is spent first and given back late, which found better patterns.
+BUDGETS = {"firm": (5.0, 3e-4), "gentle": (1.0, 1e-5)}
 DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on the public sets
 
 
@@ -49,6 +52,7 @@ class Options:
         None  # of passive sensing: mean photoelectrons that reach the encoder; None: full scale is 1
     )
     dark: float | None = None  # dark photoelectrons per exposure in training, instead of the profile's
+    budget: str = "firm"  # how fast the weight of a budget follows its excess: a key of BUDGETS
     light: float = 1.0  # of the initial patterns, times the paper's
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
 
@@ -74,6 +78,8 @@ def check_options(options: Options, profile: Profile) -> None:
         raise UsageError(
             f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
         )
+    if options.budget not in BUDGETS:
+        raise UsageError(f"--budget is {options.budget!r}, allowed: {', '.join(BUDGETS)}")
     if options.encoder not in ENCODERS:
         raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
     if options.head not in HEADS:

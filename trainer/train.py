@@ -32,7 +32,7 @@ from .encoders import ActiveIllumination, Encoder, new_encoder
 from .estimators import ESTIMATORS, cross_entropy, squared_error
 from .head_fit import fit_head
 from .heads import Heads, new_head
-from .options import EXACT_FEATURES_MAX, Options, check_options
+from .options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
 from .quantise import Quantised, exposure_us_of, quantise
 from .tasks import Task
 from .training_data import CHUNK, TrainingData
@@ -41,8 +41,6 @@ VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
-DUAL_GAIN = 5.0  # the full rate from an excess of 20 % on
-DUAL_WEIGHT_MIN = 3e-4  # a weight that sank further while a budget was met would not be back in time
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,9 +195,10 @@ class Run:
             target = getattr(self.options, name)
             if target is not None:
                 penalty = penalty + self.weights[name] * measured
-                excess = min(1.0, max(-1.0, DUAL_GAIN * (float(measured.detach()) / target - 1)))
+                gain, weight_min = BUDGETS[self.options.budget]
+                excess = min(1.0, max(-1.0, gain * (float(measured.detach()) / target - 1)))
                 weight = self.weights[name] * math.exp(self.dual_rate * excess)
-                self.weights[name] = min(10.0, max(DUAL_WEIGHT_MIN, weight))
+                self.weights[name] = min(10.0, max(weight_min, weight))
         return penalty
 
     def _new_optimiser(self) -> torch.optim.Adam:
