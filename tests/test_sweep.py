@@ -1,0 +1,64 @@
+"""Sweeps: a study goes on where it was, two workers share it, another question is refused."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the train extra")
+optuna = pytest.importorskip("optuna", reason="needs the sweep extra")
+
+from pans.runtime.cli import main  # noqa: E402
+
+
+@pytest.fixture
+def words(tmp_path):
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 2, 60)
+    images = rng.integers(0, 50, (60, 3, 3), dtype=np.uint8)
+    images[labels == 1, :, 1] = 250
+    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
+    storage = str(tmp_path / "study.journal")
+    shared = ["sweep", str(tmp_path / "bars.npz"), "--features", "2", "--epochs", "2", "--hidden", "4"]
+    return [*shared, "--storage", storage, "--json"]
+
+
+def test_a_study_goes_on_and_refuses_another_question(words, capsys):
+    assert main([*words, "--trials", "2"]) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert (first["trials"], set(first["best"])) == (2, {"front_rate", "head_rate", "warm", "batch", "light", "alpha"})
+    assert main([*words, "--trials", "3"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["trials"] == 3
+    assert again["best_loss"] <= first["best_loss"]
+    assert main([*words, "--trials", "3"]) == 0  # nothing left to do
+    assert json.loads(capsys.readouterr().out)["trials"] == 3
+    assert main([*words, "--trials", "3", "--clicks", "1"]) == 2
+    assert "clicks None (now 1.0)" in capsys.readouterr().err
+
+
+def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words, capsys):
+    command = [
+        sys.executable,
+        "-P",  # not the working folder: its metadata may be old
+        "-c",
+        "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))",
+        *words,
+    ]
+    killed = subprocess.Popen(
+        [*command, "--trials", "1000"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    assert killed.stderr is not None
+    assert "trial" in killed.stderr.readline()  # one is finished and the next begun
+    killed.kill()
+    killed.wait()
+    killed.stderr.close()
+    other = subprocess.Popen([*command, "--trials", "6"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert main([*words, "--trials", "6"]) == 0
+    mine = json.loads(capsys.readouterr().out)
+    theirs = json.loads(other.communicate()[0])
+    assert other.returncode == 0
+    assert mine["trials"] >= 6
+    assert theirs["trials"] >= 6
