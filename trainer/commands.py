@@ -70,6 +70,13 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         metavar="P",
         help="last part of the epochs, trained for decisions (default 0)",
     )
+    parser.add_argument(
+        "--mix",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="share of the loss of 2 to K shots, for patterns too (default 0)",
+    )
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
@@ -144,7 +151,7 @@ def _options(args: argparse.Namespace) -> Options:
 
     estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = "features photons clicks epochs restarts starts warm polish shots seed head hidden batch slope clamp dark budget"
+    same = "features photons clicks epochs restarts starts warm polish mix shots seed head hidden batch slope clamp dark budget"
     return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same.split()})
 
 

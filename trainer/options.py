@@ -54,6 +54,7 @@ class Options:
     dark: float | None = None  # dark photoelectrons per exposure in training, instead of the profile's
     budget: str = "firm"  # how fast the weight of a budget follows its excess: a key of BUDGETS
     light: float = 1.0  # of the initial patterns, times the paper's
+    mix: float = 0.0  # share of the loss that several shots have in stage 2, for patterns that gain from them
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
 
 
@@ -66,7 +67,14 @@ def check_options(options: Options, profile: Profile) -> None:
         "starts": (1, 1000),
         "hidden": (1, 65536),
     }
-    limits |= {"batch": (2, 1 << 20), "seed": (0, 2**63 - 1), "shots": (1, 64), "warm": (0, 1), "polish": (0, 1)}
+    limits |= {
+        "batch": (2, 1 << 20),
+        "seed": (0, 2**63 - 1),
+        "shots": (1, 64),
+        "warm": (0, 1),
+        "polish": (0, 1),
+        "mix": (0, 1),
+    }
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:
             raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
@@ -94,6 +102,8 @@ def check_options(options: Options, profile: Profile) -> None:
             f"{EXACT_FEATURES_MAX} patterns",
             remedy="use --estimator local",
         )
+    if options.mix > 0 and options.shots < 2:
+        raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
     channels = profile.detector.channels
     if profile.mode == "parallel" and options.features > channels:
         raise PlanError(

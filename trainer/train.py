@@ -29,7 +29,7 @@ from . import schedule
 from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from .encoders import ActiveIllumination, Encoder, new_encoder
-from .estimators import ESTIMATORS, cross_entropy, squared_error
+from .estimators import ESTIMATORS, LossOf, cross_entropy, squared_error
 from .head_fit import fit_head
 from .heads import Heads, new_head
 from .options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
@@ -162,6 +162,8 @@ class Run:
             p = click_probability(light.clamp(max=clamp), law, slope)
             loss_of = schedule.loss_at(options, now, is_image=data.is_image)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
+            if options.mix > 0 and self.epoch >= schedule.second_stage(options):
+                loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
             clicks = p.sum(dim=1).mean()
             illumination = self.encoder.illumination()
             total = loss + self._penalty(clicks, photons, illumination)
@@ -176,6 +178,12 @@ class Run:
         stage = schedule.stage(options, self.epoch)
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
+
+    def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
+        """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
+        shots = 2 + int(torch.randint(self.options.shots - 1, (1,), generator=self.random))
+        clicks = torch.stack([sample_clicks(p, self.random) for _ in range(shots)]).mean(dim=0)
+        return loss_of(self.head(clicks, p.mean(dim=0)), target).mean()
 
     def law(self) -> Law:
         """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
