@@ -14,7 +14,8 @@ from .wire import ClickBlock, Frame, FrameBlock, Mark, MessageType
 
 SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31
-MAX_GAP_EXPOSURES = 1 << 18  # a number further ahead is nonsense: believing it would mean seconds of empty windows at once
+# a number further ahead is nonsense: believing it would mean seconds of empty windows at once
+MAX_GAP_EXPOSURES = 1 << 18
 
 
 class Gap(NamedTuple):
