@@ -48,8 +48,10 @@ def recipe(name: str, row: PassiveRow, dark: float, *, conserving: bool = False)
         features=row.features, alpha=0.0, clicks=CLICKS_AIM * row.clicks, encoder=encoder, dark=dark, head_rate=3e-3
     )
     if name == "barcode":
-        small = replace(shared, epochs=120, warm=0.2, starts=8, polish=0.4, batch=200, front_rate=3e-2)
-        return replace(small, hidden=64 if row.features <= 8 else 128)
+        small = replace(
+            shared, epochs=120, warm=0.5, light=30.0, batch=200, front_rate=3e-2, restarts=6
+        )  # ten bars: seconds each
+        return replace(small, hidden=64, polish=0.3) if row.features <= 8 else replace(small, hidden=128)
     if name == "mmf-mnist-image":
         return replace(shared, estimator="ste", epochs=30, hidden=512)
     exact = row.features <= EXACT_FEATURES_MAX
