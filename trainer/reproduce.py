@@ -91,6 +91,7 @@ def _facts(row: Any) -> dict[str, Any]:
 
 def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from . import reproduce_passive as passive
+    from .figures import measure_over_patterns
 
     table = PASSIVE[name]
     wanted = [row for row in table.rows if args.rows is None or row.features in args.rows]
@@ -109,7 +110,7 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     text = passive.markdown(name, done)
     result = {"rows": [figures for _, figures in done], "markdown": text}
     if args.out:
-        _write(args.out, name, result, None)
+        _write(args.out, name, result, lambda path: measure_over_patterns(path, name, done))
     return result
 
 
