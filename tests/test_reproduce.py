@@ -145,3 +145,38 @@ def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
     assert (tmp_path / "out" / "mnist.md").read_text().startswith("# mnist")
     assert main([*words, "--rows", "5"]) == 2
     assert "mnist has 4, 9, 16" in capsys.readouterr().err
+
+
+def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch):
+    row = PASSIVE["barcode"].rows[0]
+    small = dataclasses.replace(passive.recipe("barcode", row, 0.01), epochs=4, restarts=1, hidden=8)
+    monkeypatch.setattr(passive, "recipe", lambda *_: small)
+    said = []
+    found = passive.make_cell(tmp_path, "barcode", row, 0.01, None, said.append)
+    assert found["objects"] == 1024
+    assert 50 < found["value"] < 90  # two classes, equally likely; three patterns cannot tell all strings apart
+    assert found["error_objects"] == 0.0
+    assert 0 < found["clicks"] < 3
+    assert len(said) == 1
+    assert passive.finished_cell(tmp_path, "barcode", row, 0.01) == found
+    assert passive.finished_cell(tmp_path, "barcode", row, 0.03) is None
+    page = passive.markdown("barcode", [(row, found)])
+    assert "of 1 measured cells (of 18 in the paper)" in page
+
+
+def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    images = (rng.uniform(size=(80, 1, 1)) * np.ones((1, 12, 12)) * 255).astype(np.uint8)  # grey: one click says a lot
+    objects = Objects(images, np.zeros(80, np.int64))
+    task = Task("grey", ("a", "b"), objects, objects, "0" * 64, "", light="field", target="image")
+    row = PASSIVE["mmf-mnist-image"].rows[0]
+    small = dataclasses.replace(
+        passive.recipe("mmf-mnist-image", row, 0.01), epochs=60, batch=20, hidden=16, head_rate=1e-2, front_rate=3e-2
+    )
+    monkeypatch.setattr(passive, "recipe", lambda *_: small)
+    monkeypatch.setattr(passive, "load", lambda *_: task)
+    monkeypatch.setattr(passive, "load_task", lambda *_: task)
+    found = passive.make_cell(tmp_path, "mmf-mnist-image", row, 0.01, None, lambda _line: None)
+    assert 0.2 < found["value"] < 1.0
+    assert found["illumination"] == 0.0
+    assert found["photons"] > 0
