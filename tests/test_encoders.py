@@ -140,3 +140,18 @@ def test_new_encoder_is_what_the_options_ask_for():
         ("incoherent", IncoherentIntensity),
     ):
         assert type(new_encoder(9, profile, Options(features=2, encoder=name), random)) is kind
+
+
+def test_a_top_level_above_the_brightest_pixel_comes_down():
+    light = encoder(limits=(0.01, 100.0))
+    light.start_quantising(64)
+    brightest = float((light.weight.detach() ** 2).max())
+    with torch.no_grad():
+        light.log_top += 0.5
+    light.lower_top()
+    assert light.brightest() == pytest.approx(brightest, rel=1e-6)
+    assert float(light.patterns().max().detach()) == pytest.approx(brightest, rel=1e-6)
+    with torch.no_grad():
+        light.log_top -= 0.5  # brighter pixels than the top level are clipped: nothing to lower
+    light.lower_top()
+    assert light.brightest() == pytest.approx(brightest * np.exp(-0.5), rel=1e-6)

@@ -67,6 +67,13 @@ class ActiveIllumination(nn.Module):
             bound = math.sqrt(self.top_limits[1] if self.levels is None else float(self.top()))
             self.weight.clamp_(-bound, bound)
 
+    def lower_top(self) -> None:
+        """Bring the top level down to the brightest pixel where it stands above: a longer exposure than needed wastes time."""
+        with torch.no_grad():
+            brightest = (self.weight**2).max().clamp(*self.top_limits)
+            if self.levels is not None and brightest < self.top() * (1 - 0.5 / (self.levels - 1)):
+                self.log_top.copy_(brightest.log())
+
     def patterns(self) -> Tensor:
         """Return the patterns as they are shown, (d_f, pixels)."""
         light = self.weight**2

@@ -242,6 +242,7 @@ class Run:
         """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
         quantised, floats = None, None
         if isinstance(self.encoder, ActiveIllumination):
+            self.encoder.lower_top()
             with torch.no_grad():
                 floats = (self.encoder.weight**2).numpy().copy()
             quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
