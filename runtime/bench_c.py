@@ -17,13 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+# The freedom to reorder sums, which our kernel takes too. Its parts are named one by one: linked as a whole, -ffast-math makes the
+# library switch subnormal numbers off for the whole process that loads it.
 FREE_FLAGS = (
-    "-O3",
-    "-march=native",
-    "-ffast-math",
-    "-shared",
-    "-fPIC",
-)  # the freedom to reorder sums, which our kernel takes too
+    *FLAGS,
+    "-fassociative-math",
+    "-fno-signed-zeros",
+    "-fno-trapping-math",
+    "-ffinite-math-only",
+    "-fno-math-errno",
+    "-freciprocal-math",
+)
 SOURCE = r"""
 #include <stdint.h>
 #include <math.h>
@@ -142,7 +146,10 @@ def c_loops(flags: tuple[str, ...] = FLAGS) -> CLoops | str:
             return f"{compiler} failed: {done.stderr.strip().splitlines()[-1:]}: rows in C are left out"
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout.splitlines()[0]
         try:
-            return CLoops(ctypes.CDLL(str(library)), f"{version}, {' '.join(flags[:-2])}")
+            return CLoops(
+                ctypes.CDLL(str(library)),
+                f"{version}, {' '.join(flag for flag in flags if flag not in ('-shared', '-fPIC'))}",
+            )
         except OSError as error:
             return f"the compiled loops cannot be loaded ({error}): rows in C are left out"
 

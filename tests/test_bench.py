@@ -10,7 +10,7 @@ from heads import head_bundle, random_layers
 
 from pans.runtime import bench_decide, bench_ingest
 from pans.runtime.bench import BenchOptions, Spent, machine_facts, mark_pareto, percentiles_us, repeated, table_text
-from pans.runtime.bench_c import CLoops, c_loops
+from pans.runtime.bench_c import FREE_FLAGS, CLoops, c_loops
 from pans.runtime.bench_decide import _bundle_rows
 from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
@@ -127,3 +127,11 @@ def test_the_simulators_benchmark_counts_wrong_bits() -> None:
 
     row = bench_sim._click_row("both", bench_sim.EFFECTS["+ afterpulsing and crosstalk"], quick=True)
     assert (row["bits_wrong"], row["name"]) == (0, "SIMULATED clicks, both")
+
+
+def test_the_free_loops_leave_subnormal_numbers_alone():
+    loops = c_loops(FREE_FLAGS)
+    if not isinstance(loops, CLoops):
+        pytest.skip(loops)
+    assert np.float64(5e-324) * 1.0 > 0.0
+    assert np.array([1e-310]) / 2 > 0.0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from pathlib import Path
 from typing import Any
@@ -349,10 +350,12 @@ def test_a_refusal_that_is_not_reported_is_found(monkeypatch: pytest.MonkeyPatch
 
 def test_memory_that_grows_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     hoard: list[bytearray] = []
+    frames = itertools.count()
     original = session_module.HostSession.on_frame
 
     def hoarding(self: session_module.HostSession, frame: wire.Frame, now_ns: int) -> bool:
-        hoard.append(bytearray(b"x" * 8192))
+        if next(frames) % 32 == 0:  # pieces so large that each takes new pages, however much was freed before
+            hoard.append(bytearray(b"x" * (1 << 20)))
         return original(self, frame, now_ns)
 
     monkeypatch.setattr(session_module.HostSession, "on_frame", hoarding)
