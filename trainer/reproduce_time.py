@@ -159,6 +159,6 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     lines += [
         "",
         "Our schedules are tried from short to long; the first that ends at the goal counts. The paper's recipe may stop at any epoch.",
-        "",
+        "It runs without the paper's slope annealing and clamping, whose schedules the paper does not give.",
     ]
     return "\n".join([*lines, ""])
