@@ -246,15 +246,7 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         summary = summarise(result, illumination=bundle.illumination() * job.shots, expected_decisions=expected)
         result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
     page = job.out / "summary.md"
-    facts = {
-        "bundle": f"{bundle.name} ({job.bundle_path.name}, SHA-256 {bundle_sha256[:16]}…)",
-        "device": f"{job.device} (firmware {result.device.get('firmware', 'unknown')})",
-        "profile": f"{job.profile.name}: {job.profile.description}",
-        "decision back end": decider.name,
-        "recording": f"{recording} (decision log SHA-256 {result.decisions_sha256[:16]}…; `pans replay` recomputes it)",
-        "command": f"`{job.command}`",
-        "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
-    }
+    facts = _what_was_run(job, bundle.name, bundle_sha256, decider.name, recording, summary)
     write_markdown(page, summary, facts, result.tally, bundle.classes)
     payload = {
         **summary,
@@ -265,6 +257,21 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     }
     emit(args, payload, _closing_words(payload))
     return _exit_code(summary)
+
+
+def _what_was_run(
+    job: Job, name: str, bundle_sha256: str, backend: str, recording: Path, summary: dict[str, Any]
+) -> dict[str, str]:
+    """The lines below the summary page's figures."""
+    return {
+        "bundle": f"{name} ({job.bundle_path.name}, SHA-256 {bundle_sha256[:16]}…)",
+        "device": f"{job.device} (firmware {summary['device'].get('firmware', 'unknown')})",
+        "profile": f"{job.profile.name}: {job.profile.description}",
+        "decision back end": backend,
+        "recording": f"{recording} (decision log SHA-256 {summary['decisions_sha256'][:16]}…; `pans replay` recomputes it)",
+        "command": f"`{job.command}`",
+        "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
+    }
 
 
 def process_start_ns() -> int:
