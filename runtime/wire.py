@@ -216,7 +216,8 @@ class Mark(NamedTuple):
     """From `exposure_index` on, object `object_index` stands before the detector.
 
     `truth` is its class and `photons` the expected photoelectrons of one shot on it, where the instrument knows them (a simulator
-    does); else -1 and NaN.
+    does); else -1 and NaN. `half_exposures` is 0 for an object that stands still; for one that passes by, `exposure_index` and `tick` are
+    those at which it is centred, `photons` is what that exposure expects, and it has left the field this many exposures later.
     """
 
     seq: int
@@ -225,6 +226,7 @@ class Mark(NamedTuple):
     exposure_index: int
     tick: int
     photons: float
+    half_exposures: int = 0
 
 
 def fields(name: str, payload: bytes, *, exact: bool = True) -> tuple[Any, ...]:
@@ -383,11 +385,11 @@ def decode_frames(payload: bytes) -> FrameBlock:
 
 def encode_mark(mark: Mark, session: int) -> bytes:
     """Return an object mark."""
-    packed = STRUCTS["MARK"].pack(*mark[:3], 0, *mark[3:])
+    packed = STRUCTS["MARK"].pack(*mark[:3], mark.half_exposures, *mark[3:6])
     return encode_frame(MessageType.MARK, packed, session)
 
 
 def decode_mark(payload: bytes) -> Mark:
     """Decode MARK."""
-    seq, object_index, truth, _, *rest = fields("MARK", payload)
-    return Mark(seq, object_index, truth, *rest)
+    seq, object_index, truth, half_exposures, *rest = fields("MARK", payload)
+    return Mark(seq, object_index, truth, *rest, half_exposures)

@@ -109,6 +109,11 @@ GOLDEN = [
         "01000000 02000000 ffff 0000 0300000000000000 0400000000000000 0000c03f",
     ),
     (
+        wire.encode_mark(wire.Mark(1, 2, 3, 3, 4, 1.5, 0x0102), SESSION),
+        0x92,
+        "01000000 02000000 0300 0201 0300000000000000 0400000000000000 0000c03f",
+    ),
+    (
         wire.encode_command(1, wire.Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(2, 0, 3, np.array([1, 0, 123], np.uint16))), SESSION),
         0x03,
         "01000000 01 00 0000 0200 0000 00000000 03000000 0100 0000 7b00",
@@ -153,8 +158,8 @@ def test_messages_survive_the_round_trip() -> None:
     assert block[:6] == (2**32 - 1, 2, 2**63, 2**40, 5, 9)
     np.testing.assert_array_equal(block.patterns, patterns)
     np.testing.assert_array_equal(block.bits, bits)
-    mark = wire.Mark(1, 2, 9, 3, 4, 1.5)
-    assert wire.decode_mark(one(wire.encode_mark(mark, 1)).payload) == mark
+    for mark in (wire.Mark(1, 2, 9, 3, 4, 1.5), wire.Mark(1, 2, -1, 3, 4, 1.5, 0xFFFF)):
+        assert wire.decode_mark(one(wire.encode_mark(mark, 1)).payload) == mark
     status = wire.Status(3, 3, 0, 7, 8, 9)
     assert wire.decode_status(one(wire.encode_status(status, 1)).payload) == status
     slots = np.array([(10, 1, 0), (20, 0, 1)], wire.SLOT_DTYPE)
