@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pans.runtime.errors import UsageError
+from pans.runtime.incident import incident_field, incident_intensity
 from pans.trainer import task_mmf
-from pans.trainer.incident import incident_field, incident_intensity
 from pans.trainer.tasks import FIBRE_TASKS, load_task
 
 IMAGES = np.random.default_rng(1).integers(0, 256, (5, 28, 28), dtype=np.uint8)

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
+from pans.runtime.incident import Light
 
 from . import task_barcode, task_cells, task_fiber, task_nebula, task_tissue, task_transient
 from .draw import Labels
-from .incident import Light
 
 Draw = Callable[[int, str, int], tuple[NDArray[np.uint8], Labels]]
 

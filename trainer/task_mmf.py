@@ -4,9 +4,7 @@ Owns what the fibre does to an image; never reads MNIST (see tasks.py). The scen
 at the entrance; the fibre mixes the modes; a passive encoder sees the speckle at its end and must name the digit, or give
 back the image.
 
-The fibre is the one of the paper's release: 2-D Fourier transform, a fixed 28 x 28 mask of phases uniform in [0, 2 pi), inverse
-transform. It is linear and loses nothing (`scatter` with orthonormal transforms is unitary). The seed of the mask is the release's, 42,
-but which generator drew it is not known: OURS is numpy's RandomState(42), whose stream numpy has frozen for good. Masks of
+The fibre itself (`scatter`, `phase_mask`) is in `pans.runtime.incident`: the simulated instrument looks through the same one. Masks of
 other generators are statistically alike; figures move by about the spread over seeds.
 
 Two inputs for the encoder:
@@ -28,28 +26,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
+from pans.runtime.incident import FIBRE_SIDE_PX as SIDE_PX
+from pans.runtime.incident import MASK_SEED, phase_mask, scatter
 
-SIDE_PX = 28
-MASK_SEED = 42
 RELEASE_BATCH = 128
-AT_ONCE = 4096
-
-
-def phase_mask(seed: int = MASK_SEED) -> NDArray[np.float64]:
-    """Return the fibre's phases in radians, float64 (28, 28), uniform in [0, 2 pi)."""
-    return np.random.RandomState(seed).uniform(0, 2 * np.pi, (SIDE_PX, SIDE_PX))
-
-
-def scatter(images: NDArray[np.uint8], seed: int = MASK_SEED) -> NDArray[np.complex64]:
-    """Return the field at the end of the fibre, complex64 (n, 28, 28), of images uint8 (n, 28, 28); sum |E|^2 is kept."""
-    _check(images)
-    turn = np.exp(1j * phase_mask(seed))
-    out = np.empty(images.shape, np.complex64)
-    for start in range(0, len(images), AT_ONCE):
-        entrance = images[start : start + AT_ONCE] / 255.0
-        out[start : start + AT_ONCE] = np.fft.ifft2(np.fft.fft2(entrance) * turn)
-    return out
 
 
 def scattering_matrix(seed: int = MASK_SEED) -> NDArray[np.complex128]:
@@ -70,11 +50,3 @@ def release_intensity(
         part -= low
         part /= max(float(high - low), 1e-12)
     return intensity.astype(np.float32, copy=False)
-
-
-def _check(images: NDArray[np.uint8]) -> None:
-    if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1:] != (SIDE_PX, SIDE_PX):
-        raise UsageError(
-            f"images for the fibre are {images.dtype} {images.shape}",
-            remedy=f"allowed: uint8 (n, {SIDE_PX}, {SIDE_PX})",
-        )

@@ -12,9 +12,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pans.runtime.incident import incident_intensity
+
 from .brightness import total_intensity
 from .generators import GENERATORS, generate
-from .incident import incident_intensity
 from .tasks import load_task
 
 PER_CLASS = 8

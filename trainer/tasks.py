@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.incident import Light, Optics
 
 from .generators import GENERATORS, generate
 from .grey import read_grey
-from .incident import Light, Optics
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
 
 FILE_MAX_BYTES = 1 << 30

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from pans.runtime.clicks import object_transmission
+from pans.runtime.incident import incident_field, incident_intensity
 from pans.runtime.profile import Profile
 
-from .incident import incident_field, incident_intensity
 from .options import Options
 from .tasks import Objects, Task
 
