@@ -7,7 +7,7 @@ to a device. `build_plan` returns a `Plan` or raises PlanError. A plan repeats o
 - **pattern-major** (sequential, the paper's protocol): every pattern is displayed once and exposed `shots_per_object` times in a
   row, within a whole number of refresh periods of the projector; a cycle is one object.
 - **parallel**: all patterns shine at once, a slot exposes all channels (its pattern index is 0); a cycle is one object, its
-  frames are the shots. In flow, `shots_per_object` is the number of frames of a window.
+  frames are the shots. For objects that pass by, flow_plan.py lays out frames without end.
 
 Dark displays stand before the patterns, spread evenly; a cycle ends with light, so that no decision waits for a dark exposure.
 The device ends a block at the end of a cycle and where the spacing changes: the last block there may be a shorter one.
@@ -105,7 +105,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class _Ticks:
+class Ticks:
     """The times that all orders share, in whole ticks."""
 
     exposure: int
@@ -131,8 +131,8 @@ def build_plan(
     if order not in ORDERS:
         raise UsageError(f"order must be one of {', '.join(ORDERS)}, found {order!r}")
     _check_counts(shots_per_object, dark_slots_per_cycle)
-    _check_fit(profile, bundle)
-    ticks = _ticks(profile, exposure_us(profile, bundle))
+    check_fit(profile, bundle)
+    ticks = ticks_of(profile, exposure_us(profile, bundle))
     if profile.mode == "parallel":
         if order != "auto":
             raise PlanError(f"order must be auto in parallel mode, found {order}", remedy="leave --order out")
@@ -183,7 +183,7 @@ def _check_counts(shots: int, dark: int) -> None:
         raise PlanError(f"dark slots per cycle must be from 0 to {_MAX_SHOTS}, found {dark}")
 
 
-def _check_fit(profile: Profile, bundle: Bundle) -> None:
+def check_fit(profile: Profile, bundle: Bundle) -> None:
     projector, retrain = profile.projector, f"retrain or requantise: pans train --profile {profile.name}"
     if bundle.levels != projector.levels:
         raise PlanError(
@@ -214,7 +214,8 @@ def _check_fit(profile: Profile, bundle: Bundle) -> None:
         )
 
 
-def _ticks(profile: Profile, exposure: float) -> _Ticks:
+def ticks_of(profile: Profile, exposure: float) -> Ticks:
+    """Return the times of a plan with exposures of `exposure` us in whole ticks; PlanError beyond what the protocol counts."""
     per_us = profile.clock.tick_hz / 1e6
     exposure_ticks = max(1, round(exposure * per_us))
     spacing = exposure_ticks + _up(profile.exposure.readout_us * per_us)
@@ -226,7 +227,7 @@ def _ticks(profile: Profile, exposure: float) -> _Ticks:
             f"the protocol counts up to {_U32} ({longest_s:.4g} s)",
             remedy="use a slower clock.tick_hz or a shorter exposure",
         )
-    return _Ticks(exposure_ticks, spacing, refresh, profile.timing.decision_deadline_us * per_us / 4)
+    return Ticks(exposure_ticks, spacing, refresh, profile.timing.decision_deadline_us * per_us / 4)
 
 
 def _up(ticks: float) -> int:
@@ -234,16 +235,16 @@ def _up(ticks: float) -> int:
     return math.ceil(ticks * (1 - 1e-12))
 
 
-def _hold(shots: int, ticks: _Ticks) -> int:
+def _hold(shots: int, ticks: Ticks) -> int:
     """How long one display lasts in pattern-major order: enough whole refresh periods for all its exposures."""
     periods = max(1, _up(shots * ticks.spacing / ticks.refresh))
     return max(shots * ticks.spacing, _up(periods * ticks.refresh))
 
 
-def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) -> Plan:
+def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     patterns = _interleave(np.arange(n), dark)
     period = max(ticks.spacing, _up(ticks.refresh))
-    return _plan(
+    return lay_out(
         profile,
         n,
         patterns,
@@ -258,12 +259,12 @@ def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) 
     )
 
 
-def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) -> Plan:
+def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     _check_slots((n + dark) * shots, "order shot-major has one shot per cycle")
     displays = _interleave(np.arange(n), dark)
     hold = _hold(shots, ticks)
     offsets = np.arange(len(displays))[:, None] * hold + np.arange(shots)[None, :] * ticks.spacing
-    return _plan(
+    return lay_out(
         profile,
         n,
         np.repeat(displays, shots),
@@ -278,10 +279,10 @@ def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: _Tick
     )
 
 
-def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) -> Plan:
+def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     frames = _interleave(np.arange(shots), dark)
     word_bytes = -(-n // 8) + 8  # a word is rounded up, by less than 8 bytes
-    return _plan(
+    return lay_out(
         profile,
         n,
         np.where(frames == DARK_PATTERN, DARK_PATTERN, 0),
@@ -296,7 +297,7 @@ def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: _Ticks) ->
     )
 
 
-def _plan(
+def lay_out(
     profile: Profile,
     n_patterns: int,
     patterns: NDArray[np.int64],
@@ -308,8 +309,9 @@ def _plan(
     shots_per_cycle: int,
     cycles_per_object: int,
     block: int,
-    ticks: _Ticks,
+    ticks: Ticks,
 ) -> Plan:
+    """Return the plan of one cycle: `patterns`, `shots` and `offsets` int64 (slots,), the rest in ticks and exposures."""
     arrays = (
         offsets.astype(np.int64),
         patterns.astype(np.uint16),
@@ -344,7 +346,7 @@ def _check_slots(slots: int, remedy: str) -> None:
         raise PlanError(f"one cycle would have {slots} slots, allowed are {MAX_SLOTS}", remedy=remedy)
 
 
-def _block(slots: int, period: int, ticks: _Ticks, most: int) -> int:
+def _block(slots: int, period: int, ticks: Ticks, most: int) -> int:
     """Exposures per block: blocks of about equal size that last at most a quarter of the decision deadline."""
     return _even_blocks(slots, max(1, min(most, int(ticks.block // period))))
 
