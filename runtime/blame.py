@@ -1,0 +1,270 @@
+"""Who is to blame for late and missing work: evidence in, one named cause out, with the reason in plain words.
+
+Owns the judgement; evidence.py collects, timing.py counts, nobody acts on it. `judge` returns a `Verdict` and is a pure function.
+Every nanosecond between the end of the exposure and the decision is given to the cause that was seen there:
+
+    gc          a garbage collection held the interpreter
+    disk        a write of the recording did not return
+    inference   the decision back end computed
+    host        the loop or its reader waited for a processor, or slept beyond its timer (starved, stolen by the hypervisor, stopped)
+    link        the loop was awake and waiting for bytes, and nothing says that the device was late
+    device      ... and a message that says when it left shows that the link was open, or that the device held it back
+    decode      the loop's own work, none of the above (reading messages, the live view)
+
+The largest share is the cause. What separates link from device is in docs/TIMING.md: a click block says when it was exposed, never
+when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the verdict is `link`, not sure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from .evidence import DISK, GC, IDLE, INFERENCE, OVERSLEPT, Evidence, Facts, Span, Stamped
+
+NS_PER_MS = 1_000_000
+CAUSES = ("link", "device", "host", "gc", "disk", "inference", "decode")
+QUIET_NS = 50 * NS_PER_MS  # without late work: the incident is over, and the probes sent within it are back
+LONGEST_INCIDENT_NS = 1_000 * NS_PER_MS  # a run that is late all the time gets a verdict per second
+LEG_NS = 500_000  # a way that takes longer than this and half the delay is no ordinary one
+
+
+class Verdict(NamedTuple):
+    """The cause, how much of the delay it explains, whether the evidence settles it, and why in plain words."""
+
+    cause: str
+    share_ns: int
+    sure: bool
+    why: str
+    shares_ns: dict[str, int]
+
+
+def judge(facts: Facts) -> Verdict:
+    """Return who is to blame for the time from `facts.begin_ns` to `facts.end_ns`."""
+    shares = _shares(facts)
+    outside = shares.pop("outside")
+    source, sure, why = blame_outside(facts)
+    shares[source] = shares.get(source, 0) + outside
+    cause = max(CAUSES, key=lambda name: shares.get(name, 0))
+    share = shares.get(cause, 0)
+    if cause == source and outside == share:
+        return Verdict(cause, share, sure, why, shares)
+    total = max(facts.end_ns - facts.begin_ns, 1)
+    return Verdict(cause, share, 2 * share >= total, _words(cause, share, facts), shares)
+
+
+def _shares(facts: Facts) -> dict[str, int]:
+    """Return how many ns each cause on this side explains, and `outside`: awake, and no bytes."""
+    begin, end = facts.begin_ns, facts.end_ns
+    collecting = _clipped(facts.spans, GC, begin, end)
+    shares = {"gc": _length(collecting)}
+    for cause, kind in (("disk", DISK), ("inference", INFERENCE)):
+        spans = _clipped(facts.spans, kind, begin, end)
+        shares[cause] = _length(spans) - _shared(spans, collecting)
+    overslept = _clipped(facts.spans, OVERSLEPT, begin, end)
+    asleep = _length(overslept) - _shared(overslept, collecting)
+    starved = min(max(facts.run_delay_ns, asleep, facts.steal_ns), end - begin)
+    # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.
+    hidden = max(starved - asleep, 0)
+    for cause in sorted(("disk", "inference"), key=lambda name: -shares[name]):
+        taken = min(shares[cause], hidden)
+        shares[cause] -= taken
+        hidden -= taken
+    before = max(facts.arrival_ns - begin, 0)
+    busy = [span for span in facts.spans if span.kind != IDLE]
+    outside = max(before - _covered(busy, begin, facts.arrival_ns) - hidden, 0)
+    hidden = max(hidden - before, 0)
+    idle_after = _clipped(facts.spans, IDLE, facts.arrival_ns, end)
+    after = max(end - facts.arrival_ns, 0)
+    own = max(after - _covered(facts.spans, facts.arrival_ns, end) - hidden, 0)
+    return shares | {"host": starved, "outside": outside + _length(idle_after), "decode": own}
+
+
+def blame_outside(facts: Facts) -> tuple[str, bool, str]:
+    """Tell link from device for a silence that began when the exposure ended and lasted until the block came."""
+    begin, end = facts.begin_ns, facts.arrival_ns
+    delay = max(end - begin, 1)
+    long_ns = max(LEG_NS, delay // 2)
+    for message in facts.stamped:
+        held = message.left_ns - (message.left_ns if message.reached_ns is None else message.reached_ns)
+        if held > long_ns and message.left_ns > begin:
+            return "device", True, f"the device kept a clock probe for {_ms(held)} before it answered"
+    open_again = _latest_round_trip(facts.stamped, begin, end)
+    for message in facts.stamped:
+        way = message.arrival_ns - message.left_ns
+        if begin <= message.left_ns <= end and way > long_ns:
+            what = "a clock probe's answer" if message.sent_ns is not None else "a STATUS"
+            why = f"{what} left the device on time and was {_ms(way)} on the way, while the host waited for bytes"
+            return "link", True, why
+        if message.sent_ns is None or message.reached_ns is None:
+            continue
+        way = message.reached_ns - message.sent_ns
+        if (
+            open_again is None
+            and begin - delay <= message.sent_ns <= end
+            and way > max(LEG_NS, (end - message.sent_ns) // 2)
+        ):
+            why = f"a clock probe needed {_ms(way)} to reach the device, while the host was awake and waited for bytes"
+            return "link", True, why
+    if open_again is not None:
+        trip, overdue = open_again.arrival_ns - (open_again.sent_ns or 0), open_again.arrival_ns - begin
+        why = (
+            f"a clock probe went to the device and back in {_ms(trip)} while the block was already {_ms(overdue)} late, "
+            "so the link was open and the block had not been sent"
+        )
+        return "device", True, why
+    why = f"the host was awake and waited for bytes for {_ms(delay)}; no message that says when it left fell into this time"
+    return "link", False, why
+
+
+def _latest_round_trip(stamped: Iterable[Stamped], begin: int, end: int) -> Stamped | None:
+    """A probe that was sent after the block should have come, and was back well before it came."""
+    margin = max(LEG_NS, (end - begin) // 8)
+    inside = [
+        message
+        for message in stamped
+        if message.sent_ns is not None and message.sent_ns >= begin and message.arrival_ns <= end - margin
+    ]
+    return max(inside, key=lambda message: message.arrival_ns, default=None)
+
+
+def _words(cause: str, share: int, facts: Facts) -> str:
+    total = _ms(facts.end_ns - facts.begin_ns)
+    if cause == "host":
+        return (
+            f"the host did not run for {_ms(share)} of {total}: its threads waited {_ms(facts.run_delay_ns)} for a processor, "
+            f"{_ms(facts.steal_ns)} were stolen from the machine, {facts.switches} involuntary switches"
+        )
+    sentence = {
+        "gc": "a garbage collection held the interpreter",
+        "disk": "writing the recording did not return",
+        "inference": "the decision back end computed",
+        "decode": "the loop was busy with its own work, reading messages or drawing the view,",
+        "link": "the host was awake and waited for bytes",
+        "device": "the device had not sent the block",
+    }[cause]
+    return f"{sentence} for {_ms(share)} of {total}"
+
+
+def _ms(nanoseconds: int) -> str:
+    return f"{nanoseconds / NS_PER_MS:.2f} ms"
+
+
+# ---- spans ----
+
+
+def _clipped(spans: Iterable[Span], kind: str, begin: int, end: int) -> list[tuple[int, int]]:
+    cut = [(max(span.begin_ns, begin), min(span.end_ns, end)) for span in spans if span.kind == kind]
+    return [(first, last) for first, last in cut if last > first]
+
+
+def _length(pieces: Iterable[tuple[int, int]]) -> int:
+    return sum(last - first for first, last in pieces)
+
+
+def _shared(some: list[tuple[int, int]], others: list[tuple[int, int]]) -> int:
+    return sum(max(0, min(a[1], b[1]) - max(a[0], b[0])) for a in some for b in others)
+
+
+def _covered(spans: Iterable[Span], begin: int, end: int) -> int:
+    """How much of the time from `begin` to `end` any of `spans` covers; what overlaps counts once."""
+    covered, reached = 0, begin
+    for span in sorted(spans, key=lambda span: span.begin_ns):
+        first, last = max(span.begin_ns, reached), min(span.end_ns, end)
+        if last > first:
+            covered += last - first
+            reached = last
+    return covered
+
+
+# ---- incidents ----
+
+
+class LateWork(NamedTuple):
+    """One late decision, in host ns: exposure ended, bytes came, decided."""
+
+    number: int
+    begin_ns: int
+    arrival_ns: int
+    end_ns: int
+    uncertainty_ns: int
+
+
+@dataclass(slots=True)
+class Incidents:
+    """Late decisions in a row are one incident with one cause, judged from its worst decision once it is quiet again."""
+
+    evidence: Evidence
+    causes: dict[str, int] = field(default_factory=dict)  # late decisions by cause
+    missing: dict[str, int] = field(default_factory=dict)  # lost exposures by cause
+    _worst: LateWork | None = None
+    _first: LateWork | None = None
+    _last: LateWork | None = None
+    _decisions: int = 0
+
+    def late(self, work: LateWork) -> None:
+        """Take one late decision; the first of an incident reads the system's counters at once."""
+        if self._first is None or self._worst is None:
+            self._first = self._worst = work
+            self._decisions = 0
+            self.evidence.sample(work.end_ns)
+        if work.end_ns - work.begin_ns > self._worst.end_ns - self._worst.begin_ns:
+            self._worst = work
+        self._last = work
+        self._decisions += 1
+
+    @property
+    def open(self) -> bool:
+        """Whether late decisions wait for their verdict."""
+        return self._first is not None
+
+    def verdict(self, now_ns: int, *, final: bool = False) -> dict[str, Any] | None:
+        """Return the event that closes the incident under way, None while there is none or it is not over."""
+        first, worst, last = self._first, self._worst, self._last
+        if first is None or worst is None or last is None:
+            return None
+        if not final and now_ns - last.end_ns < QUIET_NS and now_ns - first.end_ns < LONGEST_INCIDENT_NS:
+            return None
+        self.evidence.sample(now_ns)
+        verdict = judge(self.evidence.facts(*worst[1:]))
+        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + self._decisions
+        self._first = self._worst = self._last = None
+        return {
+            "kind": "blame",
+            "what": "late",
+            "first_decision": first.number,
+            "last_decision": last.number,
+            "decisions": self._decisions,
+            "worst_us": (worst.end_ns - worst.begin_ns) / 1000,
+            "begin_ns": worst.begin_ns,
+            "end_ns": worst.end_ns,
+            **_told(verdict),
+        }
+
+    def lost(self, gap: dict[str, Any], since_ns: int, now_ns: int, damaged_frames: int) -> dict[str, Any]:
+        """Return the event that blames somebody for exposures that never came; `since_ns` is when the latest block before came."""
+        verdict = judge_gap(gap, self.evidence.facts(since_ns, now_ns, now_ns, 0), damaged_frames)
+        exposures = int(gap["exposures"])
+        self.missing[verdict.cause] = self.missing.get(verdict.cause, 0) + exposures
+        place = {"first_exposure": gap["first_exposure"], "exposures": exposures}
+        return {"kind": "blame", "what": "missing", **place, **_told(verdict)}
+
+
+def judge_gap(gap: dict[str, Any], facts: Facts, damaged_frames: int) -> Verdict:
+    """Return who is to blame for a gap: what the device dropped was held up by whoever did not take it, the rest got lost on the link."""
+    dropped = int(gap["dropped_by_device"])
+    if 2 * dropped < int(gap["exposures"]):
+        damage = f"{damaged_frames} damaged frames were thrown away" if damaged_frames else "not even damaged"
+        why = f"{gap['messages']} messages left the device and never came ({damage})"
+        return Verdict("link", 0, True, why, {})
+    held_up = judge(facts)
+    full = f"the device dropped {dropped} exposures because its buffer was full"
+    if held_up.share_ns < NS_PER_MS:
+        return Verdict("device", 0, False, f"{full}; nothing on this side held the stream up", held_up.shares_ns)
+    return held_up._replace(why=f"{full}; before that, {held_up.why}")
+
+
+def _told(verdict: Verdict) -> dict[str, Any]:
+    shares = {name: share // 1000 for name, share in verdict.shares_ns.items() if share >= 1000}
+    return {"cause": verdict.cause, "sure": verdict.sure, "why": verdict.why, "shares_us": shares}

@@ -1,0 +1,230 @@
+"""What was going on while work became late: spans of the loop's time, the scheduler's counters, messages that say when they left.
+
+Owns the collecting, in bounded memory: nothing here looks at a photon, and nothing is read from the system per block. Never judges
+(blame.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept: none of them
+alone can make anything late. In virtual time the machine is no witness and is not asked.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .plan import Plan
+
+NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
+SAMPLE_EVERY_NS = 100 * NS_PER_MS
+FLOOR_NS = 100 * NS_PER_US
+OVERSLEPT_NS = 500 * NS_PER_US  # a timer that fires later than this was not the timer's fault
+MAX_SPANS = 1024
+MAX_SAMPLES = 64
+MAX_STAMPED = 64
+
+GC, DISK, INFERENCE, IDLE, OVERSLEPT = "gc", "disk", "inference", "idle", "overslept"
+
+
+class Span(NamedTuple):
+    """What the loop did from `begin_ns` to `end_ns`: one of GC, DISK, INFERENCE, IDLE (awake, waiting for bytes), OVERSLEPT."""
+
+    kind: str
+    begin_ns: int
+    end_ns: int
+
+
+class Sample(NamedTuple):
+    """Counters of the system at `at_ns`; they only ever grow. `run_delays_ns`: of each watched thread, waiting for a processor."""
+
+    at_ns: int
+    run_delays_ns: tuple[int, ...]
+    steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
+    switches: int  # involuntary, of the loop's thread
+
+
+class Stamped(NamedTuple):
+    """A message that says when it left the device, in host time. A PONG also says when its PING was sent and came there."""
+
+    sent_ns: int | None
+    reached_ns: int | None
+    left_ns: int
+    arrival_ns: int
+
+
+class Facts(NamedTuple):
+    """What is known about late work: its exposure ended at `begin_ns`, its bytes came at `arrival_ns`, it was decided at `end_ns`."""
+
+    begin_ns: int
+    arrival_ns: int
+    end_ns: int
+    uncertainty_ns: int
+    spans: tuple[Span, ...]
+    run_delay_ns: int
+    steal_ns: int
+    switches: int
+    stamped: tuple[Stamped, ...]
+
+
+class Evidence:
+    """Collects while a run lasts; `open` and `close` around it. `now_ns` is the link's clock."""
+
+    def __init__(self, now_ns: Callable[[], int], deadline_ns: int, *, virtual: bool = False) -> None:
+        self.floor_ns = max(FLOOR_NS, deadline_ns // 16)
+        self._now, self._virtual = now_ns, virtual
+        self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
+        self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
+        self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
+        self._collecting_ns = 0
+        self._due_ns = 0
+        self._counters = _Counters([])
+
+    def open(self, threads: Iterable[int | None] = ()) -> None:
+        """Begin: watch garbage collections, the calling thread (the loop's) and `threads`, by native id."""
+        if self._virtual:
+            return
+        gc.callbacks.append(self._on_gc)
+        self.watch(threads)
+
+    def watch(self, threads: Iterable[int | None]) -> None:
+        """Watch the calling thread and `threads` from here on; a new link brings a new reader."""
+        if self._virtual:
+            return
+        import threading
+
+        self._counters.close()
+        self._counters = _Counters([threading.get_native_id(), *(thread for thread in threads if thread)])
+        self._samples.clear()
+        self.sample(self._now())
+
+    def close(self) -> None:
+        """End: leave the collector as it was found; idempotent."""
+        with suppress(ValueError):
+            gc.callbacks.remove(self._on_gc)
+        self._counters.close()
+
+    # -- what the loop tells -------------------------------------------------------------------------------------------
+
+    def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
+        """Note that the loop was busy with `kind`."""
+        if end_ns - begin_ns >= self.floor_ns:
+            self._spans.append(Span(kind, begin_ns, end_ns))
+
+    def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
+        """Note a wait for bytes of at most `asked_s`: what it took beyond that, no timer takes; the machine gave us no time."""
+        asked_ns = begin_ns + int(asked_s * NS_PER_S)
+        if end_ns - begin_ns >= self.floor_ns:
+            self._spans.append(Span(IDLE, begin_ns, min(end_ns, asked_ns)))
+        if end_ns - asked_ns >= OVERSLEPT_NS:
+            self._spans.append(Span(OVERSLEPT, asked_ns, end_ns))
+
+    def stamped(self, message: Stamped) -> None:
+        """Note a message that says when it left the device."""
+        self._stamped.append(message)
+
+    def sample(self, now_ns: int) -> None:
+        """Read the system's counters: some ten microseconds, so at most ten times per second, and when something is late."""
+        if not self._virtual:
+            self._samples.append(self._counters.read(now_ns))
+            self._due_ns = now_ns + SAMPLE_EVERY_NS
+
+    def sample_in_slack(self, now_ns: int) -> None:
+        """Read the counters if they are due; to be called when there is nothing else to do."""
+        if now_ns >= self._due_ns:
+            self.sample(now_ns)
+
+    # -- what is known -------------------------------------------------------------------------------------------------
+
+    def facts(self, begin_ns: int, arrival_ns: int, end_ns: int, uncertainty_ns: int) -> Facts:
+        """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
+        first, last = self._around(begin_ns, end_ns)
+        delays = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)]
+        return Facts(
+            begin_ns,
+            arrival_ns,
+            end_ns,
+            uncertainty_ns,
+            tuple(span for span in self._spans if span.end_ns > begin_ns and span.begin_ns < end_ns),
+            max(delays, default=0),
+            last.steal_ns - first.steal_ns,
+            last.switches - first.switches,
+            tuple(message for message in self._stamped if message.arrival_ns >= begin_ns and message.left_ns <= end_ns),
+        )
+
+    def _around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
+        """The latest sample before and the first one after; as near as there are."""
+        if not self._samples:
+            nothing = Sample(0, (), 0, 0)
+            return nothing, nothing
+        before = [sample for sample in self._samples if sample.at_ns <= begin_ns]
+        after = [sample for sample in self._samples if sample.at_ns >= end_ns]
+        return before[-1] if before else self._samples[0], after[0] if after else self._samples[-1]
+
+    def _on_gc(self, phase: str, info: dict[str, Any]) -> None:
+        if phase == "start":
+            self._collecting_ns = self._now()
+        elif self._collecting_ns:
+            self.worked(GC, self._collecting_ns, self._now())
+            self._collecting_ns = 0
+
+
+class _Counters:
+    """The scheduler's counters of some threads and the machine's stolen time; zeros where the system does not tell."""
+
+    def __init__(self, threads: list[int]) -> None:
+        self._files = [_open(f"/proc/self/task/{thread}/schedstat") for thread in threads]
+        self._stat = _open("/proc/stat") if threads else None
+        self._tick_ns = NS_PER_S // (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
+
+    def read(self, now_ns: int) -> Sample:
+        delays = tuple(_field(file, 1) for file in self._files)
+        return Sample(now_ns, delays, _field(self._stat, 8) * self._tick_ns, _involuntary_switches())
+
+    def close(self) -> None:
+        for file in (*self._files, self._stat):
+            if file is not None:
+                os.close(file)
+        self._files, self._stat = [], None
+
+
+def _open(path: str) -> int | None:
+    try:
+        return os.open(path, os.O_RDONLY)
+    except OSError:
+        return None
+
+
+def _field(file: int | None, index: int) -> int:
+    """Field `index` of a file's first line, which the kernel makes afresh for each read from its start."""
+    if file is None:
+        return 0
+    try:
+        return int(os.pread(file, 512, 0).partition(b"\n")[0].split()[index])
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _involuntary_switches() -> int:
+    if sys.platform != "linux":
+        return 0
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
+
+
+def longest_pause_ns(plan: Plan) -> int:
+    """Return the longest time between the ends of two blocks that follow each other, when everything is on time."""
+    offsets = plan.slot_offset_ticks.astype(np.int64)
+    ends, length = [], 0
+    for slot, offset in enumerate(offsets.tolist()):
+        length += 1
+        last = slot + 1 == len(offsets)
+        if last or length == plan.block_exposures or int(offsets[slot + 1]) - offset != plan.slot_period_ticks:
+            ends.append(offset)
+            length = 0
+    pauses = np.diff([*ends, ends[0] + plan.cycle_ticks])
+    return round(int(pauses.max()) * plan.tick_us * NS_PER_US)
