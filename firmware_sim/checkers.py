@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pans.runtime import wire
 from pans.runtime.core import NO_LABEL, Decision, Output
 from pans.runtime.ingest import Gap
-from pans.runtime.loop import LiveRun
+from pans.runtime.live_run import LiveRun
 from pans.runtime.plan import Plan
 from pans.runtime.record import DecisionFlag
 from pans.runtime.wire import DARK_PATTERN, ClickBlock, FrameBlock, Mark

@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle import Bundle, make_bundle
-from pans.runtime.core import Output
+from pans.runtime.core import Core, Output
 from pans.runtime.decide import make_decider
-from pans.runtime.loop import LiveRun, RunConfig, run_live
+from pans.runtime.live_run import LiveRun
+from pans.runtime.loop import Onlookers, RunConfig, run_live
 from pans.runtime.plan import Plan, build_plan
 from pans.runtime.profile import Profile, load_profile
 from pans.runtime.recovery import Recovery
@@ -128,18 +129,10 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
     per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
     config = RunConfig(shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9)
     started = time.perf_counter()
-    decider = make_decider(bundle, shots=SHOTS, backend="table")
-    result = run_live(
-        link,
-        profile,
-        bundle,
-        plan,
-        decider,
-        config,
-        watch=host.watch,
-        recovery=Recovery.of(link, "", 30.0),
-        prepared=host.start,
-    )
+    core = Core(plan, make_decider(bundle, shots=SHOTS, backend="table"), SHOTS, config.n_cycles)
+    recovery = Recovery.of(link, "", 30.0)
+    onlookers = Onlookers(host.watch, host.start)
+    result = run_live(link, profile, bundle, plan, core, config, recovery=recovery, onlookers=onlookers)
     checker.close()
     host.finish(result.ended)
     return GridResult(
@@ -188,13 +181,13 @@ class GridHost:
         """Listen to the run."""
         self._run = run
         self.checker.attach(run)
-        report = run._event
+        report = run.journal.event
 
         def tapped(event: dict[str, Any]) -> None:
             self.checker.on_event(run.connection.session.nonce, event)
             report(event)
 
-        run._event = tapped  # type: ignore[method-assign]
+        run.journal.event = tapped  # type: ignore[method-assign]
 
     def watch(self, run: LiveRun, output: Output) -> None:
         """After each block: now and then a gate, and a look at the memory."""
@@ -219,7 +212,7 @@ class GridHost:
         assert self._run is not None
         session = self._run.connection.session
         if session.settled and not self._run.link_lost:
-            self._run._note_refusals()
+            self._run.journal.refusals(self._run.connection)
             self.checker.settled(session.nonce, 1 << 32)
         if ended not in ("completed", "the link was lost within the last object"):
             self.checker.fail(f"the run did not complete: {ended}")

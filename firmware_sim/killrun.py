@@ -28,11 +28,12 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle import bundle_bytes
-from pans.runtime.core import Output
+from pans.runtime.core import Core, Output
 from pans.runtime.decide import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link import open_link
-from pans.runtime.loop import LiveRun, RunConfig, run_live
+from pans.runtime.live_run import LiveRun
+from pans.runtime.loop import Onlookers, RunConfig, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.verify import verify_file
 from pans.runtime.wire import DeviceState, StateReason
@@ -71,7 +72,7 @@ def lit_host(url: str) -> None:
     """A host that runs until somebody ends it."""
     profile, bundle, plan = grid_setup("sequential")
     config = RunConfig(deadline_us=1e9, lease_ms=LEASE_MS, realtime=False)
-    run_live(open_link(url), profile, bundle, plan, make_decider(bundle), config)
+    run_live(open_link(url), profile, bundle, plan, Core(plan, make_decider(bundle), 1, 0), config)
 
 
 def recording_host(path: str, acted: int, seed: int) -> None:
@@ -90,7 +91,8 @@ def recording_host(path: str, acted: int, seed: int) -> None:
 
     with Recorder(path, header, bundle=data) as recorder:
         config = RunConfig(deadline_us=1e9, lease_ms=1000, realtime=False)
-        run_live(link, profile, bundle, plan, make_decider(bundle), config, recorder, act)
+        core = Core(plan, make_decider(bundle), 1, 0)
+        run_live(link, profile, bundle, plan, core, config, recorder, onlookers=Onlookers(act))
 
 
 def _context() -> Any:

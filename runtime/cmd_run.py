@@ -201,9 +201,10 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     try:
         from .bundle import load_bundle
         from .container import read_file
+        from .core import Core
         from .decide import make_decider
         from .live import live_view
-        from .loop import RunConfig, run_live
+        from .loop import Onlookers, RunConfig, run_live
         from .plan import build_plan
         from .record import Recorder
         from .recovery import Recovery
@@ -227,7 +228,9 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
             job.deadline_us,
             job.profile.timing.lease_ms,
             job.realtime,
+            started_ns,
         )
+        core = Core(plan, decider, config.shots, config.n_cycles)
         job.out.mkdir(parents=True, exist_ok=True)
         recording = job.record or job.out / "run.pansrec"
         expected = n_objects * job.trials
@@ -242,7 +245,7 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
         title = f"{bundle.name} on {job.profile.name}"
         with live_view(title, bundle.classes, expected, link.simulated) as watch:
-            result = run_live(link, job.profile, bundle, plan, decider, config, recorder, watch, started_ns, recovery)
+            result = run_live(link, job.profile, bundle, plan, core, config, recorder, recovery, Onlookers(watch))
         summary = summarise(result, illumination=bundle.illumination() * job.shots, expected_decisions=expected)
         result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
     page = job.out / "summary.md"

@@ -118,9 +118,7 @@ class Connection:
 
     def synchronise(self) -> ClockModel:
         """Measure the device clock with a burst of probes and return the model; LinkError when none is answered."""
-        clock = self.clock
-        if clock is None:
-            raise LinkError("the clock cannot be measured before the handshake")
+        clock = self.known_clock()
         for _ in range(CLOCK_BURST):
             wanted = clock.n_probes + 1
             now_ns = self.link.now_ns()
@@ -130,6 +128,12 @@ class Connection:
         if clock.n_probes == 0:
             raise LinkError("the device answered no clock probe", remedy="check that its firmware answers PING")
         return clock
+
+    def known_clock(self) -> ClockModel:
+        """Return the clock model, which exists from the handshake on; LinkError before it."""
+        if self.clock is None:
+            raise LinkError("the device's clock is not known before the handshake")
+        return self.clock
 
     def detach(self) -> None:
         """Stop reading and leave the link as it is, for whoever opens it again."""
@@ -166,7 +170,7 @@ def plan_chunks(plan: Plan) -> list[PlanChunk]:
 def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
     """Raise DeviceError when what the device says of itself cannot carry out the plan."""
     limits = [
-        ("pattern memory (patterns)", bundle.n_features, int(facts["pattern_memory"])),
+        ("pattern memory (patterns)", bundle.n_shown, int(facts["pattern_memory"])),
         ("pixels of a pattern", bundle.n_pixels, int(facts["pattern_pixels"])),
         ("projector levels", bundle.levels, int(facts["levels"])),
         ("slot memory (slots)", plan.slots_per_cycle, int(facts["slot_memory"])),
@@ -177,6 +181,7 @@ def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
             raise DeviceError(
                 f"the device's {what}: {held}, needed {needed}", remedy="use a device or a bundle that fits"
             )
+    _check_optics(facts, bundle)
     if facts["mode"] != plan.mode:
         raise DeviceError(f"the device measures in {facts['mode']} mode, the profile says {plan.mode}")
     if int(facts["tick_hz"]) != tick_hz:
@@ -184,6 +189,20 @@ def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
             f"the device counts {facts['tick_hz']} ticks per second, the profile says {tick_hz}",
             remedy="give the profile of this device with --profile",
         )
+
+
+def _check_optics(facts: Any, bundle: Bundle) -> None:
+    """A device may say which passive optics it looks through (their fingerprint); it must then be the bundle's."""
+    held = facts.get("optics_sha256")
+    wanted = None if bundle.analyser is None else bundle.analyser.fingerprint
+    if (held is None and facts.get("simulated") is not True) or held == wanted:
+        return
+    has = "a projector and no passive optics" if held is None else f"passive optics {str(held)[:12]}"
+    needs = "a projector" if wanted is None else f"passive optics {wanted[:12]}"
+    raise DeviceError(
+        f"the device has {has}, {bundle.name} needs {needs}",
+        remedy="a simulated instrument gets the optics of a bundle by optics=BUNDLE.pans in its URL",
+    )
 
 
 def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:

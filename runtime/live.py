@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from .core import NO_LABEL, Decision, Output
-from .loop import LiveRun, Watcher
+from .live_run import LiveRun, Watcher
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -98,7 +98,9 @@ class _Panel:
 
 def name_of(label: int, classes: Sequence[str]) -> str:
     """Return the class name of a label, "abstained" for none."""
-    return "abstained" if label == NO_LABEL else classes[label]
+    if label == NO_LABEL:
+        return "abstained"
+    return classes[label] if classes else "picture"
 
 
 def _headline(run: LiveRun, expected: int) -> str:

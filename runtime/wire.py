@@ -391,5 +391,5 @@ def encode_mark(mark: Mark, session: int) -> bytes:
 
 def decode_mark(payload: bytes) -> Mark:
     """Decode MARK."""
-    seq, object_index, truth, half_exposures, *rest = fields("MARK", payload)
-    return Mark(seq, object_index, truth, *rest, half_exposures)
+    seq, object_index, truth, half_exposures, exposure_index, tick, photons = fields("MARK", payload)
+    return Mark(seq, object_index, truth, exposure_index, tick, photons, half_exposures)

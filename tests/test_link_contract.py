@@ -27,13 +27,16 @@ from pans.firmware_sim.serve import SimOptions, build_instrument
 from pans.firmware_sim.shell import open_port, serve
 from pans.runtime import link as link_module
 from pans.runtime import wire
+from pans.runtime.bundle import Bundle
 from pans.runtime.connection import Connection
+from pans.runtime.core import Core
 from pans.runtime.decide import make_decider
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link import Link, LinkReader, open_link
 from pans.runtime.link_serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link_usb import UsbLink, usb_target
-from pans.runtime.loop import RunConfig, run_live
+from pans.runtime.loop import Onlookers, RunConfig, run_live
+from pans.runtime.plan import Plan
 from pans.runtime.recovery import Recovery
 
 PATIENCE_S = 20.0
@@ -168,10 +171,14 @@ def test_when_the_instrument_vanishes_the_reader_ends_loudly(rigged: Rig) -> Non
     reader.stop()
 
 
+def one_shot_core(plan: Plan, bundle: Bundle, config: RunConfig) -> Core:
+    return Core(plan, make_decider(bundle), 1, config.n_cycles)
+
+
 def test_a_whole_run_decides(rigged: Rig) -> None:
     profile, bundle, plan = grid_setup("sequential")
     config = RunConfig(n_cycles=200, deadline_us=1e9, realtime=False)
-    result = run_live(rigged.link, profile, bundle, plan, make_decider(bundle), config)
+    result = run_live(rigged.link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
     assert (result.ended, result.tally.decisions, result.tally.abstained) == ("completed", 200, 0)
     assert result.stream["lost_exposures"] == 0
     assert result.device["simulated"] is True
@@ -196,7 +203,16 @@ def test_a_device_that_comes_back_is_found_again() -> None:
     recovery = Recovery(recovery.reopen, 10.0, plug)
     config = RunConfig(n_cycles=400, deadline_us=1e9, realtime=False)
     try:
-        result = run_live(made.link, profile, bundle, plan, make_decider(bundle), config, watch=pull, recovery=recovery)
+        result = run_live(
+            made.link,
+            profile,
+            bundle,
+            plan,
+            one_shot_core(plan, bundle, config),
+            config,
+            recovery=recovery,
+            onlookers=Onlookers(pull),
+        )
     finally:
         made.link.close()
     assert (result.ended, result.reconnects, result.link_lost) == ("completed", 1, False)
@@ -218,7 +234,16 @@ def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
 
     recovery = Recovery(absent, 5.0, made.link.pause)  # type: ignore[attr-defined]
     config = RunConfig(n_cycles=400, deadline_us=1e9)
-    result = run_live(made.link, profile, bundle, plan, make_decider(bundle), config, watch=pull, recovery=recovery)
+    result = run_live(
+        made.link,
+        profile,
+        bundle,
+        plan,
+        one_shot_core(plan, bundle, config),
+        config,
+        recovery=recovery,
+        onlookers=Onlookers(pull),
+    )
     assert result.link_lost
     assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"
 
@@ -419,7 +444,7 @@ def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypa
         link = open_link(f"pipe:{tmp_path}/lab")
         profile, bundle, plan = grid_setup("sequential")
         config = RunConfig(n_cycles=100, deadline_us=1e9, realtime=False)
-        result = run_live(link, profile, bundle, plan, make_decider(bundle), config)
+        result = run_live(link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
         assert (result.ended, result.tally.decisions) == ("completed", 100)
         link.close()
         with pytest.raises(LinkError, match="is closed"):

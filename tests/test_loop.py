@@ -13,6 +13,7 @@ from pans.firmware_sim.serve import open_sim
 from pans.runtime.bundle import Bundle, load_bundle, make_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.connection import plan_chunks, plan_from_chunks
+from pans.runtime.core import Core
 from pans.runtime.decide import make_decider
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link import Link
@@ -84,7 +85,9 @@ def run(
     if wrap is not None:
         link = wrap(link)
     config = RunConfig(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
-    return run_live(link, PROFILE, bundle, plan, make_decider(bundle, shots=shots), config)
+    return run_live(
+        link, PROFILE, bundle, plan, Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles), config
+    )
 
 
 @pytest.mark.parametrize("order", ["pattern-major", "shot-major"])
@@ -177,7 +180,7 @@ def test_a_device_of_another_kind_is_refused(bundle: Bundle, scene: Path) -> Non
     plan = build_plan(PROFILE, bundle, shots_per_object=1)
     link = open_sim(f"sim:dmd-spad?scene={scene}&pace=fast")
     with pytest.raises(DeviceError, match=r"projector levels: 2, needed 124"):
-        run_live(link, PROFILE, bundle, plan, make_decider(bundle), RunConfig(n_cycles=1))
+        run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunConfig(n_cycles=1))
 
 
 def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path) -> None:
