@@ -8,6 +8,7 @@ answers the golden vectors, or raises DamagedFileError.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .analyser import Analyser
 from .bundle_facts import LEVELS_MAX, Bundle, check_bundle, check_table_shape, frozen, golden_violation, row_index
 from .bundle_format import bundle_bytes, parse_bundle
 from .container import canonical_json, parse_json_object, read_file, replace_file
@@ -40,34 +42,39 @@ def make_bundle(
     *,
     name: str,
     task: str,
-    classes: Sequence[str],
+    classes: Sequence[str] = (),
     image_shape: tuple[int, int],
-    levels: int,
-    pattern_levels: ArrayLike,
-    photons_per_level: float,
+    levels: int = 0,
+    pattern_levels: ArrayLike | None = None,
+    photons_per_level: float = 0.0,
     head_onnx: bytes | None = None,
     table: ArrayLike | None = None,
     provenance: Mapping[str, Any],
-    encoder: str = "active",
     int8_head: Int8Head | None = None,
     int8_onnx: bytes | None = None,
+    analyser: Analyser | None = None,
+    picture_shape: tuple[int, int] | None = None,
 ) -> Bundle:
-    """Return a checked bundle with golden vectors, and with a table made from the head where d_f <= 12.
+    """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where d_f <= 12.
 
-    `pattern_levels` is (d_f, pixels) of any integer dtype, `table` (2**d_f, classes) floats; one of head and table must
-    be given, and where both are they must agree. UsageError says what does not fit, DamagedFileError what is wrong
-    with the head.
+    An active sensor has `levels`, `pattern_levels` and `photons_per_level`, a passive one its `analyser` instead; a head decides among
+    `classes`, or gives back a picture of `picture_shape`. `pattern_levels` is (d_f, pixels) of any integer dtype, `table`
+    (2**d_f, classes) floats; one of head and table must be given, and where both are they must agree. UsageError says what does
+    not fit, DamagedFileError what is wrong with the head.
     """
     try:
-        quantised = _as_levels(pattern_levels, levels)
+        quantised = _as_levels(pattern_levels, levels) if analyser is None else _no_levels(pattern_levels, analyser)
+        n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
             given = None if table is None else np.array(table, dtype=np.float32)
-        means, scores, given = _evaluate_back_end(head_onnx, given, len(quantised), len(classes))
+        means, scores, given = _evaluate_back_end(
+            head_onnx, given, len(quantised), n_outputs, decides=picture_shape is None
+        )
         bundle = Bundle(
             name=name,
             task=task,
             classes=tuple(classes),
-            encoder=encoder,
+            encoder="active" if analyser is None else analyser.kind,
             image_shape=(int(image_shape[0]), int(image_shape[1])),
             levels=int(levels),
             pattern_levels=frozen(quantised),
@@ -79,6 +86,8 @@ def make_bundle(
             provenance=parse_json_object(canonical_json(dict(provenance)), "provenance"),
             int8_head=int8_head,
             int8_onnx=None if int8_onnx is None else bytes(int8_onnx),
+            analyser=analyser,
+            picture_shape=picture_shape,
         )
         check_bundle(bundle)
     except (ValueError, TypeError) as error:
@@ -92,7 +101,13 @@ def word_means(words: ArrayLike, n_features: int) -> NDArray[np.float32]:
     return (bits & 1).astype(np.float32)
 
 
-def _as_levels(pattern_levels: ArrayLike, levels: int) -> NDArray[np.uint16]:
+def _no_levels(pattern_levels: ArrayLike | None, analyser: Analyser) -> NDArray[np.uint16]:
+    if pattern_levels is not None:
+        raise ValueError("pattern_levels beside an analyser: a passive sensor shows nothing")
+    return np.zeros((len(analyser.matrix), 0), np.uint16)
+
+
+def _as_levels(pattern_levels: ArrayLike | None, levels: int) -> NDArray[np.uint16]:
     values = np.asarray(pattern_levels)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.integer) or values.size == 0:
         raise ValueError(
@@ -105,19 +120,19 @@ def _as_levels(pattern_levels: ArrayLike, levels: int) -> NDArray[np.uint16]:
 
 
 def _evaluate_back_end(
-    head_onnx: bytes | None, table: NDArray[np.float32] | None, n_features: int, n_classes: int
+    head_onnx: bytes | None, table: NDArray[np.float32] | None, n_features: int, n_outputs: int, *, decides: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
     """Return (golden means, golden scores, table or None); the head answers where there is one, else the table."""
     if table is not None:
-        check_table_shape(table.shape, n_features, n_classes)
+        check_table_shape(table.shape, n_features, n_outputs)
     if head_onnx is None:
         if table is None:
             raise ValueError("neither a head nor a table was given, allowed: either or both")
         means = _golden_words(n_features)
         return means, table[row_index(means)], table
-    head = open_head(head_onnx, n_features, n_classes, "head")
+    head = open_head(head_onnx, n_features, n_outputs, "head")
     means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
-    if table is None and n_features <= TABLE_BUILD_FEATURES_MAX:
+    if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX:
         table = head.scores(word_means(np.arange(1 << n_features), n_features))
     elif table is not None:
         _demand_agreement(head, table, n_features)

@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .analyser import Analyser, check_analyser
 from .head import HEAD_MAX_BYTES
 from .int8_head import STEP_MAX, WEIGHT_MAX, Int8Head
 
-ENCODERS = ("active",)
+ENCODERS = ("active", "coherent", "incoherent")  # the last two are passive: nothing is shown
 FEATURES_MAX = 4096
 PIXELS_MAX = 1 << 22
 LEVELS_MAX = 65536
 CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
+OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head gives back
 TEXT_MAX_CHARACTERS = 200
 TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
@@ -36,34 +38,46 @@ class Bundle:
 
     name: str
     task: str
-    classes: tuple[str, ...]
+    classes: tuple[str, ...]  # empty where a picture is given back
     encoder: str
     image_shape: tuple[int, int]
-    levels: int
-    pattern_levels: NDArray[np.uint16]  # (d_f, pixels), each below `levels`
-    photons_per_level: float  # photoelectrons per exposure, per level, per unit transmission
-    head_onnx: bytes | None  # float32 (n, d_f) click means in [0, 1] -> float32 (n, classes) scores
+    levels: int  # 0 of a passive sensor
+    pattern_levels: NDArray[np.uint16]  # (d_f, pixels), each below `levels`; (d_f, 0) of a passive sensor
+    photons_per_level: float  # photoelectrons per exposure, per level, per unit transmission; 0.0 of a passive sensor
+    head_onnx: bytes | None  # float32 (n, d_f) click means in [0, 1] -> float32 (n, outputs) scores or pixels
     table: NDArray[np.float32] | None  # (2**d_f, classes); bit i of the row index is the click of pattern i
     golden_means: NDArray[np.float32]  # (g, d_f)
-    golden_scores: NDArray[np.float32]  # (g, classes)
+    golden_scores: NDArray[np.float32]  # (g, outputs)
     provenance: Mapping[str, Any]
     int8_head: Int8Head | None = None  # the head in integers, for our kernels
     int8_onnx: bytes | None = None  # the same as a quantised ONNX model
+    analyser: Analyser | None = None  # the optics of a passive sensor
+    picture_shape: tuple[int, int] | None = None  # height and width of the picture that the head gives back
 
     @property
     def n_features(self) -> int:
-        """Number of patterns, d_f."""
+        """Number of patterns, or of detectors behind passive optics: d_f."""
         return int(self.pattern_levels.shape[0])
 
     @property
     def n_pixels(self) -> int:
-        """Number of pixels of one pattern."""
+        """Number of pixels of one pattern; 0 where nothing is shown."""
         return int(self.pattern_levels.shape[1])
 
     @property
     def n_classes(self) -> int:
-        """Number of classes."""
+        """Number of classes; 0 where a picture is given back."""
         return len(self.classes)
+
+    @property
+    def n_outputs(self) -> int:
+        """Numbers that the head gives for one object: scores of classes, or pixels of the picture."""
+        return self.n_classes if self.picture_shape is None else math.prod(self.picture_shape)
+
+    @property
+    def n_shown(self) -> int:
+        """Number of patterns that the instrument must hold: none in passive sensing."""
+        return 0 if self.analyser is not None else self.n_features
 
     def patterns(self) -> NDArray[np.float64]:
         """Return the patterns (d_f, pixels), float64, in photoelectrons per exposure per unit transmission."""
@@ -74,10 +88,11 @@ class Bundle:
         return int(self.pattern_levels.sum(dtype=np.uint64)) * self.photons_per_level
 
 
-def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32]) -> str:
-    """Return what differs between scores (g, classes) and the golden ones, or "" if nothing does.
+def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:
+    """Return what differs between scores (g, outputs) and the golden ones, or "" if nothing does.
 
-    Scores agree within 1e-5 * max(1, |score|), and the decision is the same wherever the golden margin exceeds that.
+    Scores agree within 1e-5 * max(1, |score|), and, where they decide among classes, the decision is the same wherever the golden
+    margin exceeds that.
     """
     if found.shape != golden.shape:
         return f"scores of shape {found.shape}, expected {golden.shape}"
@@ -88,6 +103,8 @@ def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32]) ->
         row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
         worst = float(error[row].max())
         return f"the scores of vector {row} are off by {worst:.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
+    if not decides:
+        return ""
     ranked = np.sort(wanted, axis=1)
     clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale.max(axis=1)
     differs = clear & (found.argmax(axis=1) != golden.argmax(axis=1))
@@ -128,14 +145,35 @@ def _check_facts(bundle: Bundle) -> None:
     _check_text(bundle.name, "name")
     _check_text(bundle.task, "task")
     demand(bundle.encoder in ENCODERS, f"encoder is {ascii(bundle.encoder)[:80]}, allowed: {', '.join(ENCODERS)}")
-    n_classes = len(bundle.classes)
+    _check_outputs(bundle)
+    demand(
+        (bundle.encoder == "active") == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none"
+    )
+    scale = bundle.photons_per_level
+    if bundle.analyser is not None:
+        demand(
+            bundle.levels == 0 and scale == 0, "a passive sensor has no projector: levels and photons_per_level are 0"
+        )
+        return
+    demand(2 <= bundle.levels <= LEVELS_MAX, f"levels is {bundle.levels}, allowed: 2 to {LEVELS_MAX}")
+    demand(math.isfinite(scale) and scale > 0, f"photons_per_level is {scale}, allowed: finite and above 0")
+
+
+def _check_outputs(bundle: Bundle) -> None:
+    """Classes, or a picture: one of them."""
+    n_classes, picture = len(bundle.classes), bundle.picture_shape
+    if picture is not None:
+        demand(n_classes == 0, f"a picture and {n_classes} classes, allowed: either")
+        fits = len(picture) == 2 and min(picture) > 0 and math.prod(picture) <= OUTPUTS_MAX
+        demand(
+            bundle.table is None and bundle.int8_head is None, "a picture from a table or an int8 head, allowed: a head"
+        )
+        demand(fits, f"picture_shape is {picture}, allowed: height and width, at most {OUTPUTS_MAX} pixels")
+        return
     demand(2 <= n_classes <= CLASSES_MAX, f"{n_classes} classes, allowed: 2 to {CLASSES_MAX}")
     for name in bundle.classes:
         _check_text(name, "a class name")
     demand(len(set(bundle.classes)) == n_classes, "two classes have the same name, allowed: each name once")
-    demand(2 <= bundle.levels <= LEVELS_MAX, f"levels is {bundle.levels}, allowed: 2 to {LEVELS_MAX}")
-    scale = bundle.photons_per_level
-    demand(math.isfinite(scale) and scale > 0, f"photons_per_level is {scale}, allowed: finite and above 0")
 
 
 def check_bundle(bundle: Bundle) -> None:
@@ -143,11 +181,17 @@ def check_bundle(bundle: Bundle) -> None:
     _check_facts(bundle)
     d_f, pixels = bundle.pattern_levels.shape
     height, width = bundle.image_shape
+    if bundle.analyser is not None:
+        demand(pixels == 0, f"{bundle.encoder} optics show no patterns, found {pixels} pixels of them")
+        check_analyser(bundle.analyser)
+        demand(bundle.analyser.kind == bundle.encoder, f"encoder {bundle.encoder}, analyser {bundle.analyser.kind}")
+        seen, pixels = bundle.analyser.matrix.shape
+        demand(seen == d_f, f"the matrix has {seen} rows for {d_f} detectors")
     demand(1 <= d_f <= FEATURES_MAX, f"{d_f} patterns, allowed: 1 to {FEATURES_MAX}")
     demand(1 <= pixels <= PIXELS_MAX, f"{pixels} pixels, allowed: 1 to {PIXELS_MAX}")
     fits = height > 0 and width > 0 and height * width == pixels
     demand(fits, f"image_shape is {height}x{width}, but a pattern has {pixels} pixels")
-    top = int(bundle.pattern_levels.max())
+    top = int(bundle.pattern_levels.max()) if bundle.analyser is None else -1
     demand(top < bundle.levels, f"a pattern level is {top}, allowed: 0 to {bundle.levels - 1}")
     demand(
         bundle.head_onnx is not None or bundle.table is not None, "neither a head nor a table, allowed: either or both"
@@ -159,9 +203,9 @@ def check_bundle(bundle: Bundle) -> None:
         size = len(bundle.int8_onnx)
         demand(0 < size <= HEAD_MAX_BYTES, f"the int8 model has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
     if bundle.int8_head is not None:
-        _check_int8(bundle.int8_head, d_f, bundle.n_classes)
+        _check_int8(bundle.int8_head, d_f, bundle.n_outputs)
     if bundle.table is not None:
-        check_table_shape(bundle.table.shape, d_f, bundle.n_classes)
+        check_table_shape(bundle.table.shape, d_f, bundle.n_outputs)
         demand(bool(np.isfinite(bundle.table).all()), "the table holds scores that are not finite")
     _check_golden(bundle)
 
@@ -189,7 +233,7 @@ def _check_golden(bundle: Bundle) -> None:
     demand(
         means.shape == (count, bundle.n_features), f"golden_means has shape {means.shape}, d_f is {bundle.n_features}"
     )
-    wanted = (count, bundle.n_classes)
+    wanted = (count, bundle.n_outputs)
     demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
     demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
     demand(bool(np.isfinite(scores).all()), "the golden scores are not finite (does the head answer NaN?)")

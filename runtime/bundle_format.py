@@ -16,29 +16,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .analyser import Analyser
 from .bundle_facts import LEVELS_MAX, Bundle, check_bundle, demand, frozen
 from .container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
 from .errors import DamagedFileError, UsageError
 from .int8_head import Int8Head
 
 MAGIC = b"PANSBNDL"
-FORMAT_VERSION = 1
+VERSIONS = (1, 2)  # a bundle is written in the lowest that can say it
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
 _HEADER_KEYS = {
     *("name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"),
 }
+_NEW_KEYS = {"sensor", "picture_shape"}  # of version 2
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
+_MATRIX_PARTS = {"<f4": "matrix", "<c8": "matrix_complex"}  # of a passive sensor, in place of the patterns: one of them
 _INT8_PARTS = {"int8_sizes": "<u4", "int8_weights": "|i1", "int8_affine": "<f4"}  # all three or none
-_PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"}
+_PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"} | {name: dtype for dtype, name in _MATRIX_PARTS.items()}
+_SENSOR_KEYS = ("light", "optics", "full_scale_photoelectrons", "exposure_us")
 _REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
 
 
 def bundle_bytes(bundle: Bundle) -> bytes:
     """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 256 MiB."""
-    parts: list[tuple[str, NDArray[Any]]] = [("pattern_levels", bundle.pattern_levels)]
+    parts: list[tuple[str, NDArray[Any]]] = [_optics_part(bundle)]
     if bundle.head_onnx is not None:
         parts.append(("head_onnx", np.frombuffer(bundle.head_onnx, dtype=np.uint8)))
     if bundle.table is not None:
@@ -72,6 +76,7 @@ def bundle_bytes(bundle: Bundle) -> bytes:
             "photons_per_level": bundle.photons_per_level,
             "provenance": bundle.provenance,
             "parts": rows,
+            **_new_facts(bundle),
         }
     )
     total = _PROLOGUE.size + len(header) + offset + _DIGEST_BYTES
@@ -80,8 +85,26 @@ def bundle_bytes(bundle: Bundle) -> bytes:
         raise UsageError(
             f"this bundle would have a header of {len(header)} and {total} bytes in all, allowed: {allowed}"
         )
-    body = b"".join([_PROLOGUE.pack(MAGIC, FORMAT_VERSION, len(header)), header, *blobs])
+    version = VERSIONS[bool(_new_facts(bundle))]
+    body = b"".join([_PROLOGUE.pack(MAGIC, version, len(header)), header, *blobs])
     return body + hashlib.sha256(body).digest()
+
+
+def _optics_part(bundle: Bundle) -> tuple[str, NDArray[Any]]:
+    if bundle.analyser is None:
+        return "pattern_levels", bundle.pattern_levels
+    matrix = bundle.analyser.matrix
+    return _MATRIX_PARTS["<c8" if np.iscomplexobj(matrix) else "<f4"], matrix
+
+
+def _new_facts(bundle: Bundle) -> dict[str, Any]:
+    """What version 1 cannot say: a passive sensor, a picture instead of classes."""
+    facts: dict[str, Any] = {}
+    if bundle.analyser is not None:
+        facts["sensor"] = {name: getattr(bundle.analyser, name) for name in _SENSOR_KEYS}
+    if bundle.picture_shape is not None:
+        facts["picture_shape"] = list(bundle.picture_shape)
+    return facts
 
 
 def parse_bundle(data: bytes, where: str) -> Bundle:
@@ -106,9 +129,9 @@ def _check_prologue(data: bytes) -> int:
     smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
     demand(len(data) >= smallest, f"truncated: {len(data)} bytes, a bundle has at least {smallest}")
     _, version, header_length = _PROLOGUE.unpack_from(data)
-    if version != FORMAT_VERSION:
+    if version not in VERSIONS:
         raise DamagedFileError(
-            f"bundle format version {version}, allowed: {FORMAT_VERSION}",
+            f"bundle format version {version}, allowed: {', '.join(map(str, VERSIONS))}",
             remedy="install the pans-runtime that wrote it, or export the bundle again with this one",
         )
     demand(header_length <= HEADER_MAX_BYTES, f"a header of {header_length} bytes, allowed at most {HEADER_MAX_BYTES}")
@@ -139,7 +162,12 @@ def _what_changed(data: bytes, header_end: int) -> str:
 
 def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict[str, NDArray[Any]]:
     """Return the parts by name, after checking that they fill the file without gap, overlap or rest."""
-    demand(set(header) == _HEADER_KEYS, f"the header has the keys {_quoted(header)}, allowed: {_quoted(_HEADER_KEYS)}")
+    version = _PROLOGUE.unpack_from(data)[1]
+    keys = _HEADER_KEYS | (set(header) & _NEW_KEYS if version > 1 else set())
+    demand(set(header) == keys, f"the header has the keys {_quoted(header)}, allowed: {_quoted(keys)}")
+    demand(
+        version == VERSIONS[bool(keys & _NEW_KEYS)], f"a bundle of format version {version} that says no more than 1"
+    )
     rows = header["parts"]
     demand(isinstance(rows, list) and len(rows) <= len(_PARTS), "the header's parts are not a short list")
     parts: dict[str, NDArray[Any]] = {}
@@ -163,7 +191,12 @@ def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict
         parts[name] = frozen(np.frombuffer(blob, dtype=_PARTS[name]).reshape(shape).astype(native))
         offset += length
     demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
-    for name in ("pattern_levels", "golden_means", "golden_scores"):
+    optics = [name for name in ("pattern_levels", *_MATRIX_PARTS.values()) if name in parts]
+    passive = "sensor" in header
+    demand(len(optics) <= 1, f"the parts {', '.join(optics)}, allowed: one of them")
+    if not (passive and optics):
+        optics = ["pattern_levels"]
+    for name in (*optics, "golden_means", "golden_scores"):
         demand(name in parts and parts[name].ndim == 2, f"the part {name} is missing or not a matrix")
     return parts
 
@@ -172,11 +205,18 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
     shape, classes, scale = header["image_shape"], header["classes"], header["photons_per_level"]
     good_shape = isinstance(shape, list) and len(shape) == 2 and all(_is_count(n) for n in shape)
     demand(good_shape, f"image_shape is {ascii(shape)[:80]}, allowed: [height, width]")
-    demand(_is_count(header["levels"]), f"levels is {ascii(header['levels'])[:80]}, allowed: 2 to {LEVELS_MAX}")
+    passive, picture = "sensor" in header, header.get("picture_shape")
+    levels = header["levels"]
+    levels_fit = _is_count(levels) or (passive and levels == 0 and not isinstance(levels, bool))
+    demand(levels_fit, f"levels is {ascii(header['levels'])[:80]}, allowed: 2 to {LEVELS_MAX}")
     good_scale = isinstance(scale, int | float) and not isinstance(scale, bool)
     demand(good_scale, f"photons_per_level is {ascii(scale)[:80]}, allowed: finite and above 0")
     demand(isinstance(classes, list), f"classes is {ascii(classes)[:80]}, allowed: a list of names")
     demand(isinstance(header["provenance"], dict), "provenance is not an object")
+    good_picture = isinstance(picture, list) and len(picture) == 2 and all(_is_count(n) for n in picture)
+    demand(picture is None or good_picture, f"picture_shape is {ascii(picture)[:80]}, allowed: [height, width]")
+    analyser = _analyser(header, parts) if passive else None
+    patterns = parts["pattern_levels"] if analyser is None else frozen(np.zeros((len(analyser.matrix), 0), np.uint16))
     head = parts.get("head_onnx")
     int8_onnx = parts.get("int8_onnx")
     bundle = Bundle(
@@ -186,7 +226,7 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
         encoder=header["encoder"],
         image_shape=(shape[0], shape[1]),
         levels=header["levels"],
-        pattern_levels=parts["pattern_levels"],
+        pattern_levels=patterns,
         photons_per_level=float(scale),
         head_onnx=None if head is None else head.tobytes(),
         table=parts.get("table"),
@@ -195,9 +235,29 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
         provenance=header["provenance"],
         int8_head=_int8_head(parts),
         int8_onnx=None if int8_onnx is None else int8_onnx.tobytes(),
+        analyser=analyser,
+        picture_shape=None if picture is None else (picture[0], picture[1]),
     )
     check_bundle(bundle)
     return bundle
+
+
+def _analyser(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Analyser:
+    facts = header["sensor"]
+    demand(
+        isinstance(facts, dict) and set(facts) == set(_SENSOR_KEYS),
+        f"sensor is {ascii(facts)[:80]}, needed are the keys {', '.join(_SENSOR_KEYS)}",
+    )
+    matrix = next((parts[name] for name in _MATRIX_PARTS.values() if name in parts), None)
+    if matrix is None:
+        raise ValueError(f"a passive sensor without its matrix, needed: {' or '.join(_MATRIX_PARTS.values())}")
+    numbers = {}
+    for name in ("full_scale_photoelectrons", "exposure_us"):
+        value = facts[name]
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        demand(good, f"sensor.{name} is {ascii(value)[:80]}, allowed: finite and above 0")
+        numbers[name] = float(value)
+    return Analyser(header["encoder"], matrix, facts["light"], facts["optics"], **numbers)
 
 
 def _int8_head(parts: Mapping[str, NDArray[Any]]) -> Int8Head | None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .bundle import Bundle
 from .decide_onnx import OnnxDecider as OnnxDecider
+from .decide_picture import PictureDecider as PictureDecider
 from .decide_table import CountTableDecider, fits_count_table
 from .decide_table import TableDecider as TableDecider
 from .errors import UsageError
@@ -38,6 +39,10 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
         raise UsageError(f"back end {backend!r}, allowed: {', '.join(BACKENDS)}")
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
+    if bundle.picture_shape is not None:
+        if backend not in ("auto", PictureDecider.name):
+            raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
+        return PictureDecider(bundle)
     if backend == "auto":
         return _choose(bundle, shots)
     return _make(bundle, shots, backend)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .analyser import Analyser
 from .bundle import Bundle, load_bundle
 from .profile import Profile, load_profile
 from .record import DecisionFlag, Recording, read_recording
@@ -38,6 +39,8 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "task": bundle.task,
         "classes": list(bundle.classes),
         "encoder": bundle.encoder,
+        "sensor": None if bundle.analyser is None else _sensor_facts(bundle.analyser),
+        "picture_shape_px": None if bundle.picture_shape is None else list(bundle.picture_shape),
         "patterns": bundle.n_features,
         "image_shape_px": list(bundle.image_shape),
         "levels": bundle.levels,
@@ -48,6 +51,20 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "table_rows": 0 if bundle.table is None else len(bundle.table),
         "golden_vectors": len(bundle.golden_means),
         "provenance": dict(bundle.provenance),
+    }
+
+
+def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
+    singular = np.linalg.svd(analyser.matrix, compute_uv=False)
+    return {
+        "light": analyser.light,
+        "optics": analyser.optics,
+        "complex": bool(np.iscomplexobj(analyser.matrix)),
+        "full_scale_photoelectrons": analyser.full_scale_photoelectrons,
+        "exposure_us": analyser.exposure_us,
+        "largest_singular_value": float(singular[0]),
+        "largest_column_sum": float(np.abs(analyser.matrix).sum(axis=0).max()),
+        "fingerprint": analyser.fingerprint,
     }
 
 

@@ -152,6 +152,8 @@ def exposure_us(profile: Profile, bundle: Bundle) -> float:
 
     Raises PlanError, with the factor by which the light is too weak or too bright, if the profile does not allow it.
     """
+    if bundle.analyser is not None:
+        return _passive_exposure_us(profile, bundle.analyser.exposure_us)
     top = bundle.photons_per_level * (bundle.levels - 1)
     if not 0 < top < math.inf:
         raise PlanError(f"photons_per_level must be finite and above 0, found {bundle.photons_per_level!r}")
@@ -176,6 +178,17 @@ def exposure_us(profile: Profile, bundle: Bundle) -> float:
     return needed_us
 
 
+def _passive_exposure_us(profile: Profile, wanted_us: float) -> float:
+    """A passive sensor was trained for one exposure: another would bring other light and other dark counts."""
+    low, high = profile.exposure.min_us, profile.exposure.max_us
+    if not low * (1 - 1e-9) <= wanted_us <= high * (1 + 1e-9):
+        raise PlanError(
+            f"the bundle's passive optics were trained for {wanted_us:g} us, {profile.name} exposes {low:g} to {high:g} us",
+            remedy=f"retrain: pans train --profile {profile.name}",
+        )
+    return wanted_us
+
+
 def _check_counts(shots: int, dark: int) -> None:
     if not 1 <= shots <= _MAX_SHOTS:
         raise PlanError(f"shots per object must be from 1 to {_MAX_SHOTS}, found {shots}")
@@ -184,6 +197,17 @@ def _check_counts(shots: int, dark: int) -> None:
 
 
 def check_fit(profile: Profile, bundle: Bundle) -> None:
+    if bundle.analyser is None:
+        _check_projector(profile, bundle)
+    if profile.mode == "parallel" and bundle.n_features > profile.detector.channels:
+        raise PlanError(
+            f"the bundle has {bundle.n_features} patterns, {profile.name} has {profile.detector.channels} detector channels, "
+            "one per pattern",
+            remedy=f"pans train --features {profile.detector.channels}, or fewer",
+        )
+
+
+def _check_projector(profile: Profile, bundle: Bundle) -> None:
     projector, retrain = profile.projector, f"retrain or requantise: pans train --profile {profile.name}"
     if bundle.levels != projector.levels:
         raise PlanError(
@@ -205,12 +229,6 @@ def check_fit(profile: Profile, bundle: Bundle) -> None:
         raise PlanError(
             f"the bundle has {bundle.n_features} patterns, the pattern memory of {profile.name} holds {projector.pattern_memory}",
             remedy=f"pans train --features {projector.pattern_memory}, or fewer",
-        )
-    if profile.mode == "parallel" and bundle.n_features > profile.detector.channels:
-        raise PlanError(
-            f"the bundle has {bundle.n_features} patterns, {profile.name} has {profile.detector.channels} detector channels, "
-            "one per pattern",
-            remedy=f"pans train --features {profile.detector.channels}, or fewer",
         )
 
 

@@ -113,11 +113,14 @@ def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
 
 
 def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
-    top = int(bundle.pattern_levels.max())
-    if top < bundle.levels - 1:
+    if bundle.analyser is not None:
+        dark = np.flatnonzero(~bundle.analyser.matrix.any(axis=1))
+        if len(dark):
+            yield f"{len(dark)} of {bundle.n_features} detectors get no light (the first: {int(dark[0])})"
+    elif (top := int(bundle.pattern_levels.max())) < bundle.levels - 1:
         yield f"the brightest pixel is at level {top} of {bundle.levels - 1}: every exposure is longer than it must be"
     dark = np.flatnonzero(~bundle.pattern_levels.any(axis=1))
-    if len(dark):
+    if len(dark) and bundle.analyser is None:
         yield f"{len(dark)} of {bundle.n_features} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
     if bundle.table is not None:
         never = set(range(bundle.n_classes)) - set(bundle.table.argmax(axis=1).tolist())
@@ -156,7 +159,7 @@ def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:
     _verify_bundle(bundle, inner)
     verdict.violations += [f"the bundle inside: {text}" for text in inner.violations]
     verdict.alerts += [f"the bundle inside: {text}" for text in inner.alerts]
-    return bundle.n_classes
+    return bundle.n_classes if bundle.picture_shape is None else 1  # a picture's label is 0
 
 
 def _verify_inner_profile(recording: Recording, verdict: FileVerdict) -> None:
