@@ -34,7 +34,7 @@ class BenchOptions:
 
     bundles: tuple[Path, ...] = ()
     inputs: tuple[Path, ...] = ()
-    seconds: float = 10.0
+    seconds: float = 5.0
     frames: int = 0
     load: bool = False
     quick: bool = False

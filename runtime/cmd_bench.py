@@ -30,7 +30,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="decide: .npz with counts (n, d_f), shots, labels; one per --bundle",
     )
-    parser.add_argument("--seconds", type=float, default=20.0, help="loop: time of all runs together (default 20)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="loop: length of each of its four runs (default 5)")
     parser.add_argument("--load", action="store_true", help="loop: keep both cores busy with other processes")
     parser.add_argument("--frames", type=int, default=0, help="ingest: also run the whole way over this many frames")
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
