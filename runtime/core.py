@@ -7,6 +7,7 @@ for bit. `Core.step` returns an `Output`; a window that overlaps a gap gives a d
 from __future__ import annotations
 
 import zlib
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,13 @@ class Core(Follower):
         windows = self.windows.restart()
         decisions = [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
         return Output(decisions, [], None)
+
+    def _place(self) -> dict[str, Any] | None:
+        return None if self.windows.half_seen else {"windows": list(self.windows.position)}
+
+    def _go_on_from(self, place: dict[str, Any]) -> None:
+        visit, next_window, number = place["windows"]
+        self.windows.position = (int(visit), int(next_window), int(number))
 
     def _nothing_left(self) -> bool:
         return self.windows.visits_begun * self.windows.visit_exposures >= self.end_exposure

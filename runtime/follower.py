@@ -6,6 +6,7 @@ Owns one stream from ARM to its end and what is remembered of it; never decides:
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from .ingest import Gap, StreamTracker
@@ -24,6 +25,7 @@ from .wire import (
 )
 
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
+PART_MARKS = 16  # of them that a part of a recording begins with
 
 
 class Decision(NamedTuple):
@@ -126,6 +128,43 @@ class Follower:
     def _nothing_left(self) -> bool:
         """Whether another stream would have nothing to show."""
         raise NotImplementedError
+
+    def _place(self) -> dict[str, Any] | None:
+        """What this core must be given to go on from here; None while something is open that the clicks so far are part of."""
+        return None
+
+    def _go_on_from(self, place: dict[str, Any]) -> None:
+        raise NotImplementedError
+
+    # -- parts of a recording ------------------------------------------------------------------------------------------
+
+    def part(self) -> dict[str, Any] | None:
+        """Begin a part of the recording here and return its place in the stream, JSON-able; None while that cannot be.
+
+        What the place does not hold is forgotten here too, so that `resume` in a replay goes on exactly as this core does.
+        """
+        stopped = self._status is not None and self._status.state in (DeviceState.IDLE, DeviceState.SAFE)
+        own = None if self.completed or stopped or not self._begun else self._place()
+        if own is None:
+            return None
+        for number in list(self.marks)[:-PART_MARKS]:
+            del self.marks[number]
+        marks = [
+            [*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks.values()
+        ]
+        numbers = {"decisions": self.n_decisions, "abstained": self.n_abstained, "last_tick": self.last_tick}
+        return {"tracker": list(self.tracker.position), "marks": marks, **numbers, "core": own}
+
+    def resume(self, place: dict[str, Any]) -> None:
+        """Go on from the place that `part` returned, right after `begin`."""
+        self.tracker.resume(tuple(place["tracker"]))
+        for mark in place["marks"]:
+            photons = math.nan if mark[5] is None else mark[5]
+            self._remember(Mark._make([*mark[:5], photons, *mark[6:]]))
+        self.n_decisions, self.n_abstained, self.last_tick = (
+            int(place[name]) for name in ("decisions", "abstained", "last_tick")
+        )
+        self._go_on_from(place["core"])
 
     # -- one stream ----------------------------------------------------------------------------------------------------
 

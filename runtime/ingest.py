@@ -91,6 +91,10 @@ class StreamTracker:
         """The sequence number and exposure that come next, and the device's drop counter."""
         return self.next_seq, self.next_exposure, self._drops
 
+    def resume(self, position: tuple[int, int, int]) -> None:
+        """Go on from a `position` that another tracker had."""
+        self.next_seq, self.next_exposure, self._drops = position
+
     def advance(self, position: tuple[int, int], messages: int, exposures: int) -> None:
         """Account for messages in order and without loss that were taken elsewhere (stream.py), `exposures` of them in blocks."""
         self.next_seq, self.next_exposure = position

@@ -154,6 +154,11 @@ class DecisionWindows:
     def position(self, value: tuple[int, int, int]) -> None:
         self._visit, self._next_window, self._object = value
 
+    @property
+    def half_seen(self) -> bool:
+        """Whether a window that is not settled holds exposures already."""
+        return bool(self._seen[self._next_window :].any())
+
     def arrays(self) -> tuple[npt.NDArray[np.int32], I64, I64, I64, I64]:
         """Return the arrays that hold the visit under way: window and last exposure, counts, seen, tallies."""
         return self._window_at, self._last, self._counts, self._seen, self.tallies
