@@ -31,6 +31,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
     parser.add_argument("--drift-ppm", type=float, default=DEFAULT_DRIFT_PPM, help="rate error of the device's clock")
     parser.add_argument(
+        "--optics", default="", metavar="BUNDLE", help="look through the passive optics of this bundle: no projector"
+    )
+    parser.add_argument(
         "--buffer", type=int, default=256, help="stream messages that the device can hold back (default 256)"
     )
     parser.add_argument(
@@ -49,6 +52,7 @@ def _run(args: argparse.Namespace) -> int:
             drift_ppm=args.drift_ppm,
             faults=args.faults,
             buffer=args.buffer,
+            optics=args.optics,
         )
     )
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pans.runtime import wire
+from pans.runtime.analyser import Analyser
 from pans.runtime.errors import ConfigError
 from pans.runtime.profile import Profile
 from pans.runtime.wire import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
@@ -18,7 +19,8 @@ from pans.runtime.wire_commands import Arm, unpack_arm, unpack_gate, unpack_patt
 
 from .detector import detector_model
 from .gates import GATE_CHANNELS, Gates
-from .measurement import MAX_LEASE_MS, LightTable, Measurement, check_arm, light_table
+from .measurement import MAX_LEASE_MS, LightTable, Measurement, check_arm, light_table, tabulate
+from .optics import passive_photoelectrons
 from .scene import Scene
 from .stream import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
@@ -53,7 +55,9 @@ class Instrument:
         power_on_tick: int = 0,
         epoch: int = 1,
         buffer_messages: int = BUFFER_MESSAGES,
+        optics: Analyser | None = None,
     ) -> None:
+        self.optics = optics  # passive: then there is no projector
         self.profile = profile
         self.scene = scene
         self.counters = InstrumentCounters()
@@ -215,7 +219,8 @@ class Instrument:
 
     def _facts(self) -> dict[str, Any]:
         profile = self.profile
-        return {
+        passive = {} if self.optics is None else {"optics_sha256": self.optics.fingerprint}
+        return passive | {
             "firmware": FIRMWARE,
             "serial": f"SIM-{self._seed & U32:08X}",
             "epoch": self._epoch,
@@ -269,6 +274,8 @@ class Instrument:
         opcode, body = command.opcode, command.body
         if opcode == Opcode.LOAD_PATTERN:
             self._require_idle("LOAD_PATTERN")
+            if self.optics is not None:
+                raise Refused(AckStatus.OUT_OF_RANGE, "passive optics: there is no projector to show a pattern")
             self._patterns.load(unpack_pattern(body))
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
@@ -312,12 +319,20 @@ class Instrument:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
         key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
         if self._light is None or self._light[0] != key:
-            levels = self._patterns.stack(program.n_patterns)
             try:
-                self._light = (key, light_table(self.profile, self.scene, levels, self._exposure_us(program)))
+                self._light = (key, self._tabulate(program))
             except ConfigError as error:
                 raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
         return self._light[1]
+
+    def _tabulate(self, program: Program) -> LightTable:
+        exposure_us = self._exposure_us(program)
+        if self.optics is None:
+            return light_table(self.profile, self.scene, self._patterns.stack(program.n_patterns), exposure_us)
+        if program.n_patterns != len(self.optics.matrix):
+            text = f"a plan of {program.n_patterns} patterns, the optics lead to {len(self.optics.matrix)} detectors"
+            raise Refused(AckStatus.OUT_OF_RANGE, text)
+        return tabulate(self.profile, passive_photoelectrons(self.optics, self.scene, exposure_us), exposure_us)
 
     def _gate(self, body: bytes) -> None:
         gate = unpack_gate(body)

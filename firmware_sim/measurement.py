@@ -41,7 +41,11 @@ class LightTable(NamedTuple):
 
 def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
     """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
-    photons = expected_photoelectrons(profile, scene, levels, exposure_us)
+    return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
+
+
+def tabulate(profile: Profile, photons: NDArray[np.float64], exposure_us: float) -> LightTable:
+    """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
     with_dark = np.column_stack([photons, np.zeros(len(photons))])
     model = detector_model(profile, exposure_us)
     return LightTable(first_click_probability(model, with_dark), photons.sum(axis=1))

@@ -1,15 +1,19 @@
 """From projector levels and objects to light: expected photoelectrons of every object under every pattern.
 
 Owns the optical model and computes it once per loaded pattern set; never draws a random number, never runs per exposure.
-Only what the profile declares is modelled: the projector's photon scale, and the object modulator where there is one.
+Only what the profile declares is modelled: the projector's photon scale, and the object modulator where there is one; or passive
+optics, as a bundle states them.
 Sums of level times grey are integers below 2^53: exact, whatever the BLAS, its threads and the block size are.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.analyser import Analyser
 from pans.runtime.errors import ConfigError
 from pans.runtime.profile import Profile
 
@@ -48,12 +52,33 @@ def expected_photoelectrons(
     levels = pattern_levels.astype(np.float64).T
     t_min = profile.min_transmission
     total = levels.sum(axis=0)
-    grey, white = _grey_table(profile)
+    grey, white = grey_steps(profile)
     through = _grey_sums(scene, grey, levels, total) / white
     return photons_per_level(profile, exposure_us) * (t_min * total + (1.0 - t_min) * through)
 
 
-def _grey_table(profile: Profile) -> tuple[NDArray[np.float64], int]:
+def passive_photoelectrons(analyser: Analyser, scene: Scene, exposure_us: float) -> NDArray[np.float64]:
+    """Return lambda, float64 (n_objects, n_detectors): photoelectrons per exposure behind passive optics; ConfigError as above.
+
+    A target fills the field with full scale; light grows with the exposure.
+    """
+    n_detectors, n_pixels = analyser.matrix.shape
+    images = scene.images
+    if scene.any_shape:
+        side = math.isqrt(n_pixels)
+        shape = (side, side) if side * side == n_pixels else (1, n_pixels)
+        images = np.broadcast_to(images, (len(images), *shape))
+    elif scene.n_pixels != n_pixels:
+        raise ConfigError(
+            f"the passive optics see {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels}",
+            remedy="choose a scene of the same image shape",
+        )
+    if not scene.lit:
+        return np.zeros((scene.n_objects, n_detectors))
+    return analyser.photoelectrons(images) * (exposure_us / analyser.exposure_us)
+
+
+def grey_steps(profile: Profile) -> tuple[NDArray[np.float64], int]:
     """What the modulator makes of the 256 grey values, in whole steps, and its step number of white."""
     modulator = profile.object_modulator
     if modulator is None or modulator.levels >= 256:

@@ -14,7 +14,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 from urllib.parse import parse_qsl
 
-from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.analyser import Analyser
+from pans.runtime.bundle import load_bundle
+from pans.runtime.errors import ConfigError, LinkError, UsageError
 from pans.runtime.link import Link, open_link
 from pans.runtime.profile import load_profile
 
@@ -43,10 +45,11 @@ class SimOptions:
     drift_ppm: float = DEFAULT_DRIFT_PPM
     faults: str = ""
     buffer: int = BUFFER_MESSAGES
+    optics: str = ""  # a bundle whose passive optics the instrument looks through
 
 
 def parse_sim_url(url: str) -> SimOptions:
-    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&offset=TICKS&drift_ppm=X]`; UsageError for anything else."""
+    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&optics=BUNDLE&offset=TICKS&drift_ppm=X]`, or raise UsageError."""
     scheme, _, rest = url.partition(":")
     profile, _, query = rest.partition("?")
     if scheme != "sim" or not profile:
@@ -89,10 +92,17 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
     scene = load_scene(options.scene)
     faults = parse_faults(options.faults)
+    optics = _optics(options.optics)
 
     def switch_on(epoch: int, tick: int) -> Instrument:
         return Instrument(
-            profile, scene, seed=options.seed, power_on_tick=tick, epoch=epoch, buffer_messages=options.buffer
+            profile,
+            scene,
+            seed=options.seed,
+            power_on_tick=tick,
+            epoch=epoch,
+            buffer_messages=options.buffer,
+            optics=optics,
         )
 
     start_tick = clock.tick_at(host_ns)
@@ -101,12 +111,22 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     return FaultyDevice(switch_on, clock, faults, options.seed, start_tick), clock
 
 
+def _optics(path: str) -> Analyser | None:
+    if not path:
+        return None
+    found = load_bundle(path)[0].analyser
+    if found is None:
+        raise ConfigError(f"{path}: an active bundle: it shows patterns and has no optics", remedy="leave optics= out")
+    return found
+
+
 def open_sim(url: str) -> Link:
     """Open a `sim:` URL (entry point of `pans.devices`); the link's `close` ends what it started."""
     options = parse_sim_url(url)
     if options.pace == "real":
         load_profile(options.profile)  # a mistake in either is better told here than by the child
         load_scene(options.scene)
+        _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)
     return VirtualLink(instrument, clock, url)
@@ -171,6 +191,7 @@ def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
     words += ["--seed", str(options.seed), "--offset", str(options.offset), f"--drift-ppm={options.drift_ppm!r}"]
     words += ["--listen", listen, "--until-stdin-closes"]
     words += ["--faults", options.faults] if options.faults else []
+    words += ["--optics", options.optics] if options.optics else []
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
     # for the host, which then leaves the instrument in a safe state.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
