@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -107,6 +108,7 @@ class Recorder:
         `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
         """
         self.path = Path(path)
+        self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
         self._messages = _Bytes(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
         self._commands = _Bytes(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
         self._events = _Bytes(Kind.EVENTS, _EVENT_BUFFER_BYTES)
@@ -150,6 +152,16 @@ class Recorder:
                 raise
         finally:
             self._file.close()
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes in the file, all of them in whole blocks."""
+        return self._end
+
+    @property
+    def written(self) -> tuple[int, str]:
+        """Number of the decisions in the file and the SHA-256 (hex) of their log; all of them after `flush`."""
+        return self._n_decisions, self._log_hash.hexdigest()
 
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
@@ -255,6 +267,7 @@ class Recorder:
         """Write one whole block (or the prologue); `_end` moves when all of it is there."""
         if self._file.closed:
             raise UsageError(f"{self.path}: this recording is closed")
+        began_ns = time.perf_counter_ns()
         try:
             for piece in pieces:
                 view = memoryview(piece)
@@ -263,6 +276,8 @@ class Recorder:
         except OSError as error:
             raise self._broken(error) from error
         self._end += sum(len(piece) for piece in pieces)
+        if self.watch_write is not None:
+            self.watch_write(began_ns, time.perf_counter_ns())
 
     def _broken(self, error: OSError) -> PansError:
         """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
