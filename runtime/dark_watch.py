@@ -26,6 +26,7 @@ I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
 FLOOR_RATE = 1e-9  # a detector that is said to have no dark clicks at all is watched as one with this rate
 ALL_CHANNELS = -1
+SHARES = {"rise": 0.6, "fall": 0.2, "burst": 0.1, "drift": 0.1}  # of the false alarms, by test
 MAX_CHANNELS = 4096
 _ALARM_ROOM = 256  # alarms of one call; more are counted, not kept
 # columns of a test's state
@@ -168,21 +169,22 @@ class ChannelWatch:
 
 def _designs(expected: F64, low: F64, high: F64, settings: WatchSettings) -> list[tuple[str, int, CusumDesign]]:
     n = len(expected)
-    n_tests = 2 * n + (2 if n > 1 else 1)
-    arl = settings.arl_exposures * n_tests
+    shares = dict(SHARES)
+    if n == 1:  # the one channel's own test sees a drift
+        shares["burst"] += shares.pop("drift")
+    arl = {test: settings.arl_exposures / share for test, share in shares.items()}
     designs = []
     for channel in range(n):
         rate = float(expected[channel])
-        designs.append(("rise", channel, _design(rate, settings.rise_ratio, arl, float(high[channel]))))
-        designs.append(("fall", channel, _design(rate, settings.fall_ratio, arl, float(low[channel]))))
-    pool, guard, trials = (
+        designs.append(("rise", channel, _design(rate, settings.rise_ratio, n * arl["rise"], float(high[channel]))))
+        designs.append(("fall", channel, _design(rate, settings.fall_ratio, n * arl["fall"], float(low[channel]))))
+    pool, guard = (
         float(expected.mean()),
         float(high.mean()),
-        arl * n,
-    )  # the pool's trial is one channel in one exposure
-    designs.append(("burst", ALL_CHANNELS, _design(pool, settings.burst_ratio, trials, guard)))
+    )  # the pool's trial is one channel in one exposure: n of them
+    designs.append(("burst", ALL_CHANNELS, _design(pool, settings.burst_ratio, n * arl["burst"], guard)))
     if n > 1:
-        designs.append(("drift", ALL_CHANNELS, _design(pool, settings.drift_ratio, trials, guard)))
+        designs.append(("drift", ALL_CHANNELS, _design(pool, settings.drift_ratio, n * arl["drift"], guard)))
     return designs
 
 
