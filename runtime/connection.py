@@ -16,6 +16,7 @@ import numpy as np
 from .bundle import Bundle
 from .clock import ClockModel, ClockStep
 from .errors import DeviceError, LinkError
+from .evidence import Evidence, Stamped
 from .link import Link, LinkReader
 from .plan import Plan
 from .session import HostSession
@@ -54,6 +55,7 @@ class Connection:
         self.session = HostSession(secrets.randbelow(0xFFFFFFFF) + 1)
         self.clock: ClockModel | None = None
         self.clock_steps: list[ClockStep] = []  # since the last look
+        self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
         self._on_sent = on_sent
 
     def pump(self, timeout_s: float) -> list[Arrived]:
@@ -61,7 +63,11 @@ class Connection:
         self.session.poll(self.link.now_ns())
         self.flush()
         stream: list[Arrived] = []
-        for chunk in self.reader.wait(timeout_s):
+        began_ns = self.link.now_ns()
+        chunks = self.reader.wait(timeout_s)
+        if self.evidence is not None:
+            self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
+        for chunk in chunks:
             for frame in self.decoder.feed(chunk.data):
                 if self.session.on_frame(frame, chunk.arrival_ns):
                     stream.append(Arrived(chunk.arrival_ns, frame))
@@ -71,6 +77,9 @@ class Connection:
                 step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
                 if step is not None:
                     self.clock_steps.append(step)
+                if self.evidence is not None:
+                    reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
+                    self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
         return stream
 
     def flush(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -71,7 +72,7 @@ class Facts(NamedTuple):
 
 
 class Evidence:
-    """Collects while a run lasts; `open` and `close` around it. `now_ns` is the link's clock."""
+    """Collects while a run lasts, from `watch` to `close`. `now_ns` is the link's clock."""
 
     def __init__(self, now_ns: Callable[[], int], deadline_ns: int, *, virtual: bool = False) -> None:
         self.floor_ns = max(FLOOR_NS, deadline_ns // 16)
@@ -83,19 +84,12 @@ class Evidence:
         self._due_ns = 0
         self._counters = _Counters([])
 
-    def open(self, threads: Iterable[int | None] = ()) -> None:
-        """Begin: watch garbage collections, the calling thread (the loop's) and `threads`, by native id."""
+    def watch(self, threads: Iterable[int | None] = ()) -> None:
+        """From here on watch collections, the calling thread (the loop's) and `threads`, by native id; a new link has a new reader."""
         if self._virtual:
             return
-        gc.callbacks.append(self._on_gc)
-        self.watch(threads)
-
-    def watch(self, threads: Iterable[int | None]) -> None:
-        """Watch the calling thread and `threads` from here on; a new link brings a new reader."""
-        if self._virtual:
-            return
-        import threading
-
+        if self._on_gc not in gc.callbacks:
+            gc.callbacks.append(self._on_gc)
         self._counters.close()
         self._counters = _Counters([threading.get_native_id(), *(thread for thread in threads if thread)])
         self._samples.clear()

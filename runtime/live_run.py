@@ -19,12 +19,13 @@ from .core import Output
 from .errors import LinkError
 from .ingest import StreamTracker
 from .journal import Journal
+from .lateness import Lateness
 from .outage import why_ended
 from .plan import Plan
 from .record import Recorder
 from .tally import RunTally
 from .timing import TimingLedger
-from .wire import DeviceState, Frame, Mark, Opcode, pack_body
+from .wire import DeviceState, Frame, Mark, MessageType, Opcode, pack_body
 from .wire_commands import Arm, Gate, pack_arm, pack_gate
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ class LiveRun:
         self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
         self.tally = RunTally(n_classes, config.shots)
         self.journal = Journal(recorder)
+        self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
         self.ended = ""
         self.link_lost = False
@@ -114,6 +116,7 @@ class LiveRun:
         self.journal.session(self.connection)
         now_ns = self.now_ns()
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
+        self.lateness.attach(self.connection, now_ns + ARM_LEAD_NS)
         self.settle(self.core.begin(start_tick, n_cycles))
         self.connection.session.submit(Opcode.ARM, pack_arm(Arm(start_tick, n_cycles, self.config.lease_ms)))
         self.last_data_ns = now_ns + ARM_LEAD_NS
@@ -136,6 +139,8 @@ class LiveRun:
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
             self.ended = self.ended or "interrupted"
         self.settle(self.core.end())
+        self._judge_late(self.lateness.last_words(self.now_ns()))
+        self.lateness.close()
         self.journal.clock(self.connection)
 
     def _is_dark(self) -> bool:
@@ -168,8 +173,9 @@ class LiveRun:
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
-        outputs = self._take(self.connection.pump(POLL_S))
+        outputs = self._take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
+        self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
         self.journal.refusals(self.connection)
         if watch is not None:
             for output in outputs:
@@ -190,12 +196,16 @@ class LiveRun:
         for arrival_ns, frame in arrived:
             decoded_ns = self.now_ns()
             output = self.core.step(frame)
+            self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
                 self._recorder.add_message(arrival_ns, pack_body(frame))
             self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
             if output.block_end_tick is not None:
                 self.last_data_ns = arrival_ns
                 self.outage_ns = None
+                self.lateness.block_came(arrival_ns)
+            elif frame.type == MessageType.STATUS and self.connection.session.status is not None:
+                self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
             outputs.append(output)
         return outputs
 
@@ -208,6 +218,8 @@ class LiveRun:
         """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
         for event in output.events:
             self.journal.event(event)
+            if event["kind"] == "gap":
+                self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()))
         if output.block_end_tick is not None:
             self._check_slot(output.block_end_tick)
         if not output.decisions:
@@ -226,8 +238,13 @@ class LiveRun:
             if self.timing.judge(marks_ns, uncertainty_ns):
                 latency_us = (marks_ns[3] - end_ns) / 1000
                 self.journal.event({"kind": "late", "decision": decision.number, "latency_us": latency_us})
+                self.lateness.late(decision.number, marks_ns, uncertainty_ns)
             if self._recorder is not None:
                 self._recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
+
+    def _judge_late(self, verdict: dict[str, Any] | None) -> None:
+        if verdict is not None:
+            self.journal.event(verdict)
 
     def _check_slot(self, block_end_tick: int) -> None:
         """Compare when the block's last exposure ended with when the plan says that it should."""

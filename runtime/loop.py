@@ -84,6 +84,8 @@ class RunResult:
     ended: str
     link_lost: bool
     reconnects: int = 0
+    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
+    lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
 
@@ -186,5 +188,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         ended=run.ended,
         link_lost=run.link_lost,
         reconnects=run.reconnects,
+        late_cause=dict(run.lateness.incidents.causes),
+        lost_cause=dict(run.lateness.incidents.missing),
         events=run.journal.events,
     )

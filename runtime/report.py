@@ -26,6 +26,8 @@ def summarise(result: RunResult, *, illumination: float, expected_decisions: int
         "illumination": illumination,
         "late": timing.late,
         "late_blame": timing.blame,
+        "late_cause": result.late_cause,
+        "lost_cause": result.lost_cause,
         "lost": result.stream["lost_exposures"],
         "latency_us": timing.total.summary(),
         "stage_latency_us": {name: histogram.summary() for name, histogram in timing.stages.items()},
@@ -59,8 +61,8 @@ def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
     if timing.late:
-        blame = ", ".join(f"{stage} {count}" for stage, count in sorted(timing.blame.items()))
-        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (slowest stage: {blame})")
+        blame = ", ".join(f"{cause} {count}" for cause, count in sorted(result.late_cause.items()))
+        faults.append(f"{timing.late} decisions later than {timing.deadline_ns / 1e6:g} ms (cause: {blame})")
     if stream["lost_exposures"]:
         faults.append(
             f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "

@@ -155,7 +155,7 @@ def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
 def test_a_real_collection_is_seen_with_its_length() -> None:
     evidence = Evidence(time.perf_counter_ns, MS)
     heap = [[[]] for _ in range(400_000)]
-    evidence.open()
+    evidence.watch()
     try:
         begin = time.perf_counter_ns()
         gc.collect()
@@ -183,7 +183,7 @@ def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
 
 def test_samples_around_a_stretch_of_time_are_compared() -> None:
     evidence = Evidence(time.perf_counter_ns, MS)
-    evidence.open([None])
+    evidence.watch([None])
     begin = time.perf_counter_ns()
     deadline = time.thread_time_ns() + 2 * MS
     while time.thread_time_ns() < deadline:
