@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MESSAGE_MAX_BYTES = MIB
 NO_LABEL = 0xFFFF  # the label of a decision that abstained
 MESSAGE = struct.Struct("<qI")
@@ -34,9 +34,13 @@ class Kind(IntEnum):
     TIMINGS = 7
     EVENTS = 8
     END = 9
+    VERDICTS = 10  # since version 2: the answers that DENSE blocks name by number
+    DENSE = 11  # since version 2: decisions in the compact form, record_dense.py
 
 
 LIMITS = {int(kind): 2 * MIB for kind in Kind} | {int(Kind.HEADER): 4 * MIB, int(Kind.BUNDLE): FILE_MAX_BYTES}
+# What may stand in a file of each format version that can be read, and how long it may be.
+VERSION_LIMITS = {1: {kind: most for kind, most in LIMITS.items() if kind < Kind.VERDICTS}, 2: LIMITS}
 
 
 class DecisionFlag(IntFlag):
@@ -49,6 +53,8 @@ class DecisionFlag(IntFlag):
     DARK_ALARM = 16  # the dark counts had changed when the window was measured
     STALE = 32  # the clicks were older than the decision may be
     NOT_FINITE = 64  # the back end gave no finite score
+    COINCIDENCE = 128  # two objects passed at once: too long, or two maxima
+    AMBIGUOUS = 256  # no class was sure enough
 
 
 DECISION_DTYPE = np.dtype(
