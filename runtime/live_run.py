@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from .actuate import GateDesk
 from .connection import Arrived, Connection
 from .core import Output
 from .errors import LinkError
@@ -89,6 +90,7 @@ class LiveRun:
         self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
         self.tally = RunTally(n_classes, config.shots)
         self.journal = Journal(recorder)
+        self.gates = GateDesk(recorder, self.journal)
         self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
         self.ended = ""
@@ -139,6 +141,7 @@ class LiveRun:
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
             self.ended = self.ended or "interrupted"
         self.settle(self.core.end())
+        self.gates.finish(session)
         self._judge_late(self.lateness.last_words(self.now_ns()))
         self.lateness.close()
         self.journal.clock(self.connection)
@@ -175,6 +178,7 @@ class LiveRun:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
         outputs = self._take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
+        self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns)
         self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
         self.journal.refusals(self.connection)
         if watch is not None:
@@ -224,11 +228,14 @@ class LiveRun:
             self._check_slot(output.block_end_tick)
         if not output.decisions:
             return
+        self.gates.take(output.actions)
         end_ns = uncertainty_ns = 0
         if output.block_end_tick is not None:
             end_ns, uncertainty_ns = self.connection.known_clock().to_host_ns(output.block_end_tick)
-        for decision in output.decisions:
-            mark = self.core.marks.get(decision.object)
+        for place, decision in enumerate(output.decisions):
+            if output.passages:  # it has a time of its own, and its number is no mark's
+                end_ns, _ = self.connection.known_clock().to_host_ns(output.passages[place].leave_tick)
+            mark = None if output.passages else self.core.marks.get(decision.object)
             self.tally.add(decision, float("nan") if mark is None else mark.photons)
             if self._recorder is not None:
                 self._recorder.add_decision(decision)

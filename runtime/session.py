@@ -114,6 +114,16 @@ class HostSession:
         return len(self._waiting) < MAX_WAITING
 
     @property
+    def in_flight(self) -> int:
+        """Commands that the device has not dealt with, waiting ones too."""
+        return len(self._waiting) + len(self._unacknowledged)
+
+    @property
+    def answered(self) -> int:
+        """Every command up to this id has been dealt with: done, or in `refusals`."""
+        return self.next_id - 1 - self.in_flight
+
+    @property
     def settled(self) -> bool:
         """True when every submitted command has been acknowledged."""
         return not self._waiting and not self._unacknowledged

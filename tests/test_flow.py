@@ -263,6 +263,8 @@ def test_too_long_and_two_maxima_are_coincidences() -> None:
     flags = DecisionFlag.COINCIDENCE | DecisionFlag.ABSTAINED
     assert [d.flags for d in feed(make(), scene((100, 115, 0))).decisions] == [flags]
     dip = scene((100, 45, 0), (154, 45, 1))
+    dip[110:135] |= 0b1111000000
+    dip[165:190] |= 0b1111000000
     dip[145:154] = 0b10000  # one click per frame keeps it open
     assert [d.flags for d in feed(make(), dip).decisions] == [flags]
 

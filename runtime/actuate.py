@@ -1,0 +1,161 @@
+"""Acting on decisions: pulses at absolute device ticks, on time or not at all.
+
+Owns the queue of pulses that wait for room in the session, what became of each, and the actuators other than the instrument's own output.
+Never decides. A pulse whose tick has passed, or will have before the command can be there, is not sent: it expires, as an event. What is
+acted upon is on record before its command leaves. The instrument refuses what comes too late; that is an event too.
+
+An actuator of a laboratory's own is found by entry point (`pans.actuators`): a function from the URL's rest to an object with `fire` and
+`close`, see docs/FLOW.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+from .clock import ClockModel
+from .errors import UsageError
+from .follower import Action
+from .journal import Journal
+from .record import Recorder
+from .session import COMMAND_WINDOW, HostSession
+from .wire import Opcode
+from .wire_commands import Gate, pack_gate
+
+GROUP = "pans.actuators"
+OWN = "device"
+MAX_WAITING = 4096
+FREE_COMMANDS = 2  # of the command window, for what is not a pulse
+
+
+class Actuator(Protocol):
+    """Something that makes a pulse at a time of the host's clock."""
+
+    def fire(self, at_ns: int, duration_us: float, channel: int) -> str:
+        """Arrange a pulse at `at_ns` (time.perf_counter_ns) and return at once: "" when it will be made, else why not."""
+
+    def close(self) -> None:
+        """Let go of the hardware; nothing is pulsed afterwards."""
+
+
+@dataclass(slots=True)
+class GateCounters:
+    """What became of the pulses that decisions asked for; what is none of the other three is not known yet."""
+
+    asked: int = 0
+    done: int = 0  # accepted before their tick
+    refused: int = 0  # by the instrument or the actuator
+    expired: int = 0  # not sent: it would have been late
+
+
+class GateDesk:
+    """Takes actions from outputs and gets them done within the session's window; `failed` is told the decision of each that was not."""
+
+    def __init__(self, recorder: Recorder | None, journal: Journal) -> None:
+        self.counters = GateCounters()
+        self.actuator: Actuator | None = None  # None: the instrument's own GATE command
+        self.failed: Callable[[int], None] = lambda number: None
+        self._recorder, self._journal = recorder, journal
+        self._waiting: deque[Action] = deque()
+        self._sent: deque[tuple[int, Action]] = deque()  # command id, action
+        self._session: HostSession | None = None
+
+    def take(self, actions: Iterable[Action]) -> None:
+        """Queue pulses; beyond MAX_WAITING the oldest expires."""
+        for action in actions:
+            self.counters.asked += 1
+            self._waiting.append(action)
+        while len(self._waiting) > MAX_WAITING:
+            self._expire(self._waiting.popleft(), "too many pulses wait")
+
+    def turn(self, session: HostSession, clock: ClockModel, now_ns: int) -> None:
+        """Note what the device has answered and send what there is room for."""
+        if not self._waiting and not self._sent:
+            return
+        self._collect(session)
+        now_tick = clock.to_tick(now_ns)
+        first = True
+        while self._waiting:
+            action = self._waiting[0]
+            if action.tick <= now_tick:
+                late_us = (now_tick - action.tick) * 1e6 / clock.tick_hz
+                self._expire(self._waiting.popleft(), f"its time passed {late_us:.0f} us before it could be sent")
+                continue
+            if self.actuator is None and session.in_flight >= COMMAND_WINDOW - FREE_COMMANDS:
+                return
+            if first and self._recorder is not None:
+                self._recorder.flush()
+            first = False
+            self._do(self._waiting.popleft(), session, clock)
+
+    def finish(self, session: HostSession) -> None:
+        """The run is over: what was answered counts, what waits expires, what has no answer was refused as far as is known."""
+        self._collect(session)
+        for _, action in self._sent:
+            self._refuse(action, "no answer before the end of the run")
+        self._sent.clear()
+        while self._waiting:
+            self._expire(self._waiting.popleft(), "the run ended")
+
+    def _do(self, action: Action, session: HostSession, clock: ClockModel) -> None:
+        if self.actuator is None:
+            body = pack_gate(Gate(action.tick, action.duration_ticks, action.channel))
+            self._session = session
+            self._sent.append((session.submit(Opcode.GATE, body, may_be_refused=True), action))
+            return
+        at_ns, _ = clock.to_host_ns(action.tick)
+        reason = self.actuator.fire(at_ns, action.duration_ticks * 1e6 / clock.tick_hz, action.channel)
+        self._journal.event({"kind": "fired", "decision": action.number, "tick": action.tick, "refusal": reason})
+        if reason:
+            self._refuse(action, reason)
+        else:
+            self.counters.done += 1
+
+    def _collect(self, session: HostSession) -> None:
+        """Match acknowledgements with pulses, in the order of their commands."""
+        if self._session is not None and session is not self._session:  # the old session took its answers with it
+            for _, action in self._sent:
+                self._refuse(action, "the link was lost before the device answered")
+            self._sent.clear()
+        refusals = {}
+        while session.refusals:
+            refusal = session.refusals.popleft()
+            refusals[refusal.command_id] = refusal
+        while self._sent and self._sent[0][0] <= session.answered:
+            command_id, action = self._sent.popleft()
+            if command_id in refusals:
+                self._refuse(action, refusals.pop(command_id).text)
+            else:
+                self.counters.done += 1
+        for refusal in refusals.values():
+            self._journal.event({"kind": "gate_refused", **refusal._asdict()})
+
+    def _refuse(self, action: Action, why: str) -> None:
+        self.counters.refused += 1
+        self._journal.event({"kind": "gate_refused", "decision": action.number, "tick": action.tick, "text": why})
+        self.failed(action.number)
+
+    def _expire(self, action: Action, why: str) -> None:
+        self.counters.expired += 1
+        self._journal.event({"kind": "gate_expired", "decision": action.number, "tick": action.tick, "text": why})
+        self.failed(action.number)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counters by name."""
+        return asdict(self.counters)
+
+
+def open_actuator(url: str) -> Actuator | None:
+    """Return the actuator that `url` (NAME or NAME:REST) names, None for the instrument's own output; UsageError for an unknown one."""
+    name, _, rest = url.partition(":")
+    if name == OWN:
+        return None
+    found = {point.name: point for point in entry_points(group=GROUP)}
+    if name not in found:
+        names = ", ".join([OWN, *sorted(found)])
+        raise UsageError(f"no actuator {name!r}, known: {names}", remedy=f"offer one by the entry point group {GROUP}")
+    actuator: Actuator = found[name].load()(rest)
+    return actuator
