@@ -30,7 +30,8 @@ class Faults:
 
     loss, flip (1 to 3 bits), duplicate, truncate (the end is missing, delimiter included), reorder (held back behind up to 8 frames), drip
     (one byte per tick); stall (nothing passes, then a flood), disconnect (the link breaks and comes back), pause (the host stands
-    still), clock_step (the device's counter jumps ahead), reset (the device restarts with another epoch).
+    still), clock_step (the device's counter jumps ahead), reset (the device restarts with another epoch), late (the device keeps its
+    stream messages to itself for a while, and answers everything else at once).
     """
 
     loss: float = 0.0
@@ -44,6 +45,7 @@ class Faults:
     pause: Recurring | None = None
     clock_step: Recurring | None = None
     reset: Recurring | None = None
+    late: Recurring | None = None
 
     @property
     def any_frame_fault(self) -> bool:
@@ -66,6 +68,7 @@ USUAL = {
     "pause": "300ms/4s",
     "clock_step": "2ms/5s",
     "reset": "0ms/20s",
+    "late": "40ms/2s",
 }
 NO_FAULTS = Faults()
 

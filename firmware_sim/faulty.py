@@ -1,7 +1,8 @@
 """A device behind a bad link: wraps an instrument and damages, delays, repeats or loses what passes, by seed.
 
-Owns the two lanes of frames and the schedule of what recurs; never reads a clock and never looks into a message. `FaultyDevice` is a
-`SteppedDevice`: shells drive it like an instrument. All randomness comes from one seed, so that a failure can be repeated.
+Owns the two lanes of frames and the schedule of what recurs; never reads a clock and looks at no more of a message than its type.
+`FaultyDevice` is a `SteppedDevice`: shells drive it like an instrument. All randomness comes from one seed, so that a failure can be
+repeated.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from pans.runtime.wire import MessageType
+
 from .clockwork import DeviceClock, SteppedDevice
 from .faults import Faults, Recurring
 
@@ -18,6 +21,7 @@ MAX_REORDER_FRAMES = 8
 HOLD_NS = 20_000_000  # a frame held back for others leaves by then at the latest
 MAX_LANE_BYTES = 1 << 24
 RESET_TICK = 1000
+STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 
 MakeDevice = Callable[[int, int], SteppedDevice]  # (epoch, tick at power-on) -> a device that has just been switched on
 
@@ -39,6 +43,7 @@ class FaultCounters:
     pauses: int = 0
     clock_steps: int = 0
     resets: int = 0
+    lates: int = 0
 
 
 @dataclass(slots=True)
@@ -187,7 +192,7 @@ class FaultyDevice:
 
         self._up = Lane(faults, random.Random(dice.random()), ticks(HOLD_NS), self.counters)
         self._down = Lane(faults, random.Random(dice.random()), ticks(HOLD_NS), self.counters)
-        kinds = ("stall", "disconnect", "clock_step", "reset", "pause")
+        kinds = ("stall", "disconnect", "clock_step", "reset", "pause", "late")
         recurring = {kind: getattr(faults, kind) for kind in kinds}
         self._schedules = {
             kind: Schedule(what, ticks, random.Random(dice.random()), start_tick)
@@ -195,6 +200,8 @@ class FaultyDevice:
             if what is not None
         }
         self._gone_until = 0
+        self._late_until = 0
+        self._kept: list[bytes] = []  # stream messages that the device is late with
 
     @property
     def session(self) -> int:
@@ -229,6 +236,8 @@ class FaultyDevice:
         ticks += [schedule.next_tick for kind, schedule in self._schedules.items() if kind != "pause"]
         if not self.connected:
             ticks.append(self._gone_until)
+        if self._kept:
+            ticks.append(self._late_until)
         return min((max(tick, self._tick) for tick in ticks if tick is not None), default=None)
 
     def _advance(self, tick: int, data: bytes) -> bytes:
@@ -238,10 +247,27 @@ class FaultyDevice:
                 getattr(self, f"_{kind}")(*schedule.begin())
         if data and self.connected:
             self._up.put(tick, data)
-        sent = self.device.step(tick + self._shift, self._up.take(tick))
+        sent = self._punctual(tick, self.device.step(tick + self._shift, self._up.take(tick)))
         if sent and self.connected:
             self._down.put(tick, sent)
         return self._down.take(tick)
+
+    def _punctual(self, tick: int, sent: bytes) -> bytes:
+        """What of `sent` leaves the device now; COBS leaves a first byte that is not zero, the type, where it stood."""
+        if tick >= self._late_until:
+            sent, self._kept = b"".join(self._kept) + sent, []
+            return sent
+        passed = b""
+        for frame in sent.split(b"\0")[:-1]:
+            if len(frame) > 1 and frame[1] in STREAM_TYPES:
+                self._kept.append(frame + b"\0")
+            else:
+                passed += frame + b"\0"
+        return passed
+
+    def _late(self, begin: int, end: int) -> None:
+        self.counters.lates += 1
+        self._late_until = end
 
     def _stall(self, begin: int, end: int) -> None:
         self.counters.stalls += 1
@@ -263,3 +289,4 @@ class FaultyDevice:
         self._shift = RESET_TICK - self._tick
         self.device = self._make(self._epoch, RESET_TICK)
         self._down.clear()  # what stood in its transmit buffer is gone
+        self._kept = []

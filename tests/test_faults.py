@@ -222,6 +222,7 @@ OFTEN = {
     "pause": "pause:100ms/200ms",
     "clock_step": "clock_step:2ms/100ms",
     "reset": "reset:0ms/500ms",
+    "late": "late:40ms/300ms",
 }
 
 
