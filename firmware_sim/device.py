@@ -8,7 +8,7 @@ sent. Whatever arrives, it answers, refuses or counts; it never raises over byte
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime import wire
 from pans.runtime.analyser import Analyser
@@ -17,13 +17,21 @@ from pans.runtime.profile import Profile
 from pans.runtime.wire import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 from pans.runtime.wire_commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
 
+from .changes import Changes
 from .detector import detector_model
+from .exposures import Exposures
 from .gates import GATE_CHANNELS, Gates
-from .measurement import MAX_LEASE_MS, LightTable, Measurement, check_arm, light_table, tabulate
+from .light import LightTable, begin, prepare, tabulate
+from .measurement import MAX_LEASE_MS, Measurement, check_arm
+from .moving import SceneFile
 from .optics import passive_photoelectrons
 from .scene import Scene
 from .stream import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
+
+if TYPE_CHECKING:
+    from .shifts import ShiftTable
+    from .tape import BarTable
 
 FIRMWARE = "pans-sim 1"
 BUFFER_MESSAGES = 256
@@ -49,7 +57,7 @@ class Instrument:
     def __init__(
         self,
         profile: Profile,
-        scene: Scene,
+        scene: Scene | SceneFile,
         *,
         seed: int = 0,
         power_on_tick: int = 0,
@@ -59,7 +67,8 @@ class Instrument:
     ) -> None:
         self.optics = optics  # passive: then there is no projector
         self.profile = profile
-        self.scene = scene
+        self.scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
+        _check_scene(self.scene, profile, optics)
         self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
@@ -76,7 +85,7 @@ class Instrument:
         pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
         self._plan = PlanMemory(self.profile)
-        self._light: tuple[tuple[int, int, int], LightTable] | None = None
+        self._light: tuple[tuple[int, int, int], LightTable | ShiftTable | BarTable] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
         self._run: Measurement | None = None
         self._lease_tick: int | None = None
@@ -304,18 +313,21 @@ class Instrument:
         if program is None:
             raise Refused(AckStatus.WRONG_STATE, "no complete plan is loaded")
         check_arm(program, arm, self._tick, self._tick_hz)
-        light = self._light_table(program)
+        table = self._light_table(program)
         model = detector_model(self.profile, self._exposure_us(program))
+        exposures = Exposures(program, arm.n_cycles or None, self._tick_hz)
+        changes = Changes(self.scene.changes, program.channels)
+        light = begin(self.scene, table, program, exposures, changes, self._seed, self._draws)
         self.stream.restart()
         self._exposures_ended = 0
-        self._run = Measurement(program, arm, self.scene, light, model, self._seed, self._draws)
+        self._run = Measurement(program, arm, light, exposures, model, changes, self._seed, self._draws)
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
 
     def _exposure_us(self, program: Program) -> float:
         return program.exposure_ticks * 1e6 / self._tick_hz
 
-    def _light_table(self, program: Program) -> LightTable:
+    def _light_table(self, program: Program) -> LightTable | ShiftTable | BarTable:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
         key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
         if self._light is None or self._light[0] != key:
@@ -325,17 +337,33 @@ class Instrument:
                 raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
         return self._light[1]
 
-    def _tabulate(self, program: Program) -> LightTable:
+    def _tabulate(self, program: Program) -> LightTable | ShiftTable | BarTable:
         exposure_us = self._exposure_us(program)
         if self.optics is None:
-            return light_table(self.profile, self.scene, self._patterns.stack(program.n_patterns), exposure_us)
+            return prepare(self.profile, self.scene, self._patterns.stack(program.n_patterns), exposure_us)
         if program.n_patterns != len(self.optics.matrix):
             text = f"a plan of {program.n_patterns} patterns, the optics lead to {len(self.optics.matrix)} detectors"
             raise Refused(AckStatus.OUT_OF_RANGE, text)
-        return tabulate(self.profile, passive_photoelectrons(self.optics, self.scene, exposure_us), exposure_us)
+        assert isinstance(self.scene.what, Scene)  # see _check_scene
+        return tabulate(self.profile, passive_photoelectrons(self.optics, self.scene.what, exposure_us), exposure_us)
 
     def _gate(self, body: bytes) -> None:
         gate = unpack_gate(body)
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)
+
+
+def _check_scene(scene: SceneFile, profile: Profile, optics: Analyser | None) -> None:
+    """Refuse what the simulator cannot do with a scene that moves."""
+    if not scene.moves:
+        return
+    if profile.mode != "parallel":
+        raise ConfigError(
+            f"scene {scene.name!r} moves, and {profile.name} shows pattern after pattern: objects would be gone before the last one",
+            remedy="choose a parallel profile, such as flow-snspd",
+        )
+    if optics is not None:
+        raise ConfigError(
+            f"scene {scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
+        )

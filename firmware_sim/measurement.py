@@ -7,18 +7,16 @@ Clicks are drawn ahead in batches: they depend on the exposure's number alone, s
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.profile import Profile
-from pans.runtime.wire import DARK_PATTERN, NO_OBJECT, AckStatus, ClickBlock, FrameBlock, Mark
+from pans.runtime.wire import NO_OBJECT, AckStatus, ClickBlock, FrameBlock, Mark
 from pans.runtime.wire_commands import PARALLEL, Arm
 
-from .detector import DetectorModel, detector_model, first_click_probability, sample_clicks
-from .optics import expected_photoelectrons
-from .scene import Scene
+from .changes import Changes
+from .detector import DetectorModel, first_click_probability, sample_clicks
+from .exposures import Exposures
+from .light import RunLight, StillObjects
 from .upload import Program, Refused, word_bytes
 
 BATCH_NUMBERS = 1 << 14
@@ -27,28 +25,6 @@ MAX_ARM_AHEAD_S = 3600
 MAX_TICK = 1 << 62
 
 StreamMessage = ClickBlock | FrameBlock | Mark
-
-
-class LightTable(NamedTuple):
-    """Every object under every pattern: click probabilities and expected photons of one shot.
-
-    `probability` is float64 (objects, patterns + 1), the last column is the dark pattern; `photons` is float64 (objects,).
-    """
-
-    probability: NDArray[np.float64]
-    photons: NDArray[np.float64]
-
-
-def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
-    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
-    return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
-
-
-def tabulate(profile: Profile, photons: NDArray[np.float64], exposure_us: float) -> LightTable:
-    """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
-    with_dark = np.column_stack([photons, np.zeros(len(photons))])
-    model = detector_model(profile, exposure_us)
-    return LightTable(first_click_probability(model, with_dark), photons.sum(axis=1))
 
 
 def check_arm(program: Program, arm: Arm, now: int, tick_hz: int) -> None:
@@ -70,24 +46,27 @@ class Measurement:
         self,
         program: Program,
         arm: Arm,
-        scene: Scene,
-        light: LightTable,
+        light: RunLight,
+        exposures: Exposures,
         model: DetectorModel,
+        changes: Changes,
         seed: int,
         first_draw: int,
     ) -> None:
-        self._program = program
+        self._program, self._light, self._exposures, self._changes = program, light, exposures, changes
         self._start_tick = arm.start_tick
         self._n_cycles = arm.n_cycles or None
-        self._scene = scene
-        self._light = light
-        self._model = model
-        self._seed = seed
+        self._model, self._seed = model, seed
         self._first_draw = first_draw  # exposures drawn in earlier runs: no number is used twice
-        self._column = np.where(program.patterns == DARK_PATTERN, program.n_patterns, program.patterns).astype(np.int64)
-        self._word_bytes = word_bytes(program.channels)
-        self._cycle, self._block, self._marked = 0, 0, False
-        self._batch = np.zeros((0, program.channels), np.uint8)
+        self._moves = not isinstance(light, StillObjects)
+        self._parallel = program.mode == PARALLEL
+        self._block_ends = [
+            int(program.offsets[first + count - 1]) + program.exposure_ticks for first, count in program.blocks
+        ]
+        self._cycle, self._block, self._cycle_tick = 0, 0, arm.start_tick
+        self._mark_tick = self._next_mark_tick()
+        # A parallel batch holds packed words, a sequential one clicks; one row for each exposure.
+        self._batch = np.zeros((0, word_bytes(program.channels) if self._parallel else 1), np.uint8)
         self._batch_first = 0
         self._before_batch = np.zeros(program.channels, np.uint8)
         self.next_tick: int | None = None
@@ -117,90 +96,97 @@ class Measurement:
 
     def emit(self) -> StreamMessage:
         """Return the message that is due at `next_tick` and move on to the next one."""
-        if not self._marked:
-            self._marked = True
-            message: StreamMessage = self._mark()
+        if self._mark_tick is not None and self._mark_tick == self.next_tick:
+            mark = self._light.mark
+            message: StreamMessage = mark._replace(tick=mark.tick + self._start_tick)
+            self._light.take_mark()
+            self._mark_tick = self._next_mark_tick()
         else:
             first, count = self._program.blocks[self._block]
-            message = self._exposures(first, count)
+            message = self._message(first, count)
             self._advance()
         self._schedule()
         return message
 
     def cut(self, tick: int) -> StreamMessage | None:
         """Return the finished exposures of the block under way when the run is broken off at `tick`; None without any."""
-        if self.next_tick is None or not self._marked:
+        if self.next_tick is None:
             return None
         first, count = self._program.blocks[self._block]
         latest_begin = tick - self._cycle_tick - self._program.exposure_ticks
         ended = int(np.searchsorted(self._program.offsets[first : first + count], latest_begin, "right"))
         self.next_tick = None
-        return self._exposures(first, ended) if ended else None
+        return self._message(first, ended) if ended else None
 
-    @property
-    def _cycle_tick(self) -> int:
-        return self._start_tick + self._cycle * self._program.cycle_ticks
-
-    @property
-    def _object(self) -> int:
-        return (self._cycle // self._program.cycles_per_object) % NO_OBJECT
+    def _next_mark_tick(self) -> int | None:
+        mark, n_exposures = self._light.mark, self._exposures.n_exposures
+        over = n_exposures is not None and mark.exposure_index >= n_exposures
+        return None if over else mark.tick + self._start_tick
 
     def _advance(self) -> None:
         self._block += 1
         if self._block == len(self._program.blocks):
             self._block = 0
             self._cycle += 1
-            self._marked = self._cycle % self._program.cycles_per_object != 0
+            self._cycle_tick += self._program.cycle_ticks
 
     def _schedule(self) -> None:
-        program = self._program
+        """A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first."""
         if self._n_cycles is not None and self._cycle >= self._n_cycles:
             self.next_tick = None
-        elif not self._marked:
-            self.next_tick = self._cycle_tick + int(program.offsets[0])
-        else:
-            first, count = program.blocks[self._block]
-            self.next_tick = self._cycle_tick + int(program.offsets[first + count - 1]) + program.exposure_ticks
+            return
+        end = self._cycle_tick + self._block_ends[self._block]
+        self.next_tick = end if self._mark_tick is None or end <= self._mark_tick else self._mark_tick
 
-    def _mark(self) -> Mark:
-        row = self._object % self._scene.n_objects
-        tick = self._cycle_tick + int(self._program.offsets[0])
-        exposure = self._cycle * self._program.n_slots
-        return Mark(0, self._object, self._scene.truth(row), exposure, tick, float(self._light.photons[row]))
-
-    def _exposures(self, first: int, count: int) -> ClickBlock | FrameBlock:
+    def _message(self, first: int, count: int) -> ClickBlock | FrameBlock:
         program = self._program
         exposure = self._cycle * program.n_slots + first
         tick = self._cycle_tick + int(program.offsets[first])
+        number = NO_OBJECT if self._moves else (self._cycle // program.cycles_per_object) % NO_OBJECT
+        head = (0, 0, tick, exposure, program.slot_period_ticks, number)
         clicks = self._clicks(exposure, count)
-        head = (0, 0, tick, exposure, program.slot_period_ticks, self._object)
-        if program.mode != PARALLEL:
-            return ClickBlock(*head, program.patterns[first : first + count], clicks[:, 0])
-        words = np.zeros((count, self._word_bytes), np.uint8)
-        packed = np.packbits(clicks, axis=1, bitorder="little")
-        words[:, : packed.shape[1]] = packed
-        return FrameBlock(*head, words)
+        if self._parallel:
+            return FrameBlock(*head, clicks)
+        return ClickBlock(*head, program.patterns[first : first + count], clicks[:, 0])
 
     def _clicks(self, first: int, count: int) -> NDArray[np.uint8]:
         start = first - self._batch_first
         if start + count > len(self._batch):
             if start:
-                self._before_batch = self._batch[start - 1]
+                self._before_batch = self._unpacked(self._batch[start - 1])
             self._batch_first, start = first, 0
-            probability = self._probability(first, max(count, BATCH_NUMBERS // self._program.channels))
-            self._batch = sample_clicks(
-                self._model, probability, self._seed, self._first_draw + first, self._before_batch
-            )
+            self._batch = self._draw(first, max(count, BATCH_NUMBERS // self._program.channels))
         return self._batch[start : start + count]
 
-    def _probability(self, first: int, count: int) -> NDArray[np.float64]:
-        """Click probabilities of exposures first..first+count-1, float64 (count, channels)."""
-        program = self._program
-        cycle, slot = np.divmod(np.arange(first, first + count), program.n_slots)
-        row = cycle // program.cycles_per_object % NO_OBJECT % self._scene.n_objects
-        column = self._column[slot]
-        if program.mode != PARALLEL:
-            return self._light.probability[row, column][:, None]
-        lit = self._light.probability[row, :-1]
-        lit[column == program.n_patterns] = self._light.probability[0, -1]
-        return lit
+    def _unpacked(self, row: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.unpackbits(row, bitorder="little", count=self._program.channels) if self._parallel else row
+
+    def _draw(self, first: int, count: int) -> NDArray[np.uint8]:
+        """The clicks of exposures first..first+count-1, as a batch holds them."""
+        probability, row_of = self._probability(first, count)
+        number = self._first_draw + first
+        if not self._parallel:
+            return sample_clicks(self._model, probability[row_of], self._seed, number, self._before_batch)
+        from .detector_kernels import sample_words  # numba is loaded only for instruments of many channels
+
+        words = np.zeros((count, self._batch.shape[1]), np.uint8)
+        sample_words(self._model, probability, row_of, self._seed, number, self._before_batch.copy(), words)
+        if self._changes.any_dead:  # nor does crosstalk wake a dead channel
+            times_s = self._exposures.seconds(self._exposures.begins(first, count))
+            alive = np.packbits(self._changes.alive(times_s), axis=1, bitorder="little")
+            words[:, : alive.shape[1]] &= alive
+        return words
+
+    def _probability(self, first: int, count: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Click probabilities float64 (rows, channels), and int64 (count,) of the row of each exposure."""
+        light, row_of = self._light.rows(first, count)
+        if self._changes:
+            times_s = self._exposures.seconds(self._exposures.begins(first, count))
+            exposure_s = self._exposures.exposure_ticks / self._exposures.tick_hz
+            return self._changes.probability(self._model, light[row_of], times_s, exposure_s), np.arange(count)
+        known = self._light.probability
+        if known is None:
+            return first_click_probability(self._model, light), row_of
+        if len(known) > count:
+            return known[row_of], np.arange(count)
+        return known, row_of

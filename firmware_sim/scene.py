@@ -18,7 +18,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import ConfigError
+from pans.runtime.errors import ConfigError, PansError
+from pans.runtime.grey import read_class_folder
 
 MAX_OBJECTS = 1 << 17
 MAX_PIXELS = 1 << 22
@@ -67,6 +68,11 @@ def shipped_scenes() -> tuple[str, ...]:
     return (*TARGETS, *sorted(path.stem for path in SCENE_FOLDER.glob("*.npz")))
 
 
+def shipped_scene_files() -> tuple[str, ...]:
+    """Names of the scene files in TOML that come with the package (scene_file.py reads them)."""
+    return tuple(sorted(path.stem for path in SCENE_FOLDER.glob("*.toml")))
+
+
 def load_scene(name_or_path: str | Path) -> Scene:
     """Load a target, a shipped scene or an `.npz` file; ConfigError says what is wrong with it and where."""
     name = str(name_or_path)
@@ -79,9 +85,21 @@ def load_scene(name_or_path: str | Path) -> Scene:
     if not path.is_file():
         raise ConfigError(
             f"scene {name!r}: neither a shipped scene nor a file",
-            remedy=f"shipped are {', '.join(shipped_scenes())}; or name a .npz file",
+            remedy=f"shipped are {', '.join(shipped_scenes() + shipped_scene_files())}; or name a .npz or .toml file",
         )
     return _read_scene(path, path.stem)
+
+
+def load_images(name: str, base: Path) -> Scene:
+    """Load pictures for a scene: a target, a shipped scene, or a `.npz` file or a folder of class folders relative to `base`."""
+    path = base / name
+    if path.is_dir():
+        try:
+            pictures = read_class_folder(path, MAX_SCENE_BYTES)
+        except PansError as error:
+            raise ConfigError(error.message, remedy=error.remedy) from error
+        return scene_from_arrays(str(path), pictures.images, pictures.labels, pictures.classes)
+    return load_scene(path if path.is_file() else name)
 
 
 def scene_from_arrays(name: str, images: NDArray[Any], labels: NDArray[Any] | None, classes: tuple[str, ...]) -> Scene:

@@ -24,7 +24,7 @@ from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, Ste
 from .device import BUFFER_MESSAGES, Instrument
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
-from .scene import load_scene
+from .scene_file import open_scene
 from .virtual import START_NS, VirtualLink
 
 DEFAULT_SCENE = "fashion200"
@@ -90,7 +90,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     """
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
-    scene = load_scene(options.scene)
+    scene = open_scene(options.scene)
     faults = parse_faults(options.faults)
     optics = _optics(options.optics)
 
@@ -125,7 +125,7 @@ def open_sim(url: str) -> Link:
     options = parse_sim_url(url)
     if options.pace == "real":
         load_profile(options.profile)  # a mistake in either is better told here than by the child
-        load_scene(options.scene)
+        open_scene(options.scene)
         _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)

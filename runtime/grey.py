@@ -1,21 +1,59 @@
-"""A user's picture file as 8-bit grey, without guessing: every pixel format is scaled by its own full scale.
+"""A user's picture file as 8-bit grey, without guessing: every pixel format is scaled by its own full scale; and folders of them.
 
-Owns this conversion; never resizes and never stretches contrast. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones
-65535 (a 12-bit camera's file stays dark: scale it before), of floating-point ones 1.0; colours become luminance (ITU-R 601) and
-transparency is ignored.
+Owns this conversion; never resizes and never stretches contrast. Trainer and simulator read pictures with it; Pillow is loaded only
+then. Full scale of 8-bit and 1-bit pictures is white, of 16-bit ones 65535 (a 12-bit camera's file stays dark: scale it before), of
+floating-point ones 1.0; colours become luminance (ITU-R 601) and transparency is ignored.
 """
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import DamagedFileError, UsageError
+from .errors import DamagedFileError, UsageError
 
 FULL_SCALE_16 = 65535
+
+
+class LabelledPictures(NamedTuple):
+    """images uint8 (n, height, width), labels int64 (n,) into `classes`, and the SHA-256 of all pixels in their order."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.int64]
+    classes: tuple[str, ...]
+    sha256: str
+
+
+def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
+    """Return the pictures of `folder`: one folder per class, pictures of one size inside; names that begin with a dot are passed over.
+
+    UsageError for what does not fit, or for more than `pixels_max` pixels in all; else as `read_grey`.
+    """
+    classes = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    images: list[NDArray[np.uint8]] = []
+    labels: list[int] = []
+    digest = hashlib.sha256()
+    n_pixels = 0
+    for label, name in enumerate(classes):
+        for path in sorted(entry for entry in (folder / name).iterdir() if entry.is_file() and entry.name[0] != "."):
+            image = read_grey(path, pixels_max - n_pixels)
+            n_pixels += image.size
+            if images and image.shape != images[0].shape:
+                raise UsageError(
+                    f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the first image has "
+                    f"{images[0].shape[1]} x {images[0].shape[0]}",
+                    remedy="all images of a task have one size: resize them",
+                )
+            digest.update(image.tobytes())
+            images.append(image)
+            labels.append(label)
+    if not images:
+        raise UsageError(f"{folder}: no images in class folders", remedy="put the images of each class into a folder")
+    return LabelledPictures(np.stack(images), np.array(labels), tuple(classes), digest.hexdigest())
 
 
 def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
@@ -24,8 +62,10 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     UsageError for more than `pixels_max` pixels, several frames, or values outside the full scale; DamagedFileError for a
     file that is no picture.
     """
-    from PIL import Image
-
+    try:
+        from PIL import Image
+    except ModuleNotFoundError as error:
+        raise UsageError(f"{path}: pictures need the package pillow", remedy="pip install pillow") from error
     try:
         with Image.open(path) as picture:
             if picture.width * picture.height > pixels_max:

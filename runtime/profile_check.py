@@ -6,8 +6,6 @@ returns checked values, or raises a ConfigError that starts with file:line:col.
 
 from __future__ import annotations
 
-import difflib
-import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import ConfigError
 from .toml_position import KeyPath, Position, position_of
+from .toml_rules import Key, found, near, type_remedy
 
 if TYPE_CHECKING:
     from .profile import Profile
@@ -23,82 +22,48 @@ MODES = ("sequential", "parallel")
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
 
 
-@dataclass(frozen=True, slots=True)
-class _Key:
-    kind: str  # "text", "whole", "number"
-    low: float = 0.0
-    high: float = 0.0
-    above: bool = False  # low itself is not allowed
-    required: bool = True
-    infinite: bool = False  # inf is a meaning, not a mistake
-    choices: tuple[str, ...] = ()
-
-    def fits(self, value: Any) -> bool:
-        """Whether the type is right: a boolean is no number, a whole number is one."""
-        if self.kind == "text":
-            return isinstance(value, str)
-        return isinstance(value, int if self.kind == "whole" else (int, float)) and not isinstance(value, bool)
-
-    def within(self, value: Any) -> bool:
-        """Whether a value of the right type is an allowed one; nan is in no range."""
-        if self.kind == "text":
-            return value in self.choices if self.choices else bool(value.strip())
-        if value == math.inf:
-            return self.infinite
-        return bool(self.low < value <= self.high or (value == self.low and not self.above))
-
-    @property
-    def allowed(self) -> str:
-        if self.kind == "text":
-            return " or ".join(f'"{choice}"' for choice in self.choices) or "text in quotes, not empty"
-        noun = "a whole number" if self.kind == "whole" else "a number"
-        low, high = f"{self.low:.12g}", f"{self.high:.12g}"
-        limits = f"above {low} and at most {high}" if self.above else f"from {low} to {high}"
-        return f"{noun} {limits}{', or inf' if self.infinite else ''}"
-
-
-_PROBABILITY = _Key("number", 0, 1, required=False)
-_SCHEMA: dict[str, dict[str, _Key]] = {
+_PROBABILITY = Key("number", 0, 1, required=False)
+_SCHEMA: dict[str, dict[str, Key]] = {
     "profile": {
-        "name": _Key("text"),
-        "description": _Key("text", required=False),
-        "mode": _Key("text", choices=MODES),
+        "name": Key("text"),
+        "description": Key("text", required=False),
+        "mode": Key("text", choices=MODES),
     },
     "projector": {
-        "kind": _Key("text"),
-        "width_px": _Key("whole", 1, 65535),
-        "height_px": _Key("whole", 1, 65535),
-        "levels": _Key("whole", 2, 65536),
-        "pixel_pitch_um": _Key("number", 0, 1e5, above=True),
-        "pattern_rate_max_hz": _Key("number", 0, 1e9, above=True),
-        "pattern_memory": _Key("whole", 1, 65535),  # 65535 patterns are 0..0xFFFE: 0xFFFF is the dark pattern
-        "peak_photoelectrons_hz": _Key("number", 0, 1e15, above=True),
+        "kind": Key("text"),
+        "width_px": Key("whole", 1, 65535),
+        "height_px": Key("whole", 1, 65535),
+        "levels": Key("whole", 2, 65536),
+        "pixel_pitch_um": Key("number", 0, 1e5, above=True),
+        "pattern_rate_max_hz": Key("number", 0, 1e9, above=True),
+        "pattern_memory": Key("whole", 1, 65535),  # 65535 patterns are 0..0xFFFE: 0xFFFF is the dark pattern
+        "peak_photoelectrons_hz": Key("number", 0, 1e15, above=True),
     },
     "object": {
-        "contrast": _Key("number", 1, 1e12, above=True, infinite=True),
-        "levels": _Key("whole", 2, 65536),
-        "black_transmission": _Key("number", 0, 0.99, required=False),
+        "contrast": Key("number", 1, 1e12, above=True, infinite=True),
+        "levels": Key("whole", 2, 65536),
+        "black_transmission": Key("number", 0, 0.99, required=False),
     },
     "detector": {
-        "kind": _Key("text"),
-        "channels": _Key("whole", 1, 4096),
-        "efficiency": _Key("number", 0, 1, above=True),
-        "dark_rate_hz": _Key("number", 0, 1e9),
-        "read_noise_e": _Key("number", 0, 3, required=False),  # beyond 3 e- a single photon is not visible at all
-        "threshold_e": _Key("number", 0, 10, above=True, required=False),
-        "dead_time_ns": _Key("number", 0, 1e9, required=False),
+        "kind": Key("text"),
+        "channels": Key("whole", 1, 4096),
+        "efficiency": Key("number", 0, 1, above=True),
+        "dark_rate_hz": Key("number", 0, 1e9),
+        "read_noise_e": Key("number", 0, 3, required=False),  # beyond 3 e- a single photon is not visible at all
+        "threshold_e": Key("number", 0, 10, above=True, required=False),
+        "dead_time_ns": Key("number", 0, 1e9, required=False),
         "afterpulse_probability": _PROBABILITY,
         "crosstalk_probability": _PROBABILITY,
     },
     "exposure": {
-        "min_us": _Key("number", 0, 1e9, above=True),
-        "max_us": _Key("number", 0, 1e9, above=True),
-        "readout_us": _Key("number", 0, 1e9),
+        "min_us": Key("number", 0, 1e9, above=True),
+        "max_us": Key("number", 0, 1e9, above=True),
+        "readout_us": Key("number", 0, 1e9),
     },
-    "clock": {"tick_hz": _Key("whole", 1000, 10_000_000_000)},
+    "clock": {"tick_hz": Key("whole", 1000, 10_000_000_000)},
     "timing": {
-        "decision_deadline_us": _Key("number", 0, 1e9, above=True),
-        "lease_ms": _Key("whole", 1, 3_600_000),
+        "decision_deadline_us": Key("number", 0, 1e9, above=True),
+        "lease_ms": Key("whole", 1, 3_600_000),
     },
 }
 _OPTIONAL_SECTIONS = ("object", "sources")
@@ -129,10 +94,10 @@ class ProfileCheck:
         for name, table in self.tables.items():
             if name not in known:
                 owners = [section for section, keys in _SCHEMA.items() if name in keys]
-                hint = f"[{owners[0]}] has a key of that name" if owners else _near(name, known, "[{}]")
+                hint = f"[{owners[0]}] has a key of that name" if owners else near(name, known, "[{}]")
                 raise self.fault((name,), f"{name} is not a section of a profile; allowed: {_listed(known)}", hint)
             if not isinstance(table, dict):
-                raise self.fault((name,), f"{name} must be a section, found {_found(table)}", f"write [{name}]")
+                raise self.fault((name,), f"{name} must be a section, found {found(table)}", f"write [{name}]")
         for name in known:
             if name not in self.tables and name not in _OPTIONAL_SECTIONS:
                 keys = ", ".join(key for key, rule in _SCHEMA[name].items() if rule.required)
@@ -151,20 +116,20 @@ class ProfileCheck:
                 )
         return {key: self._value(section, key, value, rules[key]) for key, value in table.items()}
 
-    def _value(self, section: str, key: str, value: Any, rule: _Key) -> str | int | float:
+    def _value(self, section: str, key: str, value: Any, rule: Key) -> str | int | float:
         if rule.fits(value) and rule.within(value):
             if (section, key) == ("profile", "name"):
                 return self._checked_name(value)
             return float(value) if rule.kind == "number" else value
-        remedy = "" if rule.fits(value) else _type_remedy(value, rule.kind)
-        raise self.fault((section, key), f"{section}.{key} must be {rule.allowed}, found {_found(value)}", remedy)
+        remedy = "" if rule.fits(value) else type_remedy(value, rule.kind)
+        raise self.fault((section, key), f"{section}.{key} must be {rule.allowed}, found {found(value)}", remedy)
 
     def _checked_name(self, name: str) -> str:
         if not _NAME.fullmatch(name):
             raise self.fault(
                 ("profile", "name"),
                 "profile.name must be 1 to 64 letters, digits, dots, dashes or underscores and start with a letter or "
-                f"digit, found {_found(name)}",
+                f"digit, found {found(name)}",
             )
         return name
 
@@ -180,7 +145,7 @@ class ProfileCheck:
                 f"convert the value to {unit} and name it {other}" if unit else f"name it {other}",
             )
         owner = next((name for name, keys in _SCHEMA.items() if key in keys), None)
-        hint = f"{key} belongs in [{owner}]" if owner else _near(key, list(rules), "{}")
+        hint = f"{key} belongs in [{owner}]" if owner else near(key, list(rules), "{}")
         return self.fault((section, key), f"{section}.{key} is not a key; [{section}] takes {', '.join(rules)}", hint)
 
     def sources(self, values: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -194,7 +159,7 @@ class ProfileCheck:
                     f'quote the whole key: "{name}.{next(iter(text), "key")}" = "where the figure comes from"',
                 )
             if not isinstance(text, str) or not text.strip():
-                raise self.fault(("sources", name), f"sources.{name} must be text in quotes, found {_found(text)}")
+                raise self.fault(("sources", name), f"sources.{name} must be text in quotes, found {found(text)}")
             self._names_a_key(("sources", name), name, values)
         return dict(sources)
 
@@ -204,7 +169,7 @@ class ProfileCheck:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise self.fault(
                 ("profile", "measure"),
-                f"profile.measure must be a list of keys in quotes, found {_found(names)}",
+                f"profile.measure must be a list of keys in quotes, found {found(names)}",
                 'for example measure = ["detector.dark_rate_hz"]',
             )
         for name in names:
@@ -216,7 +181,7 @@ class ProfileCheck:
         if name not in known:
             list_name = path[0] if path[0] == "sources" else ".".join(path)
             raise self.fault(
-                path, f'{list_name} names "{name}", which is not a key of this profile', _near(name, known, "{}")
+                path, f'{list_name} names "{name}", which is not a key of this profile', near(name, known, "{}")
             )
 
     def across(self, profile: Profile) -> None:
@@ -290,33 +255,6 @@ def _check_lease(profile: Profile, fault: _Fault) -> None:
             f"found {profile.timing.lease_ms}",
             "the lease is what the device waits before it goes dark: some hundred ms",
         )
-
-
-def _found(value: Any) -> str:
-    if isinstance(value, bool):
-        return f"the boolean {str(value).lower()}"
-    if isinstance(value, str):
-        return f'the text "{value[:40]}{"..." if len(value) > 40 else ""}"'
-    if isinstance(value, (int, float)):
-        return repr(value) if abs(value) < 10**20 or isinstance(value, float) else "an enormous whole number"
-    if isinstance(value, (dict, list)):
-        return "a table" if isinstance(value, dict) else "a list" if value else "an empty list"
-    return f"a {type(value).__name__}"
-
-
-def _type_remedy(value: Any, kind: str) -> str:
-    if kind == "text":
-        return "write the value in double quotes"
-    if isinstance(value, str):
-        return "write the number without quotes"
-    if kind == "whole" and isinstance(value, float) and value.is_integer():
-        return f"write {int(value)} without a decimal point or exponent"
-    return "write a plain number"
-
-
-def _near(name: str, known: list[str], form: str) -> str:
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean {form.format(near[0])}?" if near else "docs/PROFILES.md explains every key"
 
 
 def _listed(names: list[str]) -> str:

@@ -26,7 +26,8 @@ _TOMLLIB_WHERE = re.compile(r" \(at line (\d+), column (\d+)\)$")
 def read_toml(text: str, where: str) -> tuple[dict[str, Any], Mapping[KeyPath, Position]]:
     """Parse `text` (named `where` in messages); returns its tables and the position of every key and section.
 
-    Keys inside of an inline table have no position of their own: `position_of` answers with that of the table.
+    The n-th [[name]] stands under ("name", "n") and the first one under ("name",) too. Keys inside of an inline table have no position of
+    their own: `position_of` answers with that of the table.
     Raises ConfigError with the position if the text is not TOML 1.0.
     """
     try:
@@ -51,9 +52,15 @@ def key_positions(text: str) -> dict[KeyPath, Position]:
         elif text[at] == "#":
             at = _line_end(text, at)
         elif text[at] == "[":
-            start = at + (2 if text.startswith("[[", at) else 1)
-            section, _ = _dotted_key(text, start)
+            listed = text.startswith("[[", at)
+            section, _ = _dotted_key(text, at + (2 if listed else 1))
             found.setdefault(section, _line_column(text, at))
+            if listed:
+                number = 0
+                while (*section, str(number)) in found:
+                    number += 1
+                section = (*section, str(number))
+                found[section] = _line_column(text, at)
             at = _line_end(text, at)
         else:
             key, after = _dotted_key(text, at)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.trainer.grey import read_grey
+from pans.runtime.grey import read_grey
 from pans.trainer.tasks import load_task
 
 Image = pytest.importorskip("PIL.Image")

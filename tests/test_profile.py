@@ -291,7 +291,7 @@ def test_loads_a_path_and_ignores_the_line_ends_of_the_system(tmp_path):
 
 
 def test_an_unknown_name_lists_the_shipped_profiles():
-    with pytest.raises(ConfigError, match="dmd-spad, ideal, oled-qcmos, wdm-snspd") as caught:
+    with pytest.raises(ConfigError, match="dmd-spad, flow-snspd, ideal, oled-qcmos, wdm-snspd") as caught:
         load_profile("oled-qcmso")
     assert "did you mean oled-qcmos?" in caught.value.remedy
     assert caught.value.exit_code == 2
@@ -370,7 +370,10 @@ k = 2
         ("s", "t.u", "v"): (11, 5),
         ("s", "t.u", "a"): (13, 2),
         ("many",): (14, 1),
-        ("many", "k"): (15, 1),
+        ("many", "0"): (14, 1),
+        ("many", "0", "k"): (15, 1),
+        ("many", "1"): (16, 1),
+        ("many", "1", "k"): (17, 1),
     }
     assert set(tables["s"]["t.u"]) == {"v", "a"}
     assert position_of(("inline", "x"), found) == (9, 1)

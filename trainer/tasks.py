@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.grey import read_class_folder
 from pans.runtime.incident import Light, Optics
 
 from .generators import GENERATORS, generate
-from .grey import read_grey
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
 
 FILE_MAX_BYTES = 1 << 30
@@ -87,10 +87,11 @@ _SPLIT_OF_SEED = "drawn from other random streams"
 FIBRE_TASKS = {"mmf-mnist": "class", "mmf-mnist-image": "image"}  # MNIST behind a multimode fibre: what is asked for
 
 
-def load_task(name_or_path: str, data_dir: str | Path | None = None) -> Task:
+def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_seed: int = 0) -> Task:
     """Return the public set or drawn task of that name, or the .npz file or folder of class folders at that path.
 
-    `data_dir` (default: the environment variable PANS_DATA) holds the folders of the public sets. UsageError says what
+    `data_dir` (default: the environment variable PANS_DATA) holds the folders of the public sets; `data_seed` is that of drawn
+    tasks, and says nothing to others. UsageError says what
     is missing or unfit, DamagedFileError which file is not the pinned one.
     """
     if name_or_path in PUBLIC_SETS:
@@ -99,7 +100,7 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None) -> Task:
         digits = _load_public("mnist", data_folder(data_dir))
         return replace(digits, name=name_or_path, light="field", optics="mmf", target=FIBRE_TASKS[name_or_path])
     if name_or_path in GENERATORS:
-        return draw_task(name_or_path)
+        return draw_task(name_or_path, data_seed)
     path = Path(name_or_path)
     if path.is_dir():
         return _load_folder(path)
@@ -109,6 +110,13 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None) -> Task:
         f"task {name_or_path!r} is neither one of {', '.join(task_names())}, nor a .npz file, nor a folder",
         remedy="a .npz file holds `images` uint8 (n, height, width) and `labels`; a folder holds one folder per class",
     )
+
+
+def physical_encoder(task: Task) -> str:
+    """Return the encoder that the physics of `task` asks for: what `pans train` takes unless told otherwise."""
+    if task.name in GENERATORS and task.source:
+        return GENERATORS[task.name].encoder
+    return "active" if task.light == "transmission" else "coherent"
 
 
 def task_names() -> tuple[str, ...]:
@@ -174,31 +182,11 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _load_folder(folder: Path) -> Task:
-    """One folder per class, images of one size inside (see grey.py); names that begin with a dot are passed over."""
-    classes = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
-    images: list[NDArray[np.uint8]] = []
-    labels: list[int] = []
-    digest = hashlib.sha256()
-    n_bytes = 0
-    for label, name in enumerate(classes):
-        for path in sorted(entry for entry in (folder / name).iterdir() if entry.is_file() and entry.name[0] != "."):
-            image = read_grey(path, IMAGES_MAX_BYTES - n_bytes)
-            n_bytes += image.size
-            if images and image.shape != images[0].shape:
-                raise UsageError(
-                    f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the first image has "
-                    f"{images[0].shape[1]} x {images[0].shape[0]}",
-                    remedy="all images of a task have one size: resize them",
-                )
-            digest.update(image.tobytes())
-            images.append(image)
-            labels.append(label)
-    if not images:
-        raise UsageError(f"{folder}: no images in class folders", remedy="put the images of each class into a folder")
-    train, test = _split(folder, _objects(folder, np.stack(images), np.array(labels)))
-    return _checked(
-        Task(folder.resolve().name, tuple(classes), train, test, digest.hexdigest(), _SPLIT_BY_POSITION), folder
-    )
+    """One folder per class, images of one size inside (see runtime/grey.py)."""
+    pictures = read_class_folder(folder, IMAGES_MAX_BYTES)
+    train, test = _split(folder, _objects(folder, pictures.images, pictures.labels))
+    name = folder.resolve().name
+    return _checked(Task(name, pictures.classes, train, test, pictures.sha256, _SPLIT_BY_POSITION), folder)
 
 
 def _objects(where: Path, images: NDArray[Any], labels: NDArray[Any]) -> Objects:

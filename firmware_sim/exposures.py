@@ -1,0 +1,45 @@
+"""When the exposures of a running program begin: exposure numbers <-> ticks after the run's start.
+
+Owns this arithmetic for one run; never knows what is exposed. Ticks count from the start tick of ARM, exposures from its first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.wire import DARK_PATTERN
+
+from .upload import Program
+
+I64 = NDArray[np.int64]
+
+
+class Exposures:
+    """The exposures of `program` in `n_cycles` cycles (None: without end), on a clock of `tick_hz`."""
+
+    def __init__(self, program: Program, n_cycles: int | None, tick_hz: int) -> None:
+        self.n_exposures = None if n_cycles is None else n_cycles * program.n_slots
+        self.exposure_ticks = program.exposure_ticks
+        self.tick_hz = tick_hz
+        self._cycle_ticks, self._n_slots, self._offsets = program.cycle_ticks, program.n_slots, program.offsets
+        self._lit = program.patterns != DARK_PATTERN
+        self.longest_period_ticks = int(np.diff(program.offsets, append=program.offsets[0] + program.cycle_ticks).max())
+
+    def begins(self, first: int, count: int) -> I64:
+        """Ticks at which exposures first..first+count-1 begin, int64 (count,)."""
+        cycle, slot = np.divmod(np.arange(first, first + count), self._n_slots)
+        return np.asarray(cycle * self._cycle_ticks + self._offsets[slot])
+
+    def lit(self, first: int, count: int) -> NDArray[np.bool_]:
+        """Which of these exposures see light, bool (count,)."""
+        return np.asarray(self._lit[np.arange(first, first + count) % self._n_slots])
+
+    def begun_by(self, ticks: I64) -> I64:
+        """How many exposures have begun before or at each of `ticks`, int64 of the same shape, as if the run had no end."""
+        cycle, within = np.divmod(ticks, self._cycle_ticks)
+        return np.asarray(cycle * self._n_slots + np.searchsorted(self._offsets, within, "right"))
+
+    def seconds(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The same times in seconds."""
+        return np.asarray(ticks / self.tick_hz)

@@ -1,0 +1,154 @@
+"""What reaches the detectors in one run: the three kinds of scenes behind one face, for measurement.py.
+
+Owns the tables made once per pattern set (`prepare`), the choice of a scene's flow (`begin`) and still objects, which pass as the plan
+says; cells and tape have rooms of their own, with numba, opened only where something moves. Never draws a click.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.profile import Profile
+from pans.runtime.wire import DARK_PATTERN, NO_OBJECT, Mark
+from pans.runtime.wire_commands import PARALLEL
+
+from .changes import Changes
+from .detector import detector_model, first_click_probability, stream_key
+from .exposures import Exposures
+from .moving import Cells, SceneFile, Tape
+from .optics import expected_photoelectrons
+from .scene import Scene
+from .upload import Program
+
+if TYPE_CHECKING:
+    from .shifts import ShiftTable
+    from .tape import BarTable
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+class LightTable(NamedTuple):
+    """Every still object under every pattern, one exposure each: photoelectrons and click probability.
+
+    Both are float64 (objects, patterns + 1), the last column is the dark pattern.
+    """
+
+    photoelectrons: F64
+    probability: F64
+
+
+class RunLight(Protocol):
+    """One run's light; `rows` is asked for exposures in their order."""
+
+    probability: F64 | None  # of all rows, where they are known beforehand
+
+    @property
+    def mark(self) -> Mark:
+        """The next mark; its tick counts from the start of the run."""
+
+    def take_mark(self) -> None:
+        """Go on to the mark after."""
+
+    def rows(self, first: int, count: int) -> tuple[F64, I64]:
+        """Expected photoelectrons float64 (rows, channels), and int64 (count,) of the row of each of exposures first..first+count-1."""
+
+
+def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
+    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
+    return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
+
+
+def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
+    """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
+    with_dark = np.column_stack([photons, np.zeros(len(photons))])
+    return LightTable(with_dark, first_click_probability(detector_model(profile, exposure_us), with_dark))
+
+
+def prepare(
+    profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float
+) -> LightTable | ShiftTable | BarTable:
+    """Make what `scene` needs to know of the patterns, uint16 (patterns, pixels); ConfigError when they do not fit it."""
+    what = scene.what
+    if isinstance(what, Cells):
+        from .shifts import shift_table
+
+        return shift_table(profile, what.objects, levels, exposure_us, what.offset_px, what.background_transmission)
+    if isinstance(what, Tape):
+        from .tape import BarTable
+
+        return BarTable(profile, what, levels, exposure_us)
+    return light_table(profile, what, levels, exposure_us)
+
+
+def begin(
+    scene: SceneFile,
+    table: LightTable | ShiftTable | BarTable,
+    program: Program,
+    exposures: Exposures,
+    changes: Changes,
+    seed: int,
+    first_draw: int,
+) -> RunLight:
+    """Start the scene for one run; `first_draw` counts the exposures of earlier runs, so that no run repeats another one's objects."""
+    flow_seed = stream_key(seed, first_draw) if first_draw else seed
+    what = scene.what
+    if isinstance(table, LightTable):
+        assert isinstance(what, Scene)
+        return StillObjects(what, table, program, exposures, changes)
+    if isinstance(what, Cells):
+        from .cells import CellFlow
+
+        return CellFlow(what, cast("ShiftTable", table), exposures, changes, flow_seed)
+    from .tape import TapeFlow
+
+    return TapeFlow(cast(Tape, what), cast("BarTable", table), exposures, changes, flow_seed)
+
+
+class StillObjects:
+    """Objects that stand still for `cycles_per_object` cycles each, in the order of the scene, and start over at its end."""
+
+    def __init__(
+        self, scene: Scene, table: LightTable, program: Program, exposures: Exposures, changes: Changes
+    ) -> None:
+        self._scene, self._program, self._exposures, self._changes = scene, program, exposures, changes
+        self._photons = table.photoelectrons.sum(axis=1)
+        self._light = _by_row(table.photoelectrons, program.mode)
+        self.probability: F64 | None = _by_row(table.probability, program.mode)
+        self._column = np.where(program.patterns == DARK_PATTERN, program.n_patterns, program.patterns).astype(np.int64)
+        self._object = 0
+
+    @property
+    def mark(self) -> Mark:
+        """See `RunLight`."""
+        exposure = self._object * self._program.cycles_per_object * self._program.n_slots
+        tick = int(self._exposures.begins(exposure, 1)[0])
+        number = self._object % NO_OBJECT
+        photons = float(self._photons[number % self._scene.n_objects])
+        if self._changes:
+            photons *= float(self._changes.efficiency(np.array([tick / self._exposures.tick_hz]))[0])
+        return Mark(0, number, self._scene.truth(number % self._scene.n_objects), exposure, tick, photons)
+
+    def take_mark(self) -> None:
+        """See `RunLight`."""
+        self._object += 1
+
+    def rows(self, first: int, count: int) -> tuple[F64, I64]:
+        """See `RunLight`: parallel, an object is a row and the last one is dark; sequential, a row is an object under a pattern."""
+        program = self._program
+        cycle, slot = np.divmod(np.arange(first, first + count), program.n_slots)
+        row = cycle // program.cycles_per_object % NO_OBJECT % self._scene.n_objects
+        column = self._column[slot]
+        if program.mode != PARALLEL:
+            return self._light, row * (program.n_patterns + 1) + column
+        return self._light, np.where(column == program.n_patterns, len(self._light) - 1, row)
+
+
+def _by_row(table: F64, mode: int) -> F64:
+    """A table (objects, patterns + 1) as rows of what the channels see at once: see `StillObjects.rows`."""
+    if mode != PARALLEL:
+        return table.reshape(-1, 1)
+    return np.vstack([table[:, :-1], np.full((1, table.shape[1] - 1), table[0, -1])])
