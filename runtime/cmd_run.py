@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.resources
-import platform
 import shlex
 import signal
 import sys
@@ -20,14 +19,16 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
-from . import __version__
 from .cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
 from .errors import UsageError
+from .flow_settings import FlowSettings
 from .link import open_link
 from .profile import Profile, load_profile
+from .run_flow import add_options, settings_of
+from .run_words import closing_words, recording_header, what_was_run
 
 if TYPE_CHECKING:
-    from .verdict import Decider
+    pass
 
 T = TypeVar("T")
 BACKENDS = (
@@ -68,6 +69,8 @@ class Job:
     reconnect_s: float
     trace: Path | None
     command: str
+    flow: FlowSettings | None
+    act: str
 
 
 def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
@@ -101,6 +104,7 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", type=Path, help="recording to write (default: run.pansrec in --out)")
     parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
     _configure_common(parser, trials=1)
+    add_options(parser)
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
@@ -133,7 +137,11 @@ def _job(
             raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
     if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
         raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
-    loaded = load_profile(profile)
+    loaded, flow = load_profile(profile), settings_of(args)
+    if flow is not None and (decisions or args.trials != 1):
+        raise UsageError(
+            "a flow has as many decisions as objects pass", remedy="--seconds, in place of --decisions and --trials"
+        )
     return Job(
         bundle_path=bundle,
         device=device,
@@ -152,6 +160,8 @@ def _job(
         reconnect_s=args.reconnect_s,
         trace=args.trace,
         command=shlex.join(["pans", *sys.argv[1:]]),
+        flow=flow,
+        act=getattr(args, "act", "device"),
     )
 
 
@@ -199,42 +209,50 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
                 signal.signal(getattr(signal, name), _leave)
     opening = _Background(lambda: open_link(job.device))
     try:
+        from .actuate import open_actuator
         from .bundle import load_bundle
         from .container import read_file
         from .core import Core
         from .decide import make_decider
         from .live import live_view
-        from .loop import Onlookers, RunConfig, run_live
+        from .loop import LiveCore, Onlookers, RunConfig, run_live
         from .plan import build_plan
         from .record import Recorder
         from .recovery import Recovery
         from .report import summarise, write_markdown
+        from .run_flow import FlowRun, core_of
         from .trace import TracedLink
 
         bundle, bundle_sha256 = load_bundle(job.bundle_path)
-        plan = build_plan(
-            job.profile,
-            bundle,
-            shots_per_object=job.shots * job.trials,
-            dark_slots_per_cycle=job.dark_slots,
-            order=job.order,
-        )
         decider = make_decider(bundle, shots=job.shots, backend=job.backend)
-        n_objects = -(-job.decisions // job.trials)
+        n_objects, passing = -(-job.decisions // job.trials), None
+        core: LiveCore
+        if job.flow is not None:
+            plan, flow_core, n_cycles = core_of(job.profile, bundle, decider, job.flow, job.shots, job.seconds)
+            core, passing = flow_core, FlowRun(flow_core, open_actuator(job.act))
+        else:
+            plan = build_plan(
+                job.profile,
+                bundle,
+                shots_per_object=job.shots * job.trials,
+                dark_slots_per_cycle=job.dark_slots,
+                order=job.order,
+            )
+            n_cycles = n_objects * plan.cycles_per_object
+            core = Core(plan, decider, job.shots, n_cycles)
         config = RunConfig(
             job.shots,
-            n_objects * plan.cycles_per_object,
-            job.seconds,
+            n_cycles,
+            0.0 if passing is not None else job.seconds,
             job.deadline_us,
             job.profile.timing.lease_ms,
             job.realtime,
             started_ns,
         )
-        core = Core(plan, decider, config.shots, config.n_cycles)
         job.out.mkdir(parents=True, exist_ok=True)
         recording = job.record or job.out / "run.pansrec"
         expected = n_objects * job.trials
-        header = _header(job, bundle_sha256, decider, n_objects)
+        header = recording_header(job, bundle_sha256, decider, n_objects)
     except BaseException:
         _close_quietly(opening)
         raise
@@ -245,11 +263,20 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
         title = f"{bundle.name} on {job.profile.name}"
         with live_view(title, bundle.classes, expected, link.simulated) as watch:
-            result = run_live(link, job.profile, bundle, plan, core, config, recorder, recovery, Onlookers(watch))
-        summary = summarise(result, illumination=bundle.illumination() * job.shots, expected_decisions=expected)
+            onlookers = Onlookers(watch, None if passing is None else passing.prepared)
+            result = run_live(link, job.profile, bundle, plan, core, config, recorder, recovery, onlookers)
+        frames = job.shots * (1 if job.flow is None else job.flow.pool)
+        summary = summarise(
+            result,
+            illumination=bundle.illumination() * frames,
+            expected_decisions=expected,
+            flow=None if passing is None else passing.summary(),
+        )
+        if passing is not None:
+            result.tally.confusion += passing.core.matcher.confusion
         result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
     page = job.out / "summary.md"
-    facts = _what_was_run(job, bundle.name, bundle_sha256, decider.name, recording, summary)
+    facts = what_was_run(job, bundle.name, bundle_sha256, decider.name, recording, summary)
     write_markdown(page, summary, facts, result.tally, bundle.classes)
     payload = {
         **summary,
@@ -258,23 +285,8 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         "shots": job.shots,
         "seed": getattr(args, "seed", None),
     }
-    emit(args, payload, _closing_words(payload))
+    emit(args, payload, closing_words(payload))
     return _exit_code(summary)
-
-
-def _what_was_run(
-    job: Job, name: str, bundle_sha256: str, backend: str, recording: Path, summary: dict[str, Any]
-) -> dict[str, str]:
-    """The lines below the summary page's figures."""
-    return {
-        "bundle": f"{name} ({job.bundle_path.name}, SHA-256 {bundle_sha256[:16]}…)",
-        "device": f"{job.device} (firmware {summary['device'].get('firmware', 'unknown')})",
-        "profile": f"{job.profile.name}: {job.profile.description}",
-        "decision back end": backend,
-        "recording": f"{recording} (decision log SHA-256 {summary['decisions_sha256'][:16]}…; `pans replay` recomputes it)",
-        "command": f"`{job.command}`",
-        "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
-    }
 
 
 def process_start_ns() -> int:
@@ -294,62 +306,6 @@ def _close_quietly(opening: _Background[Any]) -> None:
         opening.result().close()
     except Exception as error:
         say(f"pans: besides, the device could not be opened: {error}")
-
-
-def _header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int) -> dict[str, Any]:
-    """What a recording must say to be understood alone; units are in the keys."""
-    import numba
-    import numpy
-    import onnxruntime
-
-    from .verdict import choice_of
-
-    return {
-        "bundle_sha256": bundle_sha256,
-        "command": job.command,
-        "device_url": job.device,
-        "simulated": job.device.startswith("sim:"),
-        "profile": {"name": job.profile.name, "sha256": job.profile.sha256, "toml": job.profile.text},
-        "config": {
-            "shots": job.shots,
-            "trials": job.trials,
-            "objects": n_objects,
-            "seconds": job.seconds,
-            "deadline_us": job.deadline_us,
-            "order": job.order,
-            "dark_slots_per_cycle": job.dark_slots,
-            "backend": decider.name,
-            "backend_choice": dict(choice_of(decider)),
-            "tick_hz": job.profile.clock.tick_hz,
-            "realtime_requested": job.realtime,
-        },
-        "versions": {
-            "pans": __version__,
-            "python": platform.python_version(),
-            "numpy": numpy.__version__,
-            "numba": numba.__version__,
-            "onnxruntime": onnxruntime.__version__,
-            "platform": platform.platform(),
-        },
-    }
-
-
-def _closing_words(summary: dict[str, Any]) -> str:
-    banner = "SIMULATED · " if summary["simulated"] else ""
-    accuracy = "unknown" if summary["accuracy"] is None else f"{summary['accuracy']:.2%}"
-    clicks = summary["clicks_mean"] or 0.0
-    photons = "unknown" if summary["photons_mean"] is None else f"{summary['photons_mean']:.2f}"
-    latency = summary["latency_us"]
-    lines = [
-        f"{banner}{summary['verdict']}: {summary['decisions']} decisions ({summary['objects']} objects × {summary['trials']} trials)",
-        f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary['illumination']:.1f} each",
-        f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
-        f"max {latency['max']:.0f} us; late {summary['late']}, lost {summary['lost']}",
-        *(f"  fault         {fault}" for fault in summary["faults"]),
-        f"  recording     {summary['recording']}",
-        f"  report        {summary['report']}",
-    ]
-    return "\n".join(lines)
 
 
 def _exit_code(summary: dict[str, Any]) -> int:

@@ -44,7 +44,7 @@ class FlowSettings:
     sure: float = 0.0  # a posterior below is ambiguous: no label
     # tape
     bars_per_s: float = 10_000.0
-    first_bar_us: float = 0.0  # when the window of bar position 0 is aligned, from the first exposure's start
+    first_bar: float = 1.0  # when the window of bar position 0 is aligned, in bar pitches from the start
     # gate
     gate_delay_us: float = 900.0  # from leaving to the pulse
     gate_us: float = 50.0  # length of the pulse
@@ -65,7 +65,7 @@ class FlowSettings:
             "pool": (1, 64),
             "sure": (0, 1),
             "bars_per_s": (1e-3, 1e9),
-            "first_bar_us": (0, 1e9),
+            "first_bar": (0, 1e9),
             "gate_delay_us": (0, 1e6),
             "gate_us": (0.01, 1e6),
             "gate_channel": (0, 255),

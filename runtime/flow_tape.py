@@ -35,7 +35,9 @@ class TapeCore(FlowCore):
         super().__init__(plan, decider, settings, limits, gated, shots, n_cycles)
         period_us = plan.slot_period_ticks * plan.tick_us
         self._pitch = round((1 << Q) * 1e6 / settings.bars_per_s / period_us)
-        self._origin = round((1 << Q) * (settings.first_bar_us - plan.exposure_us / 2) / period_us)
+        self._origin = round(
+            (1 << Q) * (settings.first_bar * 1e6 / settings.bars_per_s - plan.exposure_us / 2) / period_us
+        )
         if self._pitch < self.frames << Q:
             raise UsageError(
                 f"a bar passes in {self._pitch / (1 << Q):.3g} frames, a decision takes {self.frames}",

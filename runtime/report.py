@@ -14,15 +14,23 @@ from typing import Any
 
 from .container import replace_file
 from .loop import RunResult
+from .run_flow import flow_faults, flow_rows
 from .tally import RunTally
 
 
-def summarise(result: RunResult, *, illumination: float, expected_decisions: int) -> dict[str, Any]:
-    """Return the run's figures under the contract's keys; `illumination` is per decision, in photoelectrons per unit transmission."""
+def summarise(
+    result: RunResult, *, illumination: float, expected_decisions: int, flow: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the run's figures under the contract's keys; `illumination` is per decision, in photoelectrons per unit transmission.
+
+    `flow` is what run_flow.FlowRun says of passing objects; its figures replace those of still ones.
+    """
     tally, timing = result.tally, result.timing
-    faults = find_faults(result, expected_decisions)
+    faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None)
+    faults += [] if flow is None else flow_faults(flow)
     return {
         **tally.summary(),
+        **(flow or {}),
         "illumination": illumination,
         "late": timing.late,
         "late_blame": timing.blame,
@@ -52,7 +60,7 @@ def summarise(result: RunResult, *, illumination: float, expected_decisions: int
     }
 
 
-def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
+def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: bool = True) -> list[str]:
     """Return one sentence for each way in which the run broke its promise; empty means PASS."""
     tally, timing, stream = result.tally, result.timing, result.stream
     faults = []
@@ -70,7 +78,7 @@ def find_faults(result: RunResult, expected_decisions: int) -> list[str]:
         )
     if result.wrong_patterns:
         faults.append(f"{result.wrong_patterns} exposures showed another pattern than planned")
-    if tally.abstained:
+    if tally.abstained and aborts_are_faults:
         faults.append(f"{tally.abstained} decisions abstained")
     if expected_decisions and tally.decisions != expected_decisions:
         faults.append(f"{tally.decisions} of {expected_decisions} decisions were made; the run ended: {result.ended}")
@@ -109,6 +117,8 @@ def _figures(summary: Mapping[str, Any]) -> list[str]:
             f"{summary['dark']['low']:.2g} to {summary['dark']['high']:.2g}, profile {summary['dark']['expected']:.2g}",
         ),
     ]
+    if "flow" in summary:
+        rows += flow_rows(summary)
     return ["## Results", "", "| figure | value |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in rows)]
 
 
@@ -139,7 +149,7 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _confusion(tally: RunTally, classes: Sequence[str]) -> list[str]:
-    if tally.accuracy is None:
+    if not tally.confusion.any():
         return []
     head = ["## Decisions by class", "", "Rows: truth; columns: decision.", "", "| | " + " | ".join(classes) + " |"]
     rule = "| --- |" + " --- |" * len(classes)

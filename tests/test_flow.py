@@ -370,7 +370,7 @@ def test_bars_are_decided_where_the_speed_says() -> None:
     words = np.zeros(500, np.uint16)
     for position in range(20):
         words[15 + 25 * position] = 1 << (position % 3)
-    core = make(kind="tape", bars_per_s=20_000.0, first_bar_us=31.0)
+    core = make(kind="tape", bars_per_s=20_000.0, first_bar=31.0 / 50)
     output = feed(core, words)
     assert [d.exposure_index for d in output.decisions] == [15 + 25 * n for n in range(20)]
     assert [d.label for d in output.decisions] == [n % 3 for n in range(20)]
@@ -379,13 +379,13 @@ def test_bars_are_decided_where_the_speed_says() -> None:
 
 def test_bars_in_a_gap_abstain() -> None:
     words = np.full(500, 1, np.uint16)
-    output = feed(make(kind="tape", bars_per_s=20_000.0, first_bar_us=31.0), words, drop=(3,))
+    output = feed(make(kind="tape", bars_per_s=20_000.0, first_bar=31.0 / 50), words, drop=(3,))
     assert [d.flags for d in output.decisions][1:4] == [0, DecisionFlag.GAP | DecisionFlag.ABSTAINED, 0]
     assert len(output.decisions) == 20
 
 
 def test_alignment_does_not_drift_over_a_million_bars() -> None:
-    core = make(kind="tape", bars_per_s=20_000.0 / 1.0001, first_bar_us=31.0)
+    core = make(kind="tape", bars_per_s=20_000.0 / 1.0001, first_bar=31.0 / 50.005)
     assert core._window_of(10**6) == round(15 + 25.0025 * 10**6)  # type: ignore[attr-defined]
 
 

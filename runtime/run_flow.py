@@ -1,0 +1,167 @@
+"""`pans run --flow`: what a run with passing objects needs beside an ordinary one.
+
+Owns its options, the plan, core and actuator that they ask for, and its part of the summary and of the page for people; the order of
+a run is cmd_run.py's and loop.py's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from .clicks import click_law, click_probability
+from .flow_settings import FlowSettings, read_flow, with_gate
+from .profile import Profile
+
+if TYPE_CHECKING:
+    from .actuate import Actuator
+    from .bundle import Bundle
+    from .flow import FlowCore
+    from .live_run import LiveRun
+    from .plan import Plan
+    from .verdict import Decider
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a flow to `pans run`."""
+    group = parser.add_argument_group("objects that pass by (docs/FLOW.md)")
+    group.add_argument("--flow", metavar="cells|tape|FILE", help="settings of the flow: shipped ones or a TOML file")
+    group.add_argument(
+        "--gate-class", action="append", default=[], metavar="NAME", help="class to pulse for (repeatable, or a,b)"
+    )
+    group.add_argument(
+        "--gate-delay-us", type=float, metavar="US", help="from leaving to the pulse (default: the settings', 900)"
+    )
+    group.add_argument(
+        "--act",
+        default="device",
+        metavar="URL",
+        help="what pulses: device (default: its GATE command), or NAME:...",
+    )
+    group.add_argument(
+        "--pool", type=int, metavar="N", help="windows side by side whose evidence is added (default: the settings', 1)"
+    )
+
+
+def settings_of(args: argparse.Namespace) -> FlowSettings | None:
+    """Return the settings that the command line asks for, None without --flow."""
+    if getattr(args, "flow", None) is None:
+        return None
+    classes = tuple(name for part in args.gate_class for name in part.split(",") if name)
+    settings = with_gate(read_flow(args.flow), classes, args.gate_delay_us)
+    return settings if args.pool is None else replace(settings, pool=args.pool)
+
+
+def core_of(
+    profile: Profile, bundle: Bundle, decider: Decider, settings: FlowSettings, shots: int, seconds: float
+) -> tuple[Plan, FlowCore, int]:
+    """Return plan, core and number of cycles (0: until stopped) of a flow that lasts `seconds`."""
+    from .flow_make import make_flow_core
+    from .flow_plan import build_flow_plan
+
+    plan = build_flow_plan(profile, bundle, block_us=settings.block_us, dark_every=settings.dark_every)
+    dark = float(click_probability(click_law(profile, plan.exposure_us), 0.0))
+    cycles = math.ceil(seconds * 1e6 / plan.cycle_us * (1 - 1e-12)) if seconds else 0
+    core = make_flow_core(plan, decider, settings, bundle.classes, shots=shots, dark_probability=dark, n_cycles=cycles)
+    return plan, core, cycles
+
+
+class FlowRun:
+    """Joins core and gates of one run, and says afterwards what came of both."""
+
+    def __init__(self, core: FlowCore, actuator: Actuator | None) -> None:
+        self.core = core
+        self._actuator = actuator
+        self._gates: dict[str, Any] = {}
+        self._run: LiveRun | None = None
+
+    def prepared(self, run: LiveRun) -> None:
+        """Before arming: pulses go to the actuator, and the figures hear of those that were not made."""
+        self._run = run
+        run.gates.actuator = self._actuator
+        run.gates.failed = self.core.matcher.undo
+
+    def summary(self) -> dict[str, Any]:
+        """Return the flow's part of the summary, under the contract's keys."""
+        core = self.core
+        core.matcher.finish()
+        if self._actuator is not None:
+            self._actuator.close()
+        limits = core.limits
+        return {
+            "flow": {
+                "kind": core.settings.kind,
+                "frames_per_decision": core.frames,
+                "pool": core.settings.pool,
+                "onset_clicks": limits.onset_clicks,
+                "release_clicks": limits.release_clicks,
+                "onset_frames": limits.onset_frames,
+                "longest_frames": limits.longest,
+                "empty_frames": core.empty_frames,
+                "gate_delay_us": core.settings.gate_delay_us,
+                "gate_classes": list(core.settings.gate_classes),
+            },
+            **core.matcher.summary(core.frames),
+            "gates": {} if self._run is None else self._run.gates.summary(),
+        }
+
+
+def flow_faults(summary: Mapping[str, Any]) -> list[str]:
+    """Return one sentence for each broken promise of the gates."""
+    gates = summary["gates"]
+    lost = gates.get("refused", 0) + gates.get("expired", 0)
+    return (
+        [f"{lost} of {gates['asked']} pulses were not made: {gates['refused']} refused, {gates['expired']} expired"]
+        if lost
+        else []
+    )
+
+
+def flow_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return name and text of the figures that only a flow has."""
+    counts, gates = summary["passages"], summary["gates"]
+    aborted = ", ".join(f"{name} {n}" for name, n in summary["aborted"].items()) or "none"
+    rows = [
+        (
+            "passages (alone, in coincidence, in gaps)",
+            f"{counts['alone']}, {counts['coincident']}, {counts['in_gaps']}",
+        ),
+        ("accuracy per passage alone, 95 % interval", _share(summary, "accuracy")),
+        ("accuracy where a label was given", _share(summary, "accuracy_labelled")),
+        ("missed, of those alone", _share(summary, "missed")),
+        ("doubled, of those alone", _share(summary, "doubled")),
+        ("decisions without a passage", str(counts["without_mark"])),
+        ("coincidences aborted / labelled", f"{counts['coincident_aborted']} / {counts['coincident_labelled']}"),
+        ("aborted", aborted),
+        ("yield (targets pulsed)", _share(summary, "yield")),
+        ("purity (pulses on a target alone)", _share(summary, "purity")),
+        ("pulses asked, done, refused, expired", ", ".join(str(n) for n in gates.values())),
+        ("clicks of the whole passage", _mean(summary["passage_clicks_mean"])),
+        ("photons of the whole passage, at least (scaled by clicks)", _mean(summary["passage_photons_mean"])),
+    ]
+    return rows
+
+
+def flow_words(summary: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a flow's closing words."""
+    counts, gates = summary["passages"], summary["gates"]
+    return [
+        f"  passages      {counts['marks']}: {counts['alone']} alone, {counts['coincident']} in coincidence, {counts['in_gaps']} in gaps; "
+        f"missed {_share(summary, 'missed')}, doubled {_share(summary, 'doubled')}",
+        f"  aborted       {', '.join(f'{name} {n}' for name, n in summary['aborted'].items()) or 'none'}",
+        f"  light         {_mean(summary['clicks_mean'])} clicks of the window, {_mean(summary['passage_clicks_mean'])} of the passage",
+        f"  gates         asked {gates['asked']}, done {gates['done']}, refused {gates['refused']}, expired {gates['expired']}; "
+        f"yield {_share(summary, 'yield')}, purity {_share(summary, 'purity')}",
+    ]
+
+
+def _share(summary: Mapping[str, Any], name: str) -> str:
+    value, interval = summary[name], summary[f"{name}_ci"]
+    return "unknown" if value is None else f"{value:.3%} ({interval[0]:.3%} to {interval[1]:.3%})"
+
+
+def _mean(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f}"
