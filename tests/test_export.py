@@ -13,6 +13,7 @@ from pans.trainer import export as export_module
 from pans.trainer.export import (
     DEAD_VARIANCE,
     IR_VERSION,
+    Shown,
     compare,
     export,
     fold_normalisation,
@@ -38,11 +39,10 @@ def written(path, head, mean, d_f, **changed):
         "task": "own",
         "classes": tuple("abcd"),
         "image_shape": (2, 3),
-        "levels": 124,
         "provenance": {"seed": 0},
     }
     levels = RNG.integers(0, 124, (d_f, 6)).astype(np.uint16)
-    return export(path, head, mean, levels, 0.01, **(facts | changed))
+    return export(path, head, mean, Shown(124, levels, 0.01), **(facts | changed))
 
 
 def test_folded_layer_is_normalisation_then_layer():

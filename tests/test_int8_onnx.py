@@ -33,7 +33,7 @@ def test_the_model_gives_the_scores_of_the_integers() -> None:
 def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
     torch = pytest.importorskip("torch")
     from pans.runtime.bundle import load_bundle
-    from pans.trainer.export import export
+    from pans.trainer.export import Shown, export
     from pans.trainer.heads import MlpHead
 
     head = MlpHead(4, 8, 3, torch.Generator().manual_seed(1)).eval()
@@ -41,13 +41,11 @@ def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignor
         tmp_path / "a.pans",
         head,
         np.full(4, 0.4),
-        np.ones((4, 6), np.uint16),
-        0.1,
+        Shown(2, np.ones((4, 6), np.uint16), 0.1),
         name="a",
         task="t",
         classes=("x", "y", "z"),
         image_shape=(2, 3),
-        levels=2,
         provenance={},
     )
     bundle, _ = load_bundle(tmp_path / "a.pans")

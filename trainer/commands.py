@@ -1,6 +1,6 @@
-"""The commands of the trainer: `pans train`, `pans evaluate`, `pans data`.
+"""The commands of the trainer: `pans train`, `pans data` (`pans evaluate` is in cmd_evaluate.py).
 
-Owns their arguments and how their answers look; the work is in train.py, export.py, evaluate.py and tasks.py. Heavy
+Owns their arguments and how their answers look; the work is in train.py, export.py and tasks.py. Heavy
 packages are imported when a command runs, not before. All accuracies here are SIMULATED through the profile.
 """
 
@@ -19,18 +19,17 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import PansError, UsageError
 
-from .options import ESTIMATOR_NAMES
+from .cmd_evaluate import DEFAULT_PROFILE, add_data_dir, figures, first, lines, measure
+from .options import ENCODERS, ESTIMATOR_NAMES, HEADS
 
 if TYPE_CHECKING:
-    from pans.runtime.bundle import Bundle
     from pans.runtime.profile import Profile
 
-    from .evaluate import Measured
+    from .evaluate import Measured, MeasuredPictures
     from .options import Options
-    from .tasks import Objects, Task
+    from .tasks import Task
     from .train import EpochReport, Trained
 
-DEFAULT_PROFILE = "oled-qcmos"
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -38,11 +37,23 @@ NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("task", metavar="TASK", help="fashion-mnist, mnist, a .npz file, or a folder of class folders")
+    parser.add_argument(
+        "task", metavar="TASK", help="a name (`pans data list`), a .npz file, or a folder of class folders"
+    )
     parser.add_argument("--features", type=int, required=True, metavar="D", help="number of patterns")
     parser.add_argument("--profile", default=DEFAULT_PROFILE, metavar="P", help=f"default: {DEFAULT_PROFILE}")
-    parser.add_argument("--encoder", choices=("active",), default="active", help="how light meets the object")
-    parser.add_argument("--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local")
+    parser.add_argument("--encoder", choices=ENCODERS, help="how light meets the object (default: what the task's is)")
+    parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
+    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
+    parser.add_argument(
+        "--input-photons",
+        type=float,
+        metavar="N",
+        help="mean photoelectrons that reach a passive encoder in one exposure",
+    )
+    parser.add_argument(
+        "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
+    )
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
         "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
@@ -80,7 +91,9 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
-    parser.add_argument("--head", choices=("mlp", "conv"), default="mlp", help="digital back end (default mlp)")
+    parser.add_argument(
+        "--head", choices=HEADS, help="digital back end (default mlp; picture where the task asks for it)"
+    )
     parser.add_argument("--batch", type=int, default=512, metavar="B", help="objects per step (default 512)")
     parser.add_argument(
         "--slope", type=float, default=1.0, metavar="S", help="slope annealing: light at the start times S"
@@ -94,9 +107,10 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dark", type=float, metavar="R", help="dark photoelectrons per exposure in training, instead of the profile's"
     )
+    parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
     parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
-    _data_dir(parser)
+    add_data_dir(parser)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
 
 
@@ -111,11 +125,11 @@ def _train(args: argparse.Namespace) -> int:
     if not 1 <= args.threads <= 1024:
         raise UsageError(f"--threads is {args.threads}, allowed: 1 to 1024")
     profile = load_profile(args.profile)
-    options = _options(args)
-    check_options(options, profile)
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out.parent} is not a folder", remedy="make it first")
-    task = load_task(args.task, args.data_dir)
+    task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
+    options = _options(args, task)
+    check_options(options, profile)
     torch.set_num_threads(args.threads)
     started = time.perf_counter()
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
@@ -125,15 +139,15 @@ def _train(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
-    exported, measured = _export_and_measure(args, task, profile, trained, time.perf_counter() - started)
+    exported, measured = _export_andmeasure(args, task, profile, trained, time.perf_counter() - started)
     checkpoint.unlink(missing_ok=True)
     seconds = time.perf_counter() - started
     payload = {
         "bundle": str(args.out),
         "sha256": exported.sha256,
-        **_figures(measured),
-        "first_200": _figures(_measure(exported.bundle, profile, _first(task.test, 200), 1, None, 0, fall_back=True)),
-        "top_photoelectrons": exported.bundle.photons_per_level * (exported.bundle.levels - 1),
+        **figures(measured),
+        "first_200": figures(measure(exported.bundle, profile, first(task.test, 200), 1, None, 0, fall_back=True)),
+        "top_photoelectrons": exported.bundle.photons_per_level * max(0, exported.bundle.levels - 1),
         "quantisation_error_bound": trained.quantised.error_bound if trained.quantised else None,
         "score_difference": exported.score_difference,
         "words_compared": exported.words_compared,
@@ -142,33 +156,56 @@ def _train(args: argparse.Namespace) -> int:
         "seconds": seconds,
         "simulated": True,
     }
-    emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{_lines(measured)}")
+    emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{lines(measured)}")
     return EXIT_FINE
 
 
-def _options(args: argparse.Namespace) -> Options:
+def _options(args: argparse.Namespace, task: Task) -> Options:
+    """What the arguments mean for this task: its physics chooses the encoder, its question the head."""
     from .options import DEFAULT_ALPHA, EXACT_FEATURES_MAX, Options
+    from .tasks import physical_encoder
 
-    estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
+    encoder = args.encoder or physical_encoder(task)
+    is_picture = task.target == "image"
+    head = args.head or ("picture" if is_picture else "mlp")
+    if (head == "picture") != is_picture:
+        raise UsageError(
+            f"--head {head}: the task {task.name} asks for {'a picture' if is_picture else 'a class'}",
+            remedy="leave --head out",
+        )
+    if encoder == "active" and task.optics != "none":
+        raise UsageError(f"--encoder active: {task.name} lies behind a fibre", remedy="use --encoder coherent")
+    best = "exact" if args.features <= EXACT_FEATURES_MAX else "local"
+    estimator = args.estimator or ("ste" if is_picture else best)
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    same = "features photons clicks epochs restarts starts warm polish mix shots seed head hidden batch slope clamp dark budget"
-    return Options(alpha=alpha, estimator=estimator, **{name: getattr(args, name) for name in same.split()})
+    same = (
+        "features photons clicks epochs restarts starts warm polish mix shots seed hidden batch slope clamp dark budget"
+    )
+    same += " complex_field conserving input_photons"
+    return Options(
+        alpha=alpha,
+        estimator=estimator,
+        encoder=encoder,
+        head=head,
+        **{name: getattr(args, name) for name in same.split()},
+    )
 
 
-def _export_and_measure(
+def _export_andmeasure(
     args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float
-) -> tuple[Any, Measured]:
+) -> tuple[Any, Measured | MeasuredPictures]:
     from .export import export_trained
-    from .public_sets import PUBLIC_SETS
+    from .tasks import task_names
 
     known = asdict(trained.options) | {"threads": args.threads}
     provenance = {
-        "task_argument": args.task if args.task in PUBLIC_SETS else Path(args.task).name,
+        "task_argument": args.task if args.task in task_names() else Path(args.task).name,
+        "data_seed": args.data_seed,
         "options": {key: str(value) if value == math.inf else value for key, value in known.items()},
         "training_seconds": round(seconds, 1),
     }
     exported = export_trained(args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance)
-    return exported, _measure(exported.bundle, profile, task.test, 1, None, 0, fall_back=True)
+    return exported, measure(exported.bundle, profile, task.test, 1, None, 0, fall_back=True)
 
 
 @contextmanager
@@ -199,107 +236,13 @@ def _epoch_line(epoch: EpochReport, options: Options) -> str:
     )
 
 
-# ---- evaluate ----
-
-
-def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", metavar="BUNDLE", help="a .pans file")
-    parser.add_argument("--task", metavar="T", help="as of `pans train` (default: what the bundle was trained on)")
-    parser.add_argument("--profile", metavar="P", help="default: what the bundle was trained for")
-    parser.add_argument("--shots", type=int, default=1, metavar="K", help="exposures of every pattern (default 1)")
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument("--trials", type=int, metavar="N", help="sampled decisions per object (default 30)")
-    way.add_argument("--exact", action="store_true", help="enumerate all click words: no trials, no sampling error")
-    parser.add_argument("--objects", type=int, metavar="N", help="only the first N held-out objects (default: all)")
-    parser.add_argument(
-        "--dark", type=float, metavar="R", help="dark photoelectrons per exposure, instead of the profile's"
-    )
-    parser.add_argument("--eta", type=float, default=1.0, metavar="E", help="all light times E (default 1)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trials (default 0)")
-    _data_dir(parser)
-
-
-def _evaluate(args: argparse.Namespace) -> int:
-    from pans.runtime.bundle import load_bundle
-    from pans.runtime.profile import load_profile
-
-    from .tasks import load_task
-
-    if args.objects is not None and args.objects < 1:
-        raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
-    if args.shots < 1 or args.seed < 0:
-        raise UsageError(f"--shots is {args.shots}, --seed is {args.seed}, allowed: from 1, from 0")
-    bundle, digest = load_bundle(args.bundle)
-    profile = load_profile(args.profile or str(bundle.provenance.get("profile", DEFAULT_PROFILE)))
-    task = load_task(args.task or str(bundle.provenance.get("task_argument", bundle.task)), args.data_dir)
-    if task.classes != bundle.classes:
-        raise UsageError(
-            f"{args.bundle} decides among {len(bundle.classes)} classes ({', '.join(bundle.classes[:3])}, ...), the task "
-            f"{task.name} has {len(task.classes)} ({', '.join(task.classes[:3])}, ...)"
-        )
-    whole = task.split_here and bundle.provenance.get("data_sha256") != task.sha256
-    objects = task.everything() if whole else task.test
-    trials = None if args.exact else args.trials if args.trials is not None else 30
-    started = time.perf_counter()
-    measured = _measure(
-        bundle, profile, _first(objects, args.objects), args.shots, trials, args.seed, eta=args.eta, dark=args.dark
-    )
-    payload = {
-        **_figures(measured),
-        "task": task.name,
-        "profile": profile.name,
-        "sha256": digest,
-        "seconds": time.perf_counter() - started,
-        "simulated": True,
-    }
-    emit(args, payload, _lines(measured))
-    return EXIT_FINE
-
-
-def _measure(
-    bundle: Bundle,
-    profile: Profile,
-    objects: Objects,
-    shots: int,
-    trials: int | None,
-    seed: int,
-    *,
-    eta: float = 1.0,
-    dark: float | None = None,
-    fall_back: bool = False,
-) -> Measured:
-    """Exact without `trials`; with `fall_back`, 30 trials where there is too much to enumerate."""
-    from .evaluate import EXACT_OUTCOMES_MAX, evaluate_exactly, evaluate_sampled, light_of
-
-    light = light_of(bundle, profile, objects.images, eta=eta, dark=dark)
-    if trials is None and fall_back and (shots + 1) ** bundle.n_features > EXACT_OUTCOMES_MAX:
-        trials = 30
-    if trials is None:
-        return evaluate_exactly(bundle, light, objects.labels, shots=shots)
-    return evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=seed)
-
-
-def _figures(measured: Measured) -> dict[str, Any]:
-    return asdict(measured)
-
-
-def _lines(measured: Measured) -> str:
-    how = f"{measured.trials} trials" if measured.trials else "exact expectation"
-    return (
-        f"SIMULATED accuracy {100 * measured.accuracy_mean:.2f} %  ({measured.objects} objects, {how}, K = {measured.shots})\n"
-        f"  spread over trials      {100 * measured.accuracy_std:.2f} points\n"
-        f"  error from the objects  {100 * measured.accuracy_se_objects:.2f} points\n"
-        f"  clicks {measured.clicks_mean:.3f}   photons {measured.photons_mean:.2f}   illumination {measured.illumination:.1f}"
-    )
-
-
 # ---- data ----
 
 
 def _configure_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("list", "fetch"), help="what is there, or fetch what is not")
     parser.add_argument("names", nargs="*", metavar="NAME", help="fashion-mnist, mnist (default: all)")
-    _data_dir(parser)
+    add_data_dir(parser)
 
 
 def _data(args: argparse.Namespace) -> int:
@@ -331,14 +274,6 @@ def _data(args: argparse.Namespace) -> int:
 # ---- shared ----
 
 
-def _data_dir(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
-
-
-def _first(objects: Objects, count: int | None) -> Objects:
-    return objects if count is None else type(objects)(objects.images[:count], objects.labels[:count])
-
-
 def _torch() -> Any:
     try:
         import torch
@@ -348,5 +283,4 @@ def _torch() -> Any:
 
 
 TRAIN = Command("train patterns and head through a profile, and export a bundle", _configure_train, _train)
-EVALUATE = Command("accuracy of a bundle against photons, sampled or exact", _configure_evaluate, _evaluate)
 DATA = Command("list or fetch the public data sets", _configure_data, _data)

@@ -29,14 +29,14 @@ def conv_nodes(head: ConvHead, scale: F64, shift: F64) -> tuple[list[NodeProto],
         helper.make_node("Unsqueeze", ["normal", "channel"], ["maps0"]),
     ]
     for i, convolution in enumerate(head.convolutions):
-        constants |= {f"kernel{i}": _plain(convolution.weight), f"offset{i}": _plain(convolution.bias)}
+        constants |= {f"kernel{i}": as_float32(convolution.weight), f"offset{i}": as_float32(convolution.bias)}
         half = constants[f"kernel{i}"].shape[-1] // 2
         inputs = [f"maps{i}", f"kernel{i}", f"offset{i}"]
         nodes.append(helper.make_node("Conv", inputs, [f"sums{i}"], strides=[2], pads=[half, half]))
         nodes.append(helper.make_node("Relu", [f"sums{i}"], [f"maps{i + 1}"]))
     nodes.append(helper.make_node("Flatten", [f"maps{len(head.convolutions)}"], ["flat"], axis=1))
-    constants |= {"w1": _plain(head.hidden.weight), "b1": _plain(head.hidden.bias)}
-    constants |= {"w2": _plain(head.output.weight), "b2": _plain(head.output.bias)}
+    constants |= {"w1": as_float32(head.hidden.weight), "b1": as_float32(head.hidden.bias)}
+    constants |= {"w2": as_float32(head.output.weight), "b2": as_float32(head.output.bias)}
     nodes += [
         helper.make_node("Gemm", ["flat", "w1", "b1"], ["sums"], transB=1),
         helper.make_node("Relu", ["sums"], ["hidden"]),
@@ -45,6 +45,7 @@ def conv_nodes(head: ConvHead, scale: F64, shift: F64) -> tuple[list[NodeProto],
     return nodes, constants
 
 
-def _plain(parameter: object) -> NDArray[np.generic]:
+def as_float32(parameter: object) -> NDArray[np.generic]:
+    """Return a weight of a torch module, as an exporter needs it."""
     assert isinstance(parameter, torch.Tensor)
     return np.asarray(parameter.detach().float().numpy())

@@ -131,7 +131,8 @@ class CoherentField(nn.Module):
         """Return photoelectrons (n, d_f) of fields (n, inputs), float32 or complex64; there is no floor."""
         matrix = self.matrix()
         if field.is_complex() or matrix.is_complex():
-            out = field.to(torch.complex64) @ matrix.to(torch.complex64).T
+            dtype = torch.promote_types(field.dtype, matrix.dtype)
+            out = field.to(dtype) @ matrix.to(dtype).T
             return out.real.square() + out.imag.square()
         return (field @ matrix.T).square()
 

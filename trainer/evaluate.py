@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle import Bundle
 from pans.runtime.clicks import ClickLaw, click_law, click_probability, object_transmission
-from pans.runtime.decide import make_decider
+from pans.runtime.decide import PictureDecider, make_decider
 from pans.runtime.errors import UsageError
+from pans.runtime.picture import likeness
 from pans.runtime.profile import Profile
 
 from .quantise import exposure_us_of
@@ -56,7 +57,9 @@ class Light:
 def light_of(
     bundle: Bundle, profile: Profile, images: NDArray[np.uint8], *, eta: float = 1.0, dark: float | None = None
 ) -> Light:
-    """Show the patterns of `bundle` on `images` (n, height, width) through `profile`; `eta` scales the light.
+    """Show the patterns of `bundle` on `images` (n, height, width) through `profile`, or look at them through its passive optics.
+
+    `eta` scales the light.
 
     `dark` replaces the profile's dark photoelectrons per exposure.
     """
@@ -64,9 +67,16 @@ def light_of(
         raise UsageError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
         raise UsageError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
-    law = click_law(profile, exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1)))
+    if bundle.analyser is None:
+        exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
+    else:
+        exposure_us = bundle.analyser.exposure_us
+    law = click_law(profile, exposure_us)
     if dark is not None:
         law = ClickLaw(dark, law.read_noise_e, law.threshold_e)
+    if bundle.analyser is not None:
+        light = bundle.analyser.photoelectrons(images) * eta
+        return Light(light, click_probability(law, light), law, 0.0)
     patterns = bundle.patterns() * eta
     light = np.empty((len(images), bundle.n_features))
     step = max(1, _CHUNK_NUMBERS // bundle.n_pixels)
@@ -136,6 +146,57 @@ def evaluate_sampled(
         of_trial[trial] = hit.mean()
     spread = float(of_trial.std(ddof=1)) if trials > 1 else 0.0
     return _measured(light, right / trials, spread, trials=trials, shots=shots, clicks=clicks / (trials * len(labels)))
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredPictures:
+    """Means per picture given back. `ssim_std` is the spread over trials, `ssim_se_objects` the error from having few objects."""
+
+    ssim_mean: float
+    ssim_std: float
+    ssim_se_objects: float
+    mse_mean: float
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    objects: int
+    trials: int
+    shots: int
+
+
+def evaluate_pictures(
+    bundle: Bundle, light: Light, images: NDArray[np.uint8], *, shots: int = 1, trials: int = 1, seed: int = 0
+) -> MeasuredPictures:
+    """Give back `trials` pictures of every object from `shots` shots and compare them with its image, uint8 (n, height, width)."""
+    if trials < 1:
+        raise UsageError(f"--trials is {trials}, allowed: 1 or more")
+    decider = PictureDecider(bundle)
+    rng = np.random.default_rng(seed)
+    likes, of_trial, squares, clicks = np.zeros(len(images)), np.empty(trials), 0.0, 0
+    step = max(1, _CHUNK_NUMBERS // (64 * bundle.n_outputs))
+    for trial in range(trials):
+        found = np.empty(len(images))
+        for start in range(0, len(images), step):
+            counts = rng.binomial(shots, light.probability[start : start + step])
+            clicks += int(counts.sum())
+            alike = likeness(decider.pictures(counts, shots), images[start : start + step])
+            found[start : start + step] = alike.ssim
+            squares += float(alike.mse.sum())
+        likes += found
+        of_trial[trial] = found.mean()
+    n = len(images)
+    return MeasuredPictures(
+        ssim_mean=float(likes.mean()) / trials,
+        ssim_std=float(of_trial.std(ddof=1)) if trials > 1 else 0.0,
+        ssim_se_objects=float((likes / trials).std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+        mse_mean=squares / (n * trials),
+        clicks_mean=clicks / (n * trials),
+        photons_mean=shots * float(light.photoelectrons.sum()) / n,
+        illumination=light.illumination * shots,
+        objects=n,
+        trials=trials,
+        shots=shots,
+    )
 
 
 def _measured(

@@ -6,6 +6,8 @@ touches the held-out objects.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -23,12 +25,15 @@ CHUNK = 2000  # objects per pass where no gradient is needed
 class TrainingData:
     """Training objects as tensors: `shown` is what the encoder gets, (n, inputs); `target` a label, or an image in [0, 1].
 
-    Active: float32 transmission with a perfect black, `floor` being the real one. Passive: incident field or intensity.
+    Active: float32 transmission with a perfect black, `floor` being the real one. Passive: incident field or intensity;
+    with `basis` (inputs, size) of a field, its coordinates there (field_basis.py).
     """
 
-    def __init__(self, task: Task, profile: Profile, options: Options) -> None:
+    def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
         self.shown = encoder_input(task, task.train, profile, options)
+        if basis is not None:
+            self.shown = self.shown @ basis
         self.labels = torch.from_numpy(task.train.labels)
         self.image_shape = task.image_shape
         self.is_image = task.target == "image"
@@ -54,7 +59,16 @@ def encoder_input(task: Task, objects: Objects, profile: Profile, options: Optio
     incident = incident_field if coherent else incident_intensity
     x = torch.from_numpy(incident(objects.images, task.light, task.optics)).flatten(1)
     if options.input_photons is not None:
-        given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics).reshape(-1, x.shape[1])
-        scale = options.input_photons / float(given.sum(axis=1).mean())
+        scale = full_scale_photoelectrons(task, options)
         x = x * (scale**0.5 if coherent else scale)
     return x
+
+
+def full_scale_photoelectrons(task: Task, options: Options) -> float:
+    """Return the photoelectrons that one pixel at full scale brings to a passive encoder: 1, or what `input_photons` asks for."""
+    if options.input_photons is None:
+        return 1.0
+    given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics).reshape(
+        -1, math.prod(task.image_shape)
+    )
+    return options.input_photons / float(given.sum(axis=1).mean())
