@@ -17,7 +17,8 @@ from .bundle import Bundle
 from .clock import ClockModel, ClockStep
 from .errors import DeviceError, LinkError
 from .evidence import Evidence, Stamped
-from .link import Link, LinkReader
+from .link import Link
+from .link_reader import LinkReader
 from .plan import Plan
 from .session import HostSession
 from .wire import DARK_PATTERN, SLOT_DTYPE, Frame, FrameDecoder, MalformedMessage, Opcode, Welcome

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from .wire_bulk import BulkDecoder
 
 
+_CODES = tuple(bytes((length + 1,)) for length in range(254))
+_CRC_SEEDS = tuple(0 if message_type in UNSEEDED else SCHEMA for message_type in range(256))
+
+
 class Frame(NamedTuple):
     """One whole frame whose CRC was right."""
 
@@ -29,12 +33,8 @@ def cobs_encode(data: bytes) -> bytes:
     """Return `data` without any zero byte (Cheshire and Baker 1999), at most 1 + len/254 bytes longer; no delimiter added."""
     runs = data.split(b"\0")
     if len(data) < 254 or len(max(runs, key=len)) < 254:
-        # The plain form has the length of the data plus one: only the zeros change, which is what makes short frames quick.
-        plain, position = bytearray(b"\0" + data), 0
-        for run in runs:
-            plain[position] = code = len(run) + 1
-            position += code
-        return bytes(plain)
+        # The plain form: every zero becomes the code of the run behind it, which is what makes short frames quick.
+        return b"".join([_CODES[len(run)] + run for run in runs])
     out = bytearray()
     for run in runs:
         while len(run) >= 254:
@@ -69,10 +69,6 @@ def cobs_decode(data: bytes) -> bytes | None:
     return bytes(out)
 
 
-def _crc_seed(message_type: int) -> int:
-    return 0 if message_type in UNSEEDED else SCHEMA
-
-
 def pack_body(frame: Frame) -> bytes:
     """Return header and payload as they stood inside the frame: what a recording keeps."""
     return HEADER.pack(frame.type, frame.flags, 0, frame.session) + frame.payload
@@ -90,8 +86,8 @@ def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise MalformedMessage(f"payload has {len(payload)} bytes, allowed {MAX_PAYLOAD_BYTES}")
-    body = pack_body(Frame(message_type, flags, session, payload))
-    crc = zlib.crc32(body, _crc_seed(message_type))
+    body = HEADER.pack(message_type, flags, 0, session) + payload
+    crc = zlib.crc32(body, _CRC_SEEDS[message_type])
     # A run that ends exactly at a 254-byte boundary would cost one code byte more; cobs_encode keeps the plain form.
     return cobs_encode(body + crc.to_bytes(4, "little")) + b"\0"
 
@@ -113,27 +109,31 @@ class FrameDecoder:
     """Incremental decoder of one direction of a link; holds at most MAX_FRAME_BYTES and resynchronises at every delimiter."""
 
     def __init__(self) -> None:
-        self.counters = DecoderCounters()
+        self._counters = DecoderCounters()
         self._buffer = bytearray()
         self._skipping = False
         self._bulk: BulkDecoder | None = None
 
+    @property
+    def counters(self) -> DecoderCounters:
+        """What has been seen since the decoder was made."""
+        return self._counters if self._bulk is None else self._bulk.counters
+
     def use_kernels(self) -> None:
-        """Decode in compiled kernels from here on: before arming, where blocks are so long that Python's loops would show."""
+        """Decode in compiled kernels from here on: before arming, since loading them takes time and Python's loops would show."""
         if self._bulk is None:
             from .wire_bulk import BulkDecoder  # numba is loaded only for those who need it
 
-            self._bulk = BulkDecoder()
-            self._bulk.warm_up()
-            self._bulk.resume(self.counters, bytes(self._buffer), self._skipping)
+            bulk = BulkDecoder()
+            bulk.warm_up()
+            bulk.resume(self._counters, bytes(self._buffer), self._skipping)
+            self._bulk = bulk
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
         if self._bulk is not None:
-            found = self._bulk.feed(data)
-            self.counters = self._bulk.counters
-            return found
-        self.counters.bytes_in += len(data)
+            return self._bulk.feed(data)
+        self._counters.bytes_in += len(data)
         *ended, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []
         for piece in ended:
@@ -149,23 +149,23 @@ class FrameDecoder:
 
     def _append(self, piece: bytes) -> None:
         if self._skipping:
-            self.counters.bytes_discarded += len(piece)
+            self._counters.bytes_discarded += len(piece)
         elif len(self._buffer) + len(piece) > MAX_FRAME_BYTES:
-            self.counters.oversized_frames += 1
-            self.counters.bytes_discarded += len(self._buffer) + len(piece)
+            self._counters.oversized_frames += 1
+            self._counters.bytes_discarded += len(self._buffer) + len(piece)
             self._buffer.clear()
             self._skipping = True
         else:
             self._buffer += piece
 
     def _decode(self, raw: bytes) -> Frame | None:
-        counters = self.counters
+        counters = self._counters
         body = cobs_decode(raw)
         if body is None:
             counters.cobs_errors += 1
         elif len(body) < HEADER.size + 4:
             counters.short_frames += 1
-        elif zlib.crc32(body[:-4], _crc_seed(body[0])) != int.from_bytes(body[-4:], "little"):
+        elif zlib.crc32(body[:-4], _CRC_SEEDS[body[0]]) != int.from_bytes(body[-4:], "little"):
             counters.crc_errors += 1
         else:
             counters.frames += 1

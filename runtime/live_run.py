@@ -101,6 +101,7 @@ class LiveRun:
         self.armed_after_s = 0.0
         self.jitter_ticks = 0
         self.start_ns = self.last_data_ns = 0
+        self._counted: Connection | None = None
         self._recorder = recorder
         self._started_ns = started_ns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
@@ -135,7 +136,7 @@ class LiveRun:
         try:
             session.submit(Opcode.STOP)
             while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
-                self._take(self.connection.pump(POLL_S))
+                self.take(self.connection.pump(POLL_S))
         except LinkError as error:
             self.lose_link(error)
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
@@ -176,7 +177,7 @@ class LiveRun:
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
-        outputs = self._take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
+        outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
         self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns)
         self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
@@ -195,7 +196,8 @@ class LiveRun:
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self.ended = why_ended(self, now_ns)
 
-    def _take(self, arrived: list[Arrived]) -> list[Output]:
+    def take(self, arrived: list[Arrived]) -> list[Output]:
+        """Decide on stream frames and account for what came of it."""
         outputs = []
         for arrival_ns, frame in arrived:
             decoded_ns = self.now_ns()
@@ -266,6 +268,8 @@ class LiveRun:
         self._lease_due_ns = now_ns + self.config.lease_ms * NS_PER_MS // 4
 
     def count_decoded(self) -> None:
-        """Add up what the present connection's decoder has counted, before it goes."""
-        counters = self.connection.decoder.counters
-        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+        """Add up what the present connection's decoder has counted, once: before it goes, or at the end."""
+        if self._counted is not self.connection:
+            self._counted = self.connection
+            counters = self.connection.decoder.counters
+            self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})

@@ -35,7 +35,6 @@ from .timing import TimingLedger, arm_realtime
 from .window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
 
 NS_PER_S = 1_000_000_000
-KERNEL_BLOCK_BYTES = 512  # on the wire: from here on, decoding a block in Python takes longer than deciding on it
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +115,7 @@ def run_live(
             check_device(facts, plan, bundle, profile.clock.tick_hz)
             connection.upload(plan, bundle)
             connection.synchronise()
+            connection.decoder.use_kernels()
         except BaseException:
             connection.detach()
             raise
@@ -129,8 +129,6 @@ def run_live(
     run = LiveRun(connection, plan, core, len(bundle.classes), config, recorder, started_ns)
     try:
         core.warm_up()
-        if plan.block_bytes >= KERNEL_BLOCK_BYTES:
-            connection.decoder.use_kernels()
         reader = connection.reader.thread_id
         with arm_realtime(config.realtime and not link.virtual, [] if reader is None else [reader]) as granted:
             run.realtime = granted

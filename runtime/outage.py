@@ -13,7 +13,7 @@ from .connection import Connection
 from .errors import LinkError
 from .link import Link
 from .recovery import Recovery, reconnect
-from .wire import DecoderCounters, DeviceState, StateReason
+from .wire import DeviceState, StateReason
 
 if TYPE_CHECKING:
     from .live_run import LiveRun
@@ -51,7 +51,6 @@ def come_back(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Calla
     run.journal.event({"kind": "link_lost", "reason": error.message})
     run.journal.clock(run.connection)
     run.count_decoded()
-    run.connection.decoder.counters = DecoderCounters()
     try:
         run.connection, attempts = reconnect(recovery, run.connection, run.outage_ns, prepare)
     except LinkError as failure:

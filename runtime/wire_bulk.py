@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from . import wire_kernels as kernels
-from .framing import DecoderCounters, Frame, unpack_body
-from .wire_schema import MAX_FRAME_BYTES, SCHEMA
+from .framing import DecoderCounters, Frame
+from .wire_schema import HEADER, MAX_FRAME_BYTES, SCHEMA
 
 CHUNK_BYTES = 1 << 18  # decoded at a time: large against a frame, small against a level-2 cache
 SMALLEST_FRAME_BYTES = kernels.SMALLEST_BODY + 2  # on the wire: a code byte and the delimiter come with every body
@@ -26,11 +26,11 @@ class BulkDecoder:
     """Incremental decoder; memory is MAX_FRAME_BYTES and one chunk, allocated here."""
 
     def __init__(self) -> None:
-        self.buffer: U8 = np.zeros(MAX_FRAME_BYTES + CHUNK_BYTES, np.uint8)
+        self._raw = bytearray(MAX_FRAME_BYTES + CHUNK_BYTES)
+        self.buffer: U8 = np.frombuffer(self._raw, np.uint8)
+        self._view = memoryview(self._raw)
         self._bodies: I64 = np.zeros((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), np.int64)
         self._tally: I64 = np.zeros(kernels.N_TALLIES, np.int64)
-        self._held = 0  # bytes of an unfinished frame at the start of the buffer
-        self._bytes_in = 0
 
     @property
     def counters(self) -> DecoderCounters:
@@ -38,7 +38,7 @@ class BulkDecoder:
         tally = self._tally.tolist()
         return DecoderCounters(
             frames=tally[kernels.FRAMES],
-            bytes_in=self._bytes_in,
+            bytes_in=tally[kernels.BYTES_IN],
             crc_errors=tally[kernels.CRC_ERRORS],
             cobs_errors=tally[kernels.COBS_ERRORS],
             short_frames=tally[kernels.SHORT_FRAMES],
@@ -52,24 +52,31 @@ class BulkDecoder:
         The iterator must be used up: it takes `data` in as it goes.
         """
         source = np.frombuffer(data, np.uint8)
-        self._bytes_in += len(source)
+        tally = self._tally
+        tally[kernels.BYTES_IN] += len(source)
         for start in range(0, len(source), CHUNK_BYTES):
             part = source[start : start + CHUNK_BYTES]
-            used = self._held + len(part)
-            self.buffer[self._held : used] = part
-            count = kernels.unstuff_frames(self.buffer, used, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
+            waiting, held = int(tally[kernels.CONSUMED]), int(tally[kernels.HELD])
+            if waiting and held:
+                self.buffer[:held] = self.buffer[waiting : waiting + held].copy()
+            used = held + len(part)
+            self.buffer[held:used] = part
+            count = kernels.unstuff_frames(self.buffer, used, MAX_FRAME_BYTES, SCHEMA, self._bodies, tally)
+            tally[kernels.HELD] = used - tally[kernels.CONSUMED]
             yield self._bodies[:count]
-            consumed = int(self._tally[kernels.CONSUMED])
-            self._held = used - consumed
-            if consumed:
-                self.buffer[: self._held] = self.buffer[consumed:used].copy()
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
-        frames = []
-        for spans in self.bodies(data):
-            frames += [unpack_body(self.buffer[first:stop].tobytes()) for first, stop in spans.tolist()]
-        return frames
+        if len(data) > CHUNK_BYTES:
+            return [self._frame(first, stop) for spans in self.bodies(data) for first, stop in spans.tolist()]
+        # One call of one kernel: what a small message costs is Python's way there and back.
+        taken = bytes(data)
+        count = kernels.take_in(taken, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
+        return [self._frame(first, stop) for first, stop in self._bodies[:count].tolist()] if count else []
+
+    def _frame(self, first: int, stop: int) -> Frame:
+        kind, flags, _, session = HEADER.unpack_from(self._raw, first)
+        return Frame(kind, flags, session, bytes(self._view[first + HEADER.size : stop]))
 
     def resume(self, counters: DecoderCounters, unfinished: bytes, skipping: bool) -> None:
         """Take over from another decoder: its counts, the bytes of its unfinished frame, and whether it skips an oversized one."""
@@ -78,11 +85,12 @@ class BulkDecoder:
         tally[kernels.COBS_ERRORS], tally[kernels.SHORT_FRAMES] = counters.cobs_errors, counters.short_frames
         tally[kernels.OVERSIZED], tally[kernels.DISCARDED] = counters.oversized_frames, counters.bytes_discarded
         tally[kernels.SKIPPING] = skipping
-        self._bytes_in = counters.bytes_in
-        self._held = len(unfinished)
-        self.buffer[: self._held] = np.frombuffer(unfinished, np.uint8)
+        tally[kernels.BYTES_IN] = counters.bytes_in
+        tally[kernels.HELD], tally[kernels.CONSUMED] = len(unfinished), 0
+        self.buffer[: len(unfinished)] = np.frombuffer(unfinished, np.uint8)
 
     def warm_up(self) -> None:
-        """Compile or load the kernel, without counting anything."""
+        """Compile or load the kernels, without counting anything."""
         tally = np.zeros(kernels.N_TALLIES, np.int64)
         kernels.unstuff_frames(self.buffer, 0, MAX_FRAME_BYTES, SCHEMA, self._bodies, tally)
+        kernels.take_in(b"", self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, tally)

@@ -2,7 +2,7 @@
 
 Owns the loops over bytes; never allocates, keeps no state of its own and never looks inside a message. `unstuff_frames`
 gives the same frames and counts as `wire.FrameDecoder`, byte for byte (tests/test_wire_bulk.py holds them against each other).
-Imported only where bulk data is expected: small messages are decoded in Python and must not pay for numba.
+Imported by whoever measures, before arming: what decodes only a few messages does so in Python and must not pay for numba.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, N_TALLIES = range(9)
+FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = (
+    range(11)
+)
 SMALLEST_BODY = 12  # header and CRC
 _U = np.uint64
 _ONE, _EIGHT, _SIXTEEN, _BYTE = _U(1), _U(8), _U(16), _U(0xFF)
@@ -229,4 +231,24 @@ def unstuff_frames(data, used, limit, schema, bodies, tally):  # type: ignore[no
                     tally[DISCARDED] += length + 1
         start = stop + _ONE
     tally[CONSUMED] = used if tally[SKIPPING] else np.int64(start)
+    return n_bodies
+
+
+@njit(cache=True, nogil=True)
+def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-untyped-def]
+    """Put `data` (bytes) behind what waits in `buffer`, decode as `unstuff_frames` does, and return how many bodies are good.
+
+    HELD bytes from CONSUMED on have no delimiter yet. They are moved to the front only here, before the next data, so that the bodies
+    stay where they are until then.
+    """
+    waiting, held = tally[CONSUMED], tally[HELD]
+    if waiting:
+        for i in range(held):
+            buffer[i] = buffer[waiting + i]
+    for i in range(len(data)):
+        buffer[held + i] = data[i]
+    used = held + len(data)
+    n_bodies = unstuff_frames(buffer, used, limit, schema, bodies, tally)
+    tally[HELD] = used - tally[CONSUMED]
+    tally[BYTES_IN] += len(data)
     return n_bodies

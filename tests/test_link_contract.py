@@ -26,13 +26,14 @@ from pans.firmware_sim.protocol_panssim import register
 from pans.firmware_sim.serve import SimOptions, build_instrument
 from pans.firmware_sim.shell import open_port, serve
 from pans.runtime import link as link_module
-from pans.runtime import wire
+from pans.runtime import link_reader, wire
 from pans.runtime.bundle import Bundle
 from pans.runtime.connection import Connection
 from pans.runtime.core import Core
 from pans.runtime.decide import make_decider
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.link import Link, LinkReader, open_link
+from pans.runtime.link import Link, open_link
+from pans.runtime.link_reader import LinkReader
 from pans.runtime.link_serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link_usb import UsbLink, usb_target
 from pans.runtime.loop import Onlookers, RunConfig, run_live
@@ -367,7 +368,7 @@ class Flood:
 
 
 def test_the_readers_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_module, "MAX_QUEUED_BYTES", 10_000)
+    monkeypatch.setattr(link_reader, "MAX_QUEUED_BYTES", 10_000)
     flood = Flood()
     reader = LinkReader(flood)
     deadline = time.monotonic() + PATIENCE_S
