@@ -89,6 +89,10 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         help="share of the loss of 2 to K shots, for patterns too (default 0)",
     )
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
+    parser.add_argument(
+        "--shift-px", type=int, default=0, metavar="X", help="move training images by up to X along the rows (default 0)"
+    )
+    parser.add_argument("--offset-px", type=int, default=0, metavar="Y", help="and by up to Y across them (default 0)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
     parser.add_argument(
@@ -181,7 +185,7 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     same = (
         "features photons clicks epochs restarts starts warm polish mix shots seed hidden batch slope clamp dark budget"
     )
-    same += " complex_field conserving input_photons"
+    same += " complex_field conserving input_photons shift_px offset_px"
     return Options(
         alpha=alpha,
         estimator=estimator,

@@ -56,6 +56,8 @@ class Options:
     light: float = 1.0  # of the initial patterns, times the paper's
     mix: float = 0.0  # share of the loss that several shots have in stage 2, for patterns that gain from them
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
+    shift_px: int = 0  # training images are moved by up to that much along the rows, for objects that pass by
+    offset_px: int = 0  # and across them
 
 
 def check_options(options: Options, profile: Profile) -> None:
@@ -74,6 +76,8 @@ def check_options(options: Options, profile: Profile) -> None:
         "warm": (0, 1),
         "polish": (0, 1),
         "mix": (0, 1),
+        "shift_px": (0, 65536),
+        "offset_px": (0, 65536),
     }
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:

@@ -16,6 +16,7 @@ from pans.runtime.incident import incident_field, incident_intensity
 from pans.runtime.profile import Profile
 
 from .options import Options
+from .shifts import shifted
 from .tasks import Objects, Task
 
 VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
@@ -31,14 +32,15 @@ class TrainingData:
 
     def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
-        self.shown = encoder_input(task, task.train, profile, options)
+        placed = shifted(task.train, options.shift_px, options.offset_px, options.seed)
+        self.shown = encoder_input(task, placed, profile, options)
         if basis is not None:
             self.shown = self.shown @ basis
         self.labels = torch.from_numpy(task.train.labels)
         self.image_shape = task.image_shape
         self.is_image = task.target == "image"
         if self.is_image:
-            flat = task.train.images.reshape(len(task.train), -1)
+            flat = placed.images.reshape(len(placed), -1)
             self.target, self.n_outputs = torch.from_numpy(flat.astype("float32") / 255), flat.shape[1]
         else:
             self.target, self.n_outputs = self.labels, len(task.classes)
