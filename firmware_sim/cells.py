@@ -25,6 +25,7 @@ from .detector import uniform_numbers
 from .exposures import Exposures
 from .moving import Cells
 from .shifts import ShiftTable
+from .shifts import warm_up as warm_up_table
 
 ARRIVAL_STREAM = 16  # five numbers per arrival: waiting time, picture, offset, two for the velocity
 CHUNK = 256  # arrivals drawn at a time
@@ -131,7 +132,7 @@ class CellFlow:
             np.ceil(arrivals.centre_ticks + self._table.width / arrivals.speed_px).astype(np.int64)
         )
         half = np.clip(gone - centred, 1, MAX_HALF_EXPOSURES)
-        begins = np.array([exposures.begins(one, 1)[0] for one in centred.tolist()], np.int64)
+        begins = exposures.begins_of(centred)
         photons = np.empty(len(begins))
         _alone(begins, float(exposures.exposure_ticks), *arrivals, *self._table, photons)
         if self._changes:
@@ -142,6 +143,16 @@ class CellFlow:
             Mark(0, (first + k) % NO_OBJECT, truth, exposure, tick, light, long)
             for k, (truth, exposure, tick, light, long) in enumerate(zip(*columns))
         ]
+
+
+def warm_up() -> None:
+    """Compile or load the kernels of this module and of the table before it."""
+    warm_up_table()
+    ints, floats, rows = np.zeros(1, np.int64), np.ones(1), np.zeros((3, 1))
+    cell = (floats, floats, ints, ints)
+    table = (np.zeros((1, 1, 3, 1), np.uint32), np.zeros((1, 3, 1)), 1.0, 1.0, floats, floats)
+    _fill(ints, np.ones(1, np.bool_), 1.0, *cell, *table, ints.copy(), rows)
+    _alone(ints, 1.0, *cell, *table, floats.copy())
 
 
 @njit(cache=True, nogil=True)

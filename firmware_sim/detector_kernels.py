@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pans.runtime.clicks import ClickLaw
+
 from .detector import (
     CHANNEL_STEP,
     CLICK_STREAM,
@@ -130,6 +132,14 @@ def sample_words(
     both = np.stack([previous, previous])
     memory_words(thresholds, primed, row_of, np.array(keys, np.uint64), first_exposure, _U(crosstalk), both, used)
     previous[:] = both[0]
+
+
+def warm_up() -> None:
+    """Compile or load what `sample_words` needs."""
+    for effects in (DetectorModel(ClickLaw()), DetectorModel(ClickLaw(), afterpulse_probability=0.5)):
+        sample_words(
+            effects, np.zeros((1, 1)), np.zeros(1, np.int64), 0, 0, np.zeros(1, np.uint8), np.zeros((1, 1), np.uint8)
+        )
 
 
 def sparse_patterns(levels: NDArray[np.uint16]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:

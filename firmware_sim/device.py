@@ -21,7 +21,7 @@ from .changes import Changes
 from .detector import detector_model
 from .exposures import Exposures
 from .gates import GATE_CHANNELS, Gates
-from .light import LightTable, begin, prepare, tabulate
+from .light import LightTable, begin, prepare, tabulate, warm_up
 from .measurement import MAX_LEASE_MS, Measurement, check_arm
 from .moving import SceneFile
 from .optics import passive_photoelectrons
@@ -30,6 +30,7 @@ from .stream import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
 
 if TYPE_CHECKING:
+    from .frame_writer import FrameWriter
     from .shifts import ShiftTable
     from .tape import BarTable
 
@@ -69,14 +70,16 @@ class Instrument:
         self.profile = profile
         self.scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
         _check_scene(self.scene, profile, optics)
+        warm_up(self.scene)
         self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
+        self.decoder.use_kernels()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
         self.session = 0  # the host's nonce; 0 before the first HELLO
         self.gates = Gates()
         self._seed, self._epoch, self._tick, self._tick_hz = seed, epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
-        self.stream = StreamBuffer(buffer_messages)
+        self.stream = StreamBuffer(buffer_messages, _writer(profile))
         self._out: list[bytes] = []
         self._forget_session()
 
@@ -128,17 +131,15 @@ class Instrument:
 
     def _next_event(self) -> tuple[int, str] | None:
         """The earliest event; at the same tick in the order start, message, end, lease, status."""
-        run = self._run
-        events: list[tuple[int | None, str]] = []
+        run, due, what = self._run, self._status_tick, "status"
         if run is not None:
-            if self.state is DeviceState.ARMED:
-                events.append((run.start_tick, "start"))
-            else:
-                events += [(run.next_tick, "message"), (run.end_tick, "end")]
-            events.append((self._lease_tick, "lease"))
-        events.append((self._status_tick, "status"))
-        due = [event for event in events if event[0] is not None]
-        return min(due, key=lambda event: event[0], default=None)  # type: ignore[arg-type, return-value]
+            events: tuple[tuple[int | None, str], ...] = ((run.start_tick, "start"),)
+            if self.state is not DeviceState.ARMED:
+                events = ((run.end_tick, "end"), (run.next_tick, "message"))
+            for tick, name in ((self._lease_tick, "lease"), *events):
+                if tick is not None and (due is None or tick <= due):
+                    due, what = tick, name
+        return None if due is None else (due, what)
 
     def _happen(self, what: str) -> None:
         run = self._run
@@ -367,3 +368,14 @@ def _check_scene(scene: SceneFile, profile: Profile, optics: Analyser | None) ->
         raise ConfigError(
             f"scene {scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
         )
+
+
+def _writer(profile: Profile) -> FrameWriter | None:
+    """The compiled encoder, and every other kernel of a parallel instrument with it: nothing is compiled after it is switched on."""
+    if profile.mode != "parallel":
+        return None
+    from .detector_kernels import warm_up as warm_up_detector
+    from .frame_writer import FrameWriter
+
+    warm_up_detector()
+    return FrameWriter()

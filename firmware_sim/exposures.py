@@ -28,7 +28,11 @@ class Exposures:
 
     def begins(self, first: int, count: int) -> I64:
         """Ticks at which exposures first..first+count-1 begin, int64 (count,)."""
-        cycle, slot = np.divmod(np.arange(first, first + count), self._n_slots)
+        return self.begins_of(np.arange(first, first + count))
+
+    def begins_of(self, exposures: I64) -> I64:
+        """Ticks at which `exposures` begin, int64 of the same shape."""
+        cycle, slot = np.divmod(exposures, self._n_slots)
         return np.asarray(cycle * self._cycle_ticks + self._offsets[slot])
 
     def lit(self, first: int, count: int) -> NDArray[np.bool_]:

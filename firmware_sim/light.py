@@ -84,6 +84,18 @@ def prepare(
     return light_table(profile, what, levels, exposure_us)
 
 
+def warm_up(scene: SceneFile) -> None:
+    """Compile or load the kernels of a scene that moves, so that ARM need not."""
+    if isinstance(scene.what, Cells):
+        from .cells import warm_up as warm_up_cells
+
+        warm_up_cells()
+    elif isinstance(scene.what, Tape):
+        from .tape import warm_up as warm_up_tape
+
+        warm_up_tape()
+
+
 def begin(
     scene: SceneFile,
     table: LightTable | ShiftTable | BarTable,

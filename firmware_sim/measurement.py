@@ -63,6 +63,9 @@ class Measurement:
         self._block_ends = [
             int(program.offsets[first + count - 1]) + program.exposure_ticks for first, count in program.blocks
         ]
+        self.end_tick = (
+            None if self._n_cycles is None else arm.start_tick + self._n_cycles * program.cycle_ticks
+        )  # at which the last cycle is over; None when the run lasts until STOP
         self._cycle, self._block, self._cycle_tick = 0, 0, arm.start_tick
         self._mark_tick = self._next_mark_tick()
         # A parallel batch holds packed words, a sequential one clicks; one row for each exposure.
@@ -75,11 +78,6 @@ class Measurement:
     @property
     def start_tick(self) -> int:
         return self._start_tick
-
-    @property
-    def end_tick(self) -> int | None:
-        """Tick at which the last cycle is over; None when the run lasts until STOP."""
-        return None if self._n_cycles is None else self._start_tick + self._n_cycles * self._program.cycle_ticks
 
     def begun_by(self, tick: int) -> int:
         """Number of exposures that have begun before or at `tick`."""
@@ -98,7 +96,7 @@ class Measurement:
         """Return the message that is due at `next_tick` and move on to the next one."""
         if self._mark_tick is not None and self._mark_tick == self.next_tick:
             mark = self._light.mark
-            message: StreamMessage = mark._replace(tick=mark.tick + self._start_tick)
+            message: StreamMessage = Mark(*mark[:4], mark.tick + self._start_tick, *mark[5:])
             self._light.take_mark()
             self._mark_tick = self._next_mark_tick()
         else:

@@ -110,6 +110,12 @@ def _reversed_rows(picture: NDArray[np.uint32], offset_px: int) -> NDArray[np.ui
     return padded
 
 
+def warm_up() -> None:
+    """Compile or load the kernel."""
+    ints = np.zeros(1, np.int64)
+    _shift_sums(np.zeros((1, 5), np.uint32), ints, ints, ints, ints, 0, np.zeros((1, 3, 1), np.uint32))
+
+
 @njit(cache=True, nogil=True)
 def _shift_sums(padded, patterns, rows, columns, levels, offset_px, out):  # type: ignore[no-untyped-def]
     """Sum level times grey over the lit pixels: out uint32 (offsets, shifts, patterns) for one picture, padded as `_reversed_rows`.

@@ -7,19 +7,27 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from pans.runtime import wire
 
 from .measurement import StreamMessage
+
+if TYPE_CHECKING:
+    from .frame_writer import FrameWriter
 
 U32 = 0xFFFFFFFF
 
 
 @dataclass(slots=True)
 class StreamBuffer:
-    """At most `capacity` messages are held back; when it is full the newest is dropped whole and its exposures counted."""
+    """At most `capacity` messages are held back; when it is full the newest is dropped whole and its exposures counted.
+
+    With a `writer`, blocks of frames and marks are encoded by its kernel.
+    """
 
     capacity: int
+    writer: FrameWriter | None = None
     sequence: int = 0
     limit: int = 0
     dropped_exposures: int = 0
@@ -48,12 +56,18 @@ class StreamBuffer:
 
     def _released(self) -> list[bytes]:
         released = []
-        while self._held and 0 < (self.limit - self._held[0][0]) & U32 < 1 << 31:  # modulo 2^32
-            released.append(self._held.popleft()[1])
+        held, limit = self._held, self.limit
+        while held and 0 < (limit - held[0][0]) & U32 < 1 << 31:  # modulo 2^32
+            released.append(held.popleft()[1])
         return released
 
     def _encode(self, message: StreamMessage, session: int) -> bytes:
         drops = self.dropped_exposures & U32
+        if self.writer is not None:
+            if isinstance(message, wire.FrameBlock):
+                return self.writer.block(message, self.sequence, drops, session)
+            if isinstance(message, wire.Mark):
+                return self.writer.mark(message, self.sequence, session)
         if isinstance(message, wire.Mark):
             return wire.encode_mark(message._replace(seq=self.sequence), session)
         if isinstance(message, wire.ClickBlock):

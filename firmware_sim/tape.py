@@ -151,7 +151,7 @@ class TapeFlow:
         places = pitches - 1.0 + self._errors[pitches - self._first_pitch]
         centres = np.interp(np.arange(first, first + count), places, pitches.astype(np.float64)) * self._pitch_ticks
         centred = np.maximum(exposures.begun_by(centres.astype(np.int64)) - 1, 0)
-        begins = np.array([exposures.begins(one, 1)[0] for one in centred.tolist()], np.int64)
+        begins = exposures.begins_of(centred)
         half = np.clip(
             exposures.begun_by((centres + 0.5 * self._pitch_ticks).astype(np.int64)) - centred, 1, MAX_HALF_EXPOSURES
         )
@@ -177,6 +177,13 @@ class TapeFlow:
             Mark(0, (first + k) % NO_OBJECT, truth, exposure, tick, light, long)
             for k, (truth, exposure, tick, light, long) in enumerate(zip(*columns))
         ]
+
+
+def warm_up() -> None:
+    """Compile or load the kernels of this module."""
+    floats = np.zeros(1)
+    _autoregress(floats, 0.5, 1.0, 0.0, floats.copy())
+    _fill(floats, np.ones(1), np.zeros(8, np.uint8), -1, np.zeros((1, 2, 1)), floats, np.zeros((2, 1)))
 
 
 @njit(cache=True, nogil=True)
