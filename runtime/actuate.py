@@ -20,7 +20,7 @@ from .clock import ClockModel
 from .errors import UsageError
 from .follower import Action
 from .journal import Journal
-from .record import Recorder
+from .rotate import AnyRecorder
 from .session import COMMAND_WINDOW, HostSession
 from .wire import Opcode
 from .wire_commands import Gate, pack_gate
@@ -54,7 +54,7 @@ class GateCounters:
 class GateDesk:
     """Takes actions from outputs and gets them done within the session's window; `failed` is told the decision of each that was not."""
 
-    def __init__(self, recorder: Recorder | None, journal: Journal) -> None:
+    def __init__(self, recorder: AnyRecorder | None, journal: Journal) -> None:
         self.counters = GateCounters()
         self.actuator: Actuator | None = None  # None: the instrument's own GATE command
         self.failed: Callable[[int], None] = lambda number: None

@@ -6,7 +6,8 @@ Every nanosecond between the end of the exposure and the decision is given to th
     gc          a garbage collection held the interpreter
     disk        a write of the recording did not return
     inference   the decision back end computed
-    host        the loop or its reader waited for a processor, or slept beyond its timer (starved, stolen by the hypervisor, stopped)
+    host        the loop or its reader waited for a processor, slept beyond its timer, or stood still (starved, stolen by the hypervisor,
+                stopped)
     link        the loop was awake and waiting for bytes, and nothing says that the device was late
     device      ... and a message that says when it left shows that the link was open, or that the device held it back
     decode      the loop's own work, none of the above (reading messages, the live view)
@@ -57,28 +58,46 @@ def judge(facts: Facts) -> Verdict:
 def _shares(facts: Facts) -> dict[str, int]:
     """Return how many ns each cause on this side explains, and `outside`: awake, and no bytes."""
     begin, end = facts.begin_ns, facts.end_ns
+    total = end - begin
     collecting = _clipped(facts.spans, GC, begin, end)
     shares = {"gc": _length(collecting)}
-    for cause, kind in (("disk", DISK), ("inference", INFERENCE)):
+    for cause, kind in (("disk", DISK), ("inference", INFERENCE), ("outside", IDLE)):
         spans = _clipped(facts.spans, kind, begin, end)
         shares[cause] = _length(spans) - _shared(spans, collecting)
     overslept = _clipped(facts.spans, OVERSLEPT, begin, end)
     asleep = _length(overslept) - _shared(overslept, collecting)
-    starved = min(max(facts.run_delay_ns, asleep, facts.steal_ns), end - begin)
+    starved = min(max(facts.run_delay_ns, asleep, facts.steal_ns), total)
+    own = max(total - _covered(facts.spans, begin, end), 0)
     # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.
     hidden = max(starved - asleep, 0)
-    for cause in sorted(("disk", "inference"), key=lambda name: -shares[name]):
+    shares["decode"] = own
+    for cause in sorted(("disk", "inference", "decode", "outside"), key=lambda name: -shares[name]):
         taken = min(shares[cause], hidden)
         shares[cause] -= taken
         hidden -= taken
-    before = max(facts.arrival_ns - begin, 0)
-    busy = [span for span in facts.spans if span.kind != IDLE]
-    outside = max(before - _covered(busy, begin, facts.arrival_ns) - hidden, 0)
-    hidden = max(hidden - before, 0)
-    idle_after = _clipped(facts.spans, IDLE, facts.arrival_ns, end)
-    after = max(end - facts.arrival_ns, 0)
-    own = max(after - _covered(facts.spans, facts.arrival_ns, end) - hidden, 0)
-    return shares | {"host": starved, "outside": outside + _length(idle_after), "decode": own}
+    stopped = _stopped(facts, shares)
+    return shares | {"host": min(starved + stopped, total)}
+
+
+def _stopped(facts: Facts, shares: dict[str, int]) -> int:
+    """Take from `shares`, and return, the time in which the loop should have computed and nothing of this process did: it stood still.
+
+    The loop's own work costs it processor time. A back end may sleep, as one that waits for other hardware does; but then the reader
+    still stamps what comes.
+    """
+    computed = min(shares["decode"], facts.cpu_ns)
+    still = shares["decode"] - computed
+    shares["decode"] = computed
+    for span in facts.spans:
+        length = min(span.end_ns, facts.end_ns) - max(span.begin_ns, facts.begin_ns)
+        expected = facts.pause_ns > 0 and span.end_ns - span.begin_ns > 4 * facts.pause_ns
+        if span.kind != INFERENCE or not expected or 2 * facts.cpu_ns > length or length > shares["inference"]:
+            continue
+        margin = facts.pause_ns
+        if not any(span.begin_ns + margin < arrival < span.end_ns - margin for arrival in facts.arrivals_ns):
+            shares["inference"] -= length
+            still += length
+    return still
 
 
 def blame_outside(facts: Facts) -> tuple[str, bool, str]:
@@ -133,8 +152,9 @@ def _words(cause: str, share: int, facts: Facts) -> str:
     total = _ms(facts.end_ns - facts.begin_ns)
     if cause == "host":
         return (
-            f"the host did not run for {_ms(share)} of {total}: its threads waited {_ms(facts.run_delay_ns)} for a processor, "
-            f"{_ms(facts.steal_ns)} were stolen from the machine, {facts.switches} involuntary switches"
+            f"the host did not run for {_ms(share)} of {total}: waiting for a processor {_ms(facts.run_delay_ns)}, "
+            f"stolen from the machine {_ms(facts.steal_ns)}, computing at most {_ms(facts.cpu_ns)}, "
+            f"{facts.switches} involuntary switches"
         )
     sentence = {
         "gc": "a garbage collection held the interpreter",

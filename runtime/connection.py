@@ -57,7 +57,7 @@ class Connection:
         self.clock: ClockModel | None = None
         self.clock_steps: list[ClockStep] = []  # since the last look
         self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
-        self._on_sent = on_sent
+        self.on_sent = on_sent
 
     def pump(self, timeout_s: float) -> list[Arrived]:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return the stream frames among them."""
@@ -68,6 +68,8 @@ class Connection:
         chunks = self.reader.wait(timeout_s)
         if self.evidence is not None:
             self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
+            for chunk in chunks:
+                self.evidence.arrived(chunk.arrival_ns)
         for chunk in chunks:
             for frame in self.decoder.feed(chunk.data):
                 if self.session.on_frame(frame, chunk.arrival_ns):
@@ -88,8 +90,8 @@ class Connection:
         data = self.session.take_output()
         if data:
             self.link.write(data)
-            if self._on_sent is not None:
-                self._on_sent(self.link.now_ns(), data)
+            if self.on_sent is not None:
+                self.on_sent(self.link.now_ns(), data)
 
     def handshake(self) -> Welcome:
         """Open the session and return what the device says of itself; the device leaves SAFE if it was latched there."""

@@ -7,6 +7,7 @@
     ├── DamagedFileError      2   a bundle or recording that is truncated, altered or inconsistent
     ├── LinkError             3   the device cannot be reached, or went away
     │   └── DeviceError       3   the device answered, and refused
+    ├── RecordingError        2   the recording cannot be written any further: the run ends, what was written is readable
     └── TimingError           4   the timing contract was broken and going on would be a lie
 
 A message says what, found, allowed and where; `remedy` is the next step. Damaged bytes, lost frames and late deadlines are
@@ -42,6 +43,10 @@ class PlanError(PansError):
 
 class DamagedFileError(PansError):
     """A bundle or recording that is truncated, altered, oversized or inconsistent."""
+
+
+class RecordingError(PansError):
+    """The recording cannot be written any further: the disk is full, or gone."""
 
 
 class LinkError(PansError):

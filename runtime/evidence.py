@@ -11,6 +11,7 @@ import gc
 import os
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -27,6 +28,7 @@ OVERSLEPT_NS = 500 * NS_PER_US  # a timer that fires later than this was not the
 MAX_SPANS = 1024
 MAX_SAMPLES = 64
 MAX_STAMPED = 64
+MAX_ARRIVALS = 512
 
 GC, DISK, INFERENCE, IDLE, OVERSLEPT = "gc", "disk", "inference", "idle", "overslept"
 
@@ -43,6 +45,7 @@ class Sample(NamedTuple):
     """Counters of the system at `at_ns`; they only ever grow. `run_delays_ns`: of each watched thread, waiting for a processor."""
 
     at_ns: int
+    cpu_ns: int  # that the loop's thread has computed
     run_delays_ns: tuple[int, ...]
     steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
     switches: int  # involuntary, of the loop's thread
@@ -65,7 +68,10 @@ class Facts(NamedTuple):
     end_ns: int
     uncertainty_ns: int
     spans: tuple[Span, ...]
-    run_delay_ns: int
+    arrivals_ns: tuple[int, ...]  # when the reader stamped bytes
+    pause_ns: int  # the longest time between two blocks when everything is on time
+    cpu_ns: int  # the loop's thread computed for so long, at most
+    run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor
     steal_ns: int
     switches: int
     stamped: tuple[Stamped, ...]
@@ -74,9 +80,12 @@ class Facts(NamedTuple):
 class Evidence:
     """Collects while a run lasts, from `watch` to `close`. `now_ns` is the link's clock."""
 
-    def __init__(self, now_ns: Callable[[], int], deadline_ns: int, *, virtual: bool = False) -> None:
+    def __init__(
+        self, now_ns: Callable[[], int], deadline_ns: int, *, pause_ns: int = 0, virtual: bool = False
+    ) -> None:
         self.floor_ns = max(FLOOR_NS, deadline_ns // 16)
-        self._now, self._virtual = now_ns, virtual
+        self._now, self._virtual, self._pause_ns = now_ns, virtual, pause_ns
+        self._arrivals: deque[int] = deque(maxlen=MAX_ARRIVALS)
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
@@ -111,10 +120,17 @@ class Evidence:
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
         """Note a wait for bytes of at most `asked_s`: what it took beyond that, no timer takes; the machine gave us no time."""
         asked_ns = begin_ns + int(asked_s * NS_PER_S)
-        if end_ns - begin_ns >= self.floor_ns:
+        last = self._spans[-1] if self._spans else None
+        if last is not None and last.kind == IDLE and begin_ns - last.end_ns < self.floor_ns:
+            self._spans[-1] = Span(IDLE, last.begin_ns, min(end_ns, asked_ns))  # nothing of note was done in between
+        else:
             self._spans.append(Span(IDLE, begin_ns, min(end_ns, asked_ns)))
         if end_ns - asked_ns >= OVERSLEPT_NS:
             self._spans.append(Span(OVERSLEPT, asked_ns, end_ns))
+
+    def arrived(self, arrival_ns: int) -> None:
+        """Note when bytes were stamped by whoever read them."""
+        self._arrivals.append(arrival_ns)
 
     def stamped(self, message: Stamped) -> None:
         """Note a message that says when it left the device."""
@@ -136,14 +152,20 @@ class Evidence:
     def facts(self, begin_ns: int, arrival_ns: int, end_ns: int, uncertainty_ns: int) -> Facts:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
         first, last = self._around(begin_ns, end_ns)
-        delays = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)]
+        cpu_ns = last.cpu_ns - first.cpu_ns
+        own, *readers = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
+        # a reader that waits while the loop computes waits for the loop
+        delay_ns = max([own, *(delay - cpu_ns for delay in readers)])
         return Facts(
             begin_ns,
             arrival_ns,
             end_ns,
             uncertainty_ns,
             tuple(span for span in self._spans if span.end_ns > begin_ns and span.begin_ns < end_ns),
-            max(delays, default=0),
+            tuple(arrival for arrival in self._arrivals if begin_ns < arrival < end_ns),
+            self._pause_ns,
+            cpu_ns,
+            delay_ns,
             last.steal_ns - first.steal_ns,
             last.switches - first.switches,
             tuple(message for message in self._stamped if message.arrival_ns >= begin_ns and message.left_ns <= end_ns),
@@ -152,7 +174,7 @@ class Evidence:
     def _around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
         """The latest sample before and the first one after; as near as there are."""
         if not self._samples:
-            nothing = Sample(0, (), 0, 0)
+            nothing = Sample(0, 0, (), 0, 0)
             return nothing, nothing
         before = [sample for sample in self._samples if sample.at_ns <= begin_ns]
         after = [sample for sample in self._samples if sample.at_ns >= end_ns]
@@ -176,7 +198,9 @@ class _Counters:
 
     def read(self, now_ns: int) -> Sample:
         delays = tuple(_field(file, 1) for file in self._files)
-        return Sample(now_ns, delays, _field(self._stat, 8) * self._tick_ns, _involuntary_switches())
+        return Sample(
+            now_ns, time.thread_time_ns(), delays, _field(self._stat, 8) * self._tick_ns, _involuntary_switches()
+        )
 
     def close(self) -> None:
         for file in (*self._files, self._stat):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from .connection import Connection
-from .record import Recorder
+from .rotate import AnyRecorder
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 
@@ -17,16 +17,16 @@ MAX_EVENTS = 1000  # of the summary; the recording has them all
 class Journal:
     """The notes of one run, across reconnections."""
 
-    def __init__(self, recorder: Recorder | None) -> None:
+    def __init__(self, recorder: AnyRecorder | None) -> None:
         self.events: list[dict[str, Any]] = []
-        self._recorder = recorder
+        self.recorder = recorder
 
     def event(self, event: dict[str, Any]) -> None:
         """Note one event: a map with its `kind` and what belongs to it, units in the keys."""
         if len(self.events) < MAX_EVENTS:
             self.events.append(event)
-        if self._recorder is not None:
-            self._recorder.add_event(event)
+        if self.recorder is not None:
+            self.recorder.add_event(event)
 
     def session(self, connection: Connection) -> None:
         """Note which session and device clock the following ticks belong to."""
@@ -41,8 +41,8 @@ class Journal:
             self.event({"kind": "clock_step", "tick": step.tick, "off_ns": step.off_ns, "allowed_ns": step.allowed_ns})
         connection.clock_steps.clear()
         samples = connection.known_clock().take_samples()
-        if self._recorder is not None and len(samples):
-            self._recorder.add_clock(samples)
+        if self.recorder is not None and len(samples):
+            self.recorder.add_clock(samples)
 
     def refusals(self, connection: Connection) -> None:
         """Note the gates that the device has refused."""

@@ -13,7 +13,7 @@ from .connection import Connection
 from .evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
 from .link import Link
 from .plan import Plan
-from .record import Recorder
+from .rotate import AnyRecorder
 from .wire import Status
 
 POLL_S = 0.02
@@ -24,11 +24,12 @@ LEAST_WAIT_S = 0.0002
 class Lateness:
     """The witnesses of one run, across reconnections; `attach` before each ARM, `close` at the end."""
 
-    def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: Recorder | None) -> None:
-        self.evidence = Evidence(link.now_ns, deadline_ns, virtual=link.virtual)
+    def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: AnyRecorder | None) -> None:
+        pause_ns = longest_pause_ns(plan)
+        self.evidence = Evidence(link.now_ns, deadline_ns, pause_ns=pause_ns, virtual=link.virtual)
         self.incidents = Incidents(self.evidence)
         self.block_ns = 0  # when the latest block came
-        self._patience_ns = longest_pause_ns(plan) + max(deadline_ns // 2, LEAST_SLACK_NS)
+        self._patience_ns = pause_ns + max(deadline_ns // 2, LEAST_SLACK_NS)
         self._asked = True  # the device, in the silence under way
         self._damaged = 0
         if recorder is not None and not link.virtual:

@@ -23,7 +23,7 @@ from .journal import Journal
 from .lateness import Lateness
 from .outage import why_ended
 from .plan import Plan
-from .record import Recorder
+from .rotate import AnyRecorder, PartedRecorder, repeated_setup
 from .tally import RunTally
 from .timing import TimingLedger
 from .wire import DeviceState, Frame, Mark, MessageType, Opcode, pack_body
@@ -69,6 +69,8 @@ class LiveCore(Protocol):
 
     def cycles_left(self, n_cycles: int) -> int: ...
 
+    def part(self) -> dict[str, Any] | None: ...
+
 
 Watcher = Callable[["LiveRun", Output], None]
 
@@ -83,7 +85,7 @@ class LiveRun:
         core: LiveCore,
         n_classes: int,
         config: RunConfig,
-        recorder: Recorder | None,
+        recorder: AnyRecorder | None,
         started_ns: int,
     ) -> None:
         self.connection, self.plan, self.core, self.config = connection, plan, core, config
@@ -103,6 +105,7 @@ class LiveRun:
         self.start_ns = self.last_data_ns = 0
         self._counted: Connection | None = None
         self._recorder = recorder
+        self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
         self._granted_until = 0
@@ -121,7 +124,10 @@ class LiveRun:
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
         self.lateness.attach(self.connection, now_ns + ARM_LEAD_NS)
         self.settle(self.core.begin(start_tick, n_cycles))
-        self.connection.session.submit(Opcode.ARM, pack_arm(Arm(start_tick, n_cycles, self.config.lease_ms)))
+        arm = Arm(start_tick, n_cycles, self.config.lease_ms)
+        self.connection.session.submit(Opcode.ARM, pack_arm(arm))
+        if isinstance(self._recorder, PartedRecorder):
+            self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
         self.last_data_ns = now_ns + ARM_LEAD_NS
         self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         if not self.reconnects:
@@ -194,6 +200,7 @@ class LiveRun:
             self.journal.clock(self.connection)
             self._recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
+        self._turn_page(now_ns)
         self.ended = why_ended(self, now_ns)
 
     def take(self, arrived: list[Arrived]) -> list[Output]:
@@ -250,6 +257,22 @@ class LiveRun:
                 self.lateness.late(decision.number, marks_ns, uncertainty_ns)
             if self._recorder is not None:
                 self._recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
+
+    def _turn_page(self, now_ns: int) -> None:
+        """Go on in the recording's next part when this one is full and no window is open."""
+        recorder = self._recorder
+        if not isinstance(recorder, PartedRecorder):
+            return
+        for event in recorder.news():
+            self.journal.event(event)
+        if recorder.wants_part and (place := self.core.part()) is not None:
+            recorder.next_part(place, self._setup, now_ns)
+            self.journal.session(self.connection)
+
+    def drop_recorder(self) -> None:
+        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
+        self._recorder = self.journal.recorder = None
+        self.connection.on_sent = None
 
     def _judge_late(self, verdict: dict[str, Any] | None) -> None:
         if verdict is not None:

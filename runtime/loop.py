@@ -20,7 +20,7 @@ from .bundle import Bundle
 from .clicks import click_law, click_probability
 from .connection import Connection, check_device
 from .dark import DarkMonitor, DarkReport
-from .errors import LinkError
+from .errors import LinkError, RecordingError
 from .link import Link, link_facts
 from .live_run import LiveCore as LiveCore
 from .live_run import LiveRun as LiveRun
@@ -28,8 +28,8 @@ from .live_run import Watcher as Watcher
 from .outage import come_back
 from .plan import Plan
 from .profile import Profile
-from .record import Recorder
 from .recovery import Recovery
+from .rotate import AnyRecorder
 from .tally import RunTally
 from .timing import TimingLedger, arm_realtime
 from .window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
@@ -96,7 +96,7 @@ def run_live(
     plan: Plan,
     core: LiveCore,
     config: RunConfig,
-    recorder: Recorder | None = None,
+    recorder: AnyRecorder | None = None,
     recovery: Recovery | None = None,
     onlookers: Onlookers = NOBODY,
 ) -> RunResult:
@@ -139,6 +139,9 @@ def run_live(
                 _until_ended(run, recovery, prepare, onlookers.watch)
             except KeyboardInterrupt:
                 run.ended = "interrupted"
+            except RecordingError:
+                run.drop_recorder()
+                raise
             finally:  # whatever went wrong: light off first
                 run.stop()
         return _result(run, profile)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .clock import CLOCK_DTYPE
 from .container import MIB, block_ends, canonical_json, file_prologue, sync_folder
-from .errors import PansError, UsageError
+from .errors import PansError, RecordingError, UsageError
 from .record_format import (
     DECISION_DTYPE,
     FORMAT_VERSION,
@@ -279,13 +279,13 @@ class Recorder:
         if self.watch_write is not None:
             self.watch_write(began_ns, time.perf_counter_ns())
 
-    def _broken(self, error: OSError) -> PansError:
+    def _broken(self, error: OSError) -> RecordingError:
         """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
         with suppress(OSError):  # otherwise the reader stops at the torn block by itself
             self._file.truncate(self._end)
         self._file.close()
         reason = error.strerror or str(error)
-        return PansError(
+        return RecordingError(
             f"{self.path}: the recording stops after {self._end} bytes: {reason}",
             remedy="make room on the disk; what was written before is readable",
         )

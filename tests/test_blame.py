@@ -32,10 +32,18 @@ MS = 1_000_000
 
 
 def facts(
-    arrival: float = 40, end: float = 40.2, spans: tuple[Span, ...] = (), run_delay: float = 0, stamped: tuple[Stamped, ...] = ()
-) -> Facts:  # fmt: skip
-    """Late work whose exposure ended at 0; times in ms."""
-    return Facts(0, int(arrival * MS), int(end * MS), 0, spans, int(run_delay * MS), 0, 0, stamped)
+    arrival: float = 40,
+    end: float = 40.2,
+    spans: tuple[Span, ...] = (),
+    run_delay: float = 0,
+    stamped: tuple[Stamped, ...] = (),
+    cpu: float = 2,
+    arrivals: tuple[float, ...] = (),
+) -> Facts:
+    """Late work whose exposure ended at 0; times in ms; a block every millisecond."""
+    stamps = tuple(int(one * MS) for one in arrivals)
+    begin, came, decided = 0, int(arrival * MS), int(end * MS)
+    return Facts(begin, came, decided, 0, spans, stamps, MS, int(cpu * MS), int(run_delay * MS), 0, 0, stamped)
 
 
 def span(kind: str, begin: float, end: float) -> Span:
@@ -51,17 +59,22 @@ CASES = {
     "a collection while bytes wait": (facts(0.2, 40, (span(GC, 0.1, 39),)), "gc", True),
     "a collection holds up the reader, so the bytes seem late": (facts(39, 40, (span(GC, 0.1, 39),)), "gc", True),
     "a write before the bytes could be taken": (facts(0.2, 40, (span(DISK, 0.1, 39),)), "disk", True),
-    "this decision's own computation": (facts(0.2, 40, (span(INFERENCE, 0.3, 40),)), "inference", True),
-    "the computation of the decision before": (facts(0.2, 40, (span(INFERENCE, 0, 39.8),)), "inference", True),
+    "this decision's own computation": (facts(0.2, 40, (span(INFERENCE, 0.3, 40),), cpu=39), "inference", True),
+    "the computation of the decision before": (facts(0.2, 40, (span(INFERENCE, 0, 39.8),), cpu=39), "inference", True),
+    "a back end that waits for other hardware while bytes come": (
+        facts(0.2, 40, (span(INFERENCE, 0.3, 40),), arrivals=(10, 20, 30)), "inference", True
+    ),
+    "stopped within the decision": (facts(0.2, 40, (span(INFERENCE, 0.3, 40),)), "host", True),
+    "stopped between two waits": (facts(39.9, 40, (span(IDLE, -5, 0.5),)), "host", True),
     "a collection within the computation": (
         facts(0.2, 40, (span(INFERENCE, 0.3, 40), span(GC, 1, 39))), "gc", True
     ),
     "a processor taken away within the computation": (
         facts(0.2, 40, (span(INFERENCE, 0.3, 40),), run_delay=38), "host", True
     ),
-    "a processor taken away while bytes come": (facts(39, 40, run_delay=38), "host", True),
+    "a processor taken away while bytes come": (facts(39, 40, (span(IDLE, 0, 39),), run_delay=38), "host", True),
     "stopped in the middle of a wait": (facts(39, 40, (span(IDLE, 0, 5), span(OVERSLEPT, 5, 39))), "host", True),
-    "its own work": (facts(0.2, 40), "decode", True),
+    "its own work": (facts(0.2, 40, cpu=39), "decode", True),
     "silence without a witness": (facts(spans=(IDLE_ALL,)), "link", False),
     "a probe stuck on its way there": (facts(spans=(IDLE_ALL,), stamped=(pong(5, 39.8, 39.8, 40),)), "link", True),
     "an answer stuck on its way back": (facts(spans=(IDLE_ALL,), stamped=(pong(1, 1.1, 1.1, 40),)), "link", True),
@@ -101,7 +114,9 @@ def test_no_cause_explains_more_than_the_delay(
         begin = reached + int(abs(gap) * total / 4)
         reached = begin + int(length * total / 2)
         pieces.append(Span(kind, begin, reached))
-    verdict = judge(Facts(0, int(arrival * total), total, 0, tuple(pieces), int(delay * total), 0, 0, ()))
+    verdict = judge(
+        Facts(0, int(arrival * total), total, 0, tuple(pieces), (), 1, total // 3, int(delay * total), 0, 0, ())
+    )
     assert verdict.cause in CAUSES
     assert all(0 <= share <= total for share in verdict.shares_ns.values())
     assert verdict.share_ns == max(verdict.shares_ns.values())
@@ -149,7 +164,7 @@ def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
         verdicts.append(incidents.verdict((number + 20) * MS))
     events = [event for event in verdicts if event is not None]
     assert len(events) == 4
-    assert incidents.causes["decode"] == sum(event["decisions"] for event in events)
+    assert sum(incidents.causes.values()) == sum(event["decisions"] for event in events)
 
 
 def test_a_real_collection_is_seen_with_its_length() -> None:
@@ -173,11 +188,11 @@ def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
     evidence = Evidence(lambda: 0, MS, virtual=True)
     evidence.waited(0, 0.02, 20 * MS)
     evidence.waited(20 * MS, 0.02, 90 * MS)
-    evidence.waited(90 * MS, 0.02, 90 * MS + 10)  # too short to matter
+    evidence.waited(90 * MS, 0.02, 90 * MS + 10)
     assert evidence.facts(0, 0, 100 * MS, 0).spans == (
-        Span(IDLE, 0, 20 * MS),
-        Span(IDLE, 20 * MS, 40 * MS),
+        Span(IDLE, 0, 40 * MS),  # two waits with nothing of note between them
         Span(OVERSLEPT, 40 * MS, 90 * MS),
+        Span(IDLE, 90 * MS, 90 * MS + 10),
     )
 
 
