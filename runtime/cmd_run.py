@@ -253,6 +253,8 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         recording = job.record or job.out / "run.pansrec"
         expected = n_objects * job.trials
         header = recording_header(job, bundle_sha256, decider, n_objects)
+        if passing is not None:
+            header["config"]["flow"] = passing.header()
     except BaseException:
         _close_quietly(opening)
         raise

@@ -59,6 +59,7 @@ class FlowCore(Follower):
         self.frames = shots * settings.pool  # of a decision
         self.matcher = PassageMatcher(decider.n_classes, gated, lag=self._lag())
         self.n_passages = 0
+        self.dark_probability = 0.0  # of a click, that the limits were worked out with
         self.dark_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in dark frames
         self.empty_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in frames without an object
         self._decider = decider

@@ -39,4 +39,6 @@ def make_flow_core(
         )
     kind = CellCore if settings.kind == "cells" else TapeCore
     gated = frozenset(classes.index(name) for name in settings.gate_classes)
-    return kind(plan, decider, settings, flow_limits(settings, plan, dark_probability), gated, shots, n_cycles)
+    core = kind(plan, decider, settings, flow_limits(settings, plan, dark_probability), gated, shots, n_cycles)
+    core.dark_probability = dark_probability
+    return core

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from .clicks import click_law, click_probability
-from .flow_settings import FlowSettings, read_flow, with_gate
+from .flow_settings import FlowSettings, flow_of_header, read_flow, with_gate
 from .profile import Profile
 
 if TYPE_CHECKING:
@@ -69,6 +69,27 @@ def core_of(
     return plan, core, cycles
 
 
+def replayed_core(
+    header: Mapping[str, Any], plan: Plan, decider: Decider, bundle: Bundle, shots: int, n_cycles: int
+) -> FlowCore:
+    """Return the core of a recorded flow; `header` is `FlowRun.header`'s. KeyError, TypeError or UsageError if it is damaged."""
+    from .flow_make import make_flow_core
+
+    settings, dark = flow_of_header(header["settings"]), float(header["dark_probability"])
+    return make_flow_core(
+        plan, decider, settings, bundle.classes, shots=shots, dark_probability=dark, n_cycles=n_cycles
+    )
+
+
+def replayed_figures(core: FlowCore, events: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a replayed flow was worth; `events` tell which pulses were not made."""
+    core.matcher.finish()
+    for event in events:
+        if event["kind"] in ("gate_refused", "gate_expired") and "decision" in event:
+            core.matcher.undo(int(event["decision"]))
+    return core.matcher.summary(core.frames)
+
+
 class FlowRun:
     """Joins core and gates of one run, and says afterwards what came of both."""
 
@@ -77,6 +98,10 @@ class FlowRun:
         self._actuator = actuator
         self._gates: dict[str, Any] = {}
         self._run: LiveRun | None = None
+
+    def header(self) -> dict[str, Any]:
+        """What a replay needs to make the same core."""
+        return {"settings": self.core.settings.as_header(), "dark_probability": self.core.dark_probability}
 
     def prepared(self, run: LiveRun) -> None:
         """Before arming: pulses go to the actuator, and the figures hear of those that were not made."""

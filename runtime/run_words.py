@@ -58,7 +58,6 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "backend_choice": dict(choice_of(decider)),
             "tick_hz": job.profile.clock.tick_hz,
             "realtime_requested": job.realtime,
-            **({} if job.flow is None else {"flow": job.flow.as_header()}),
         },
         "versions": {
             "pans": __version__,
