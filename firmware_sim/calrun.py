@@ -2,10 +2,10 @@
 
     python -m pans.firmware_sim.calrun [--trials 2000] [--case NAME] [--seed 1] [--json]
 
-Owns the simulated instruments: brightness and dark rate differ from the profile's by random factors, clicks are drawn exposure by
-exposure by the simulator's kernels (SIMULATED; afterpulsing, crosstalk, dead time and read noise as the profile says), and counted and
-estimated by the code behind `pans calibrate`. Cases without a profile have so few clicks that Wald's interval would fail. Exit code 1
-when an interval of a photon level covers less than 94 % or more than 96 %.
+Owns the simulated instruments: brightness and dark rate differ from the profile's by random factors, clicks are drawn exposure
+by exposure by the simulator's kernels (SIMULATED; afterpulsing, crosstalk, dead time and read noise as the profile says), and
+counted and estimated by the code behind `pans calibrate`. Cases without a profile have so few clicks that Wald's interval would
+fail. Exit code 1 when an interval of a photon level covers less than 94 % or more than 96 %.
 """
 
 from __future__ import annotations

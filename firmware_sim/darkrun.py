@@ -2,10 +2,11 @@
 
     python -m pans.firmware_sim.darkrun [--exposures 100000000] [--changes 2000] [--seed 1] [--json]
 
-Owns the measurement; the clicks are drawn by the simulator's own generator (SIMULATED), the watch is the runtime's, exposure by exposure.
-The optimum beside the delay is exact: the mean delay, from the worst state, of the CUSUM that knows both rates and has the same
-false-alarm rate (no test has a shorter one: Moustakides 1986). Exit code 1 when a bar is missed: false alarms within a factor
-1.5 of the stated rate, delay at most 1.25 times the optimum."""
+Owns the measurement; the clicks are drawn by the simulator's own generator (SIMULATED), the watch is the runtime's, exposure by
+exposure. The optimum beside the delay is exact: the mean delay, from the worst state, of the CUSUM that knows both rates and
+has the same false-alarm rate (no test has a shorter one: Moustakides 1986). Exit code 1 when a bar is missed: false alarms
+within a factor 1.5 of the stated rate, delay at most 1.25 times the optimum.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +128,9 @@ def delay_rows(case: DarkCase, changes: int, seed: int) -> list[dict[str, Any]]:
 
 
 def estimate_rows(case: DarkCase, clicks: int, exposures: int, changes: int, seed: int) -> list[dict[str, Any]]:
-    """What it costs that the rate is an estimate from about `clicks` dark clicks: plugged in as it is, and guarded by its interval."""
+    """What it costs that the rate is an estimate from about `clicks` dark clicks: plugged in as it is, and guarded by its
+    interval.
+    """
     rng = np.random.default_rng(seed)
     sample = round(clicks / case.rate)
     optimum = design_cusum(case.rate, DOUBLED, case.arl_exposures).delay(DOUBLED * case.rate)

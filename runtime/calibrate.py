@@ -31,8 +31,9 @@ _STEPS_MAX = 200
 
 
 class Counts(NamedTuple):
-    """Exposures that are alike, (g,) each: drive in levels, clicks (int64) of exposures (int64), the log probability that nothing but
-    light and dark counts fired it (float64), and the number of the pattern (-1: dark)."""
+    """Exposures that are alike, (g,) each: drive in levels, clicks (int64) of exposures (int64), the log probability that
+    nothing but light and dark counts fired it (float64), and the number of the pattern (-1: dark).
+    """
 
     drive: F64
     clicks: I64
@@ -58,7 +59,9 @@ class LightFit(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Non-uniformity of patterns: relative standard deviation (random effects) with its interval, and the test that there is none."""
+    """Non-uniformity of patterns: relative standard deviation (random effects) with its interval, and the test that there is
+    none.
+    """
 
     relative: Interval
     p_value: float
@@ -118,7 +121,8 @@ def log_likelihood(counts: Counts, model: CountModel, level: float, dark: float)
 def fit_light(counts: Counts, model: CountModel) -> LightFit:
     """Return the photon level and the dark rate that make `counts` most likely, with their 95 % intervals.
 
-    UsageError without lit exposures. All silent: the level is 0 and `high` bounds it; all clicked: the level is inf and `low` bounds it.
+    UsageError without lit exposures. All silent: the level is 0 and `high` bounds it; all clicked: the level is inf and `low`
+    bounds it.
     """
     counts = _merged(counts)
     lit = counts.drive > 0
@@ -319,7 +323,9 @@ def fit_spread(counts: Counts, model: CountModel, level: float, dark: float) -> 
 
 
 def _pattern_levels(counts: Counts, model: CountModel, level: float, dark: float) -> tuple[F64, F64]:
-    """Log of each pattern's level relative to `level` and its variance, both (patterns that say something,), by scoring all at once."""
+    """Log of each pattern's level relative to `level` and its variance, both (patterns that say something,), by scoring all at
+    once.
+    """
     lit = counts.pattern >= 0
     _, own = np.unique(counts.pattern[lit], return_inverse=True)
     drive, clicks, exposures = counts.drive[lit], counts.clicks[lit], counts.exposures[lit]

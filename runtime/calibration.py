@@ -111,7 +111,9 @@ def is_calibration(start: bytes) -> bool:
 
 
 def find_objections(calibration: Calibration, profile: Profile, serial: str | None) -> None:
-    """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another device."""
+    """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another
+    device.
+    """
     made_for = calibration.values["profile"]
     if made_for["sha256"] != profile.sha256:
         raise ConfigError(

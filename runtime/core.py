@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .dark_guard import DarkGuard
 from .decide import Decider
 from .follower import MAX_MARKS as MAX_MARKS
 from .follower import Decision as Decision
@@ -29,8 +30,9 @@ NO_FLAGS = DecisionFlag(0)
 class Core(Follower):
     """Stream tracker, windows and back end joined up, for objects that stand still."""
 
-    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int) -> None:
+    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
         super().__init__(plan, n_cycles)
+        self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots
         self._decider = decider
@@ -44,6 +46,8 @@ class Core(Follower):
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming."""
         self.windows.warm_up()
+        if self.guard is not None:
+            self.guard.warm_up()
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""
@@ -54,21 +58,26 @@ class Core(Follower):
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         decisions = []
+        events = [] if self.guard is None else self.guard.take(block)
         for window in self.windows.push(block):
             before_end = (block.exposure_index + n_exposures - 1 - window.last_exposure) * block.period_ticks
             decisions.append(self._decide(window, end_tick - before_end))
-        return Output(decisions, [], None)
+        return Output(decisions, events, None)
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
         return Output([self._decide(window, tick) for window in self.windows.skip_to(exposure_index)], [], None)
 
     def _give_up(self) -> Output:
         self._visits_before += self.windows.visits_begun
+        if self.guard is not None:
+            self.guard.restart()
         windows = self.windows.restart()
         decisions = [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
         return Output(decisions, [], None)
 
     def _place(self) -> dict[str, Any] | None:
+        if self.guard is not None and self.guard.policy != "warn":
+            return None  # what it has learnt decides too
         return None if self.windows.half_seen else {"windows": list(self.windows.position)}
 
     def _go_on_from(self, place: dict[str, Any]) -> None:
@@ -86,9 +95,16 @@ class Core(Follower):
             flags |= DecisionFlag.WRONG_PATTERN
         if flags:
             flags |= DecisionFlag.ABSTAINED
+        decider = self._decider
+        if self.guard is not None:
+            flags |= self.guard.flags
+            decider = self.guard.decider(decider)
+        if flags & DecisionFlag.ABSTAINED:
             self.n_abstained += 1
         else:
-            label, probability = self._decider.decide(window.counts, self.shots)
+            label, probability = decider.decide(window.counts, self.shots)
+            if self.guard is not None:
+                self.guard.count_word(window.counts)
             if not probability > 0:  # the scores were not finite: their label means nothing
                 flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
                 label, probability = NO_LABEL, 0.0

@@ -17,7 +17,9 @@ CHI2_95 = 3.841458820694124  # 0.95 quantile of chi-square with one degree of fr
 
 
 def beta_cdf(x: float, a: float, b: float) -> float:
-    """Return I_x(a, b), the probability that a Beta(a, b) variable is at most x; relative error about 1e-12 where a + b is below 1e9."""
+    """Return I_x(a, b), the probability that a Beta(a, b) variable is at most x; relative error about 1e-12 where a + b is
+    below 1e9.
+    """
     if x <= 0.0:
         return 0.0
     if x >= 1.0:

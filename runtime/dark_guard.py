@@ -1,0 +1,145 @@
+"""From dark exposures to consequences: the watch, what it means, and what the policy does about it, for one core.
+
+Owns the policies; never counts (dark_watch.py), names (channels.py) or computes tables (dark_tables.py). Deterministic: the
+same blocks give the same events and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
+`decider` for every decision, and passes its events on.
+
+Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates; `mask` leaves channels
+out that are hot, quiet or dead, and abstains where all are concerned; `abstain` gives no label while a warning or an alarm
+lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bundle import Bundle
+from .channels import LEVELS, ChannelHealth, Finding
+from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
+from .dark_watch import ChannelWatch
+from .decide import Decider
+from .errors import UsageError
+from .plan import Plan
+from .record_format import DecisionFlag
+from .wire import DARK_PATTERN, ClickBlock, FrameBlock
+
+POLICIES = ("warn", "tables", "mask", "abstain")
+REMAKE = 2  # a table is made again when this many times the dark exposures are behind the rates
+MAX_FINDINGS = 1000  # kept for the summary; the recording has them all
+F64 = NDArray[np.float64]
+
+
+class DarkGuard:
+    """Watches the dark exposures of one run and does what `policy` says."""
+
+    def __init__(
+        self, plan: Plan, watch: ChannelWatch, policy: str = "warn", bundle: Bundle | None = None, shots: int = 1
+    ) -> None:
+        if policy not in POLICIES:
+            raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
+        self._parallel = plan.mode == "parallel"
+        if policy in ("tables", "mask") and (bundle is None or bundle.table is None or shots != 1):
+            raise UsageError(
+                f"--on-dark {policy} needs a bundle with a table, and one shot per decision",
+                remedy="use --on-dark abstain",
+            )
+        self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
+        self.findings: list[Finding] = []
+        self.dropped_findings = 0
+        self._dark_slot = plan.slot_pattern == DARK_PATTERN
+        self._any_dark = bool(self._dark_slot.any())
+        self._silent_before: bool | None = None  # of the exposure before the next block; None where it is not known
+        self._next = 0
+        self._table = None if bundle is None else bundle.table
+        self._seen = np.zeros(0 if self._table is None else len(self._table), np.int64)
+        self._made: AdaptedTable | None = None
+        self._made_for: tuple[Any, ...] = ()
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels, before arming."""
+        self.watch.warm_up()
+
+    def restart(self) -> None:
+        """Follow another stream: its exposures count from 0 again, the rates go on."""
+        self._next, self._silent_before = 0, None
+
+    def take(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
+        """Take the dark exposures of a block and return events.
+
+        With one detector an exposure right behind a click is left out: an afterpulse is no dark count.
+        """
+        if isinstance(block, FrameBlock):
+            if not self._any_dark:
+                return []
+            slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
+            return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
+        bits, dark = np.asarray(block.bits), np.asarray(block.patterns) == DARK_PATTERN
+        known = self._silent_before if block.exposure_index == self._next else False
+        silent = np.concatenate([[bool(known)], bits[:-1] == 0])
+        self._next, self._silent_before = block.exposure_index + len(bits), bool(bits[-1] == 0)
+        return self.take_dark_words(bits[dark & silent].reshape(-1, 1))
+
+    def take_dark_words(self, words: NDArray[np.uint8]) -> list[dict[str, Any]]:
+        """Take dark exposures (or those of an empty field), words uint8 (n, bytes), in the order of time; return events."""
+        if not len(words):
+            return []
+        found = self.health.take(self.watch.update_words(words))
+        kept = found[: max(0, MAX_FINDINGS - len(self.findings))]
+        self.findings += kept
+        self.dropped_findings += len(found) - len(kept)
+        return [finding.event() for finding in found]
+
+    @property
+    def serious(self) -> list[Finding]:
+        """The states of level warning or alarm that last."""
+        return [
+            finding for finding in self.health.present if LEVELS.index(finding.level) >= 1 or finding.kind == "dead"
+        ]
+
+    @property
+    def flags(self) -> DecisionFlag:
+        """What a decision made now carries."""
+        serious = self.serious if self.policy != "warn" else []
+        if not serious:
+            return DecisionFlag(0)
+        abstains = self.policy == "abstain" or (self.policy == "mask" and self._all_concerned(serious))
+        return DecisionFlag.DARK_ALARM | (DecisionFlag.ABSTAINED if abstains else DecisionFlag(0))
+
+    def decider(self, ordinary: Decider) -> Decider:
+        """The back end for a decision made now."""
+        if self.policy not in ("tables", "mask") or not self.serious:
+            return ordinary
+        assert self._table is not None
+        if self.policy == "mask":
+            masked = np.zeros(len(self._seen).bit_length() - 1, np.bool_)
+            masked[[channel for finding in self.serious for channel in finding.channels]] = True
+            return self._remade(("mask", *np.flatnonzero(masked).tolist()), np.zeros(len(masked)), masked)
+        n_features = len(self._seen).bit_length() - 1
+        looks = max(1, self.watch.exposures - min(finding.since for finding in self.serious))
+        key = ("tables", looks.bit_length(), *(finding.channels for finding in self.serious))
+        extra = np.resize(extra_probability(self.health.rates(), self.watch.expected), n_features)
+        return self._remade(key, extra, np.zeros(n_features, np.bool_))
+
+    def count_word(self, counts: NDArray[np.int64]) -> None:
+        """Remember the word of a decision made while nothing was wrong, int64 (d_f,): how often words come is what tables are
+        made with.
+        """
+        if len(self._seen) and self.policy in ("tables", "mask") and not self.health.present:
+            self._seen[int(counts @ (1 << np.arange(len(counts))))] += 1
+
+    def words(self) -> str:
+        """One line on the present state, for the live view; "" when nothing is wrong."""
+        return "; ".join(f"{finding.level}: {finding.words}" for finding in self.health.present)
+
+    def _all_concerned(self, serious: list[Finding]) -> bool:
+        return not self._parallel or any(len(finding.channels) == self.watch.n_channels for finding in serious)
+
+    def _remade(self, key: tuple[Any, ...], extra: F64, masked: NDArray[np.bool_]) -> AdaptedTable:
+        if self._made is None or key != self._made_for:
+            assert self._table is not None
+            self._made = AdaptedTable(adapted_scores(self._table, word_prior(self._seen), extra, masked))
+            self._made_for = key
+        return self._made
