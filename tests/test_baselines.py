@@ -433,3 +433,17 @@ def test_the_strong_baseline_is_as_strong_as_known(name: str, wanted: tuple[floa
         # known from 3000 other readouts: both errors count
         error = math.hypot(found.accuracy_se_objects, math.sqrt(accuracy / 100 * (1 - accuracy / 100) / 3000))
         assert abs(found.accuracy_mean - accuracy / 100) < 5 * error
+
+
+def test_frames_of_a_field_are_intensities_and_take_no_patterns():
+    images = np.array([[[10, 20], [30, 40]], [[0, 5], [200, 255]]], np.uint8)
+    objects = Objects(images, np.array([0, 1]))
+    task = Task("field", ("a", "b"), objects, objects, "0" * 64, "", light="field")
+    measurement = measure(task, None)
+    light = measurement.photoelectrons(measurement.test, 100.0)
+    intensity = (images.astype(np.float64) / 255).reshape(2, 4) ** 2
+    np.testing.assert_allclose(light, intensity * (100 * 2 / intensity.sum()), rtol=1e-5)
+    lifted = measurement.photoelectrons(measurement.test, 100.0, floor=0.5)
+    assert lifted.sum() == pytest.approx(300)  # 200 of the objects, and half of their mean light on every pixel
+    with pytest.raises(UsageError, match="light that reaches us"):
+        measure(task, np.ones((2, 4)))

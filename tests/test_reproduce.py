@@ -16,6 +16,7 @@ from pans.trainer import reproduce_passive as passive
 from pans.trainer.options import Options, check_options, plain_options, same_options
 from pans.trainer.paper_tables import ACTIVE, PASSIVE, ActiveRow
 from pans.trainer.report_active import markdown
+from pans.trainer.report_passive import markdown as passive_markdown
 from pans.trainer.tasks import Objects, Task
 
 ROWS = [(name, row) for name, rows in ACTIVE.items() for row in rows]
@@ -149,7 +150,7 @@ def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
 
 def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch):
     row = PASSIVE["barcode"].rows[0]
-    small = dataclasses.replace(passive.recipe("barcode", row, 0.01), epochs=4, restarts=1, hidden=8)
+    small = dataclasses.replace(passive.recipe("barcode", row, 0.01), restarts=1, hidden=8)
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     said = []
     found = passive.make_cell(tmp_path, "barcode", row, 0.01, None, said.append)
@@ -160,7 +161,7 @@ def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch)
     assert len(said) == 1
     assert passive.finished_cell(tmp_path, "barcode", row, 0.01) == found
     assert passive.finished_cell(tmp_path, "barcode", row, 0.03) is None
-    page = passive.markdown("barcode", [(row, found)])
+    page = passive_markdown("barcode", [(row, found)])
     assert "of 1 measured cells (of 18 in the paper)" in page
 
 

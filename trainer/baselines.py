@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
+from pans.runtime.incident import incident_intensity
 
 from .evaluate import Measured
 from .tasks import Task
@@ -91,10 +92,12 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
     if brightness not in BRIGHTNESS:
         raise UsageError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
     n_pixels = math.prod(task.image_shape)
-    train, test = (part.images.reshape(len(part), n_pixels) for part in (task.train, task.test))
-    if not test.any():
+    if not task.test.images.any():
         raise UsageError(f"the test objects of {task.name} are black: no light can reach the detector")
     shared = (task.train.labels, task.test.labels, len(task.classes))
+    if task.light != "transmission" or task.optics != "none":
+        return _incident_frames(task, patterns, brightness)
+    train, test = (part.images.reshape(len(part), n_pixels) for part in (task.train, task.test))
     if patterns is None:
         ones = np.ones(n_pixels, np.float32)
         return Measurement(train, shared[0], test, shared[1], shared[2], ones, 1 / 255, brightness, task.image_shape)
@@ -104,6 +107,22 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
     features = [_features(images, weights) for images in (train, test)]
     full = weights.sum(axis=0)
     return Measurement(features[0], shared[0], features[1], shared[1], shared[2], full, 1.0, brightness, None)
+
+
+def _incident_frames(task: Task, patterns: NDArray[np.floating] | None, brightness: str) -> Measurement:
+    """Frames of light that reaches us: a camera sees the intensity of a field, not its amplitude."""
+    if patterns is not None:
+        raise UsageError(
+            f"{task.name} is light that reaches us: no patterns can be thrown on it", remedy="direct imaging"
+        )
+    n_pixels = math.prod(task.image_shape)
+    train, test = (
+        incident_intensity(part.images, task.light, task.optics).reshape(-1, n_pixels)
+        for part in (task.train, task.test)
+    )
+    full = np.full(n_pixels, float(test.mean()), np.float32)  # so that a floor is a part of the mean light
+    labels, n_classes = (task.train.labels, task.test.labels), len(task.classes)
+    return Measurement(train, labels[0], test, labels[1], n_classes, full, 1.0, brightness, task.image_shape)
 
 
 def _features(images: NDArray[np.uint8], weights: F32) -> F32:

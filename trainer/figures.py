@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from .paper_tables import PASSIVE, ActiveRow, PassiveRow
+from .paper_tables import PASSIVE, UNPRINTED, ActiveRow, PassiveRow
 
 DPI = 90
 
@@ -66,13 +66,12 @@ def accuracy_against_photons(path: Path, name: str, done: list[tuple[ActiveRow, 
 
 def measure_over_patterns(path: Path, name: str, done: list[tuple[PassiveRow, dict[str, Any]]]) -> None:
     """Draw accuracy or SSIM over the number of patterns, one colour per dark count: ours solid, the paper's dashed."""
-    table = PASSIVE[name]
+    table = PASSIVE.get(name) or UNPRINTED[name]
     figure, axis = _new(width=6.0, panels=1)
     for i, dark in enumerate(table.dark):
         measured = [(row, figures) for row, figures in done if figures["dark"] == dark]
-        axis.plot(
-            [row.features for row in table.rows], [row.values[i] for row in table.rows], "o--", color=f"C{i}", alpha=0.6
-        )
+        printed = [row for row in table.rows if row.values]
+        axis.plot([r.features for r in printed], [r.values[i] for r in printed], "o--", color=f"C{i}", alpha=0.6)
         if measured:
             x, y = [row.features for row, _ in measured], [figures["value"] for _, figures in measured]
             axis.plot(x, y, "o-", color=f"C{i}", label=f"dark counts {dark:g}")

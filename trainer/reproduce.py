@@ -16,7 +16,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
 
-from .paper_tables import ACTIVE, PASSIVE
+from .paper_tables import ACTIVE, PASSIVE, UNPRINTED
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
@@ -92,8 +92,9 @@ def _facts(row: Any) -> dict[str, Any]:
 def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from . import reproduce_passive as passive
     from .figures import measure_over_patterns
+    from .report_passive import markdown, table_of
 
-    table = PASSIVE[name]
+    table = table_of(name)
     wanted = [row for row in table.rows if args.rows is None or row.features in args.rows]
     levels = [dark for dark in table.dark if args.dark is None or dark in args.dark]
     if not (wanted and levels):
@@ -107,7 +108,7 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
                 figures = passive.make_cell(args.cache, name, row, dark, args.data_dir, say)
             if figures is not None:
                 done.append((row, figures))
-    text = passive.markdown(name, done)
+    text = markdown(name, done)
     result = {"rows": [figures for _, figures in done], "markdown": text}
     if args.out:
         _write(args.out, name, result, lambda path: measure_over_patterns(path, name, done))
@@ -149,7 +150,7 @@ def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     **dict.fromkeys(ACTIVE, _active),
-    **dict.fromkeys(PASSIVE, _passive),
+    **dict.fromkeys([*PASSIVE, *UNPRINTED], _passive),
     "estimators": _estimators,
     "time": _time,
 }

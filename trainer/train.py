@@ -30,6 +30,7 @@ from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from .encoders import ActiveIllumination, Encoder, new_encoder
 from .estimators import ESTIMATORS, LossOf, cross_entropy, squared_error
+from .field_basis import in_pixels
 from .head_fit import fit_head
 from .heads import Heads, new_head
 from .options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
@@ -80,17 +81,19 @@ def train(
     resume: bool = False,
     report: Callable[[EpochReport], None] = lambda _: None,
     law: Law | None = None,
+    basis: Tensor | None = None,
 ) -> Trained:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
 
     `law` replaces the click law of the profile (thermal light, or any differentiable function from photoelectrons to p); what
-    is exported is still judged by the profile's. A checkpoint does not know of it.
+    is exported is still judged by the profile's. A checkpoint does not know of it, nor of `basis` (inputs, size): a coherent encoder
+    is then trained as coefficients of these fields (field_basis.py), and the one returned is W = coefficients @ basis.T.
 
     After every epoch the state goes to `checkpoint`; with `resume` a run goes on from there. KeyboardInterrupt passes
     through, with the state of the last whole epoch on disk.
     """
     check_options(options, profile)
-    data = TrainingData(task, profile, options)
+    data = TrainingData(task, profile, options, basis)
     saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
     best: dict[str, Any] | None = saved.get("best")
     losses: list[float] = saved.get("losses", [])
@@ -119,7 +122,8 @@ def train(
     run = Run(data, profile, options, losses.index(min(losses)), law)
     if best is not None:
         run.restore(best)
-    return run.finish(tuple(losses))
+    trained = run.finish(tuple(losses))
+    return trained if basis is None else replace(trained, encoder=in_pixels(trained.encoder, basis))
 
 
 class Run:

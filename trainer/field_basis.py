@@ -1,0 +1,73 @@
+"""A few fields in which a coherent encoder finds its start: what one class has and the others lack.
+
+Owns the choice of these fields from training objects, and the way back to pixels; never trains and never sees held-out objects.
+
+Scenes with a bright, fluctuating background defeat an encoder that starts from random weights: its first job is to cancel
+the background, and every step of an optimiser in 4096 pixels undoes that. The fields w for which E[(w.x)^2] of one class is largest
+against that of the others cancel it from the start: generalised eigenvectors of the second-moment matrices. An encoder
+W = C B^T is then trained as C alone: the optimiser moves inside them, and every coordinate has the same size.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from .encoders import CoherentField, Encoder
+
+INPUTS_MAX = 1024  # finer images are binned before the eigenvectors are found: 2 x 2 pixels of 64 x 64
+RIDGE = 1e-6  # mean square amplitude that is added everywhere: less than an 8-bit step, it keeps the matrices regular
+
+
+def discriminant_basis(fields: Tensor, labels: Tensor, image_shape: tuple[int, int], size: int) -> Tensor:
+    """Return `size` fields per class, float32 (pixels, classes * size): E[(b.x)^2] of that class largest against the rest.
+
+    `fields` (n, pixels) are real amplitudes; each basis field is scaled to a mean square of 1 over all objects.
+    """
+    side = _binning(image_shape)
+    coarse = _binned(fields, image_shape, side).double()
+    regular = RIDGE * torch.eye(coarse.shape[1], dtype=torch.float64)
+    found = []
+    for label in range(int(labels.max()) + 1):
+        ours, others = (_second_moment(coarse[mask]) for mask in (labels == label, labels != label))
+        lower = torch.linalg.cholesky(others + regular)
+        half = torch.linalg.solve_triangular(lower, ours, upper=False)
+        whitened = torch.linalg.solve_triangular(lower, half.T, upper=False)
+        vectors = torch.linalg.eigh(0.5 * (whitened + whitened.T)).eigenvectors[:, -size:]
+        found.append(torch.linalg.solve_triangular(lower.T, vectors, upper=True))
+    basis = torch.cat(found, dim=1)
+    basis = basis / (coarse @ basis).square().mean(dim=0).sqrt()
+    return _spread(basis, image_shape, side).float()
+
+
+def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
+    """Return the coherent encoder W = C B^T of one whose inputs are the coordinates in `basis` (pixels, size)."""
+    assert isinstance(encoder, CoherentField)
+    parts, n_features, _ = encoder.weight.shape
+    whole = CoherentField(n_features, len(basis), torch.Generator(), complex_field=parts == 2)
+    with torch.no_grad():
+        whole.weight.copy_(encoder.weight @ basis.T)
+    return whole
+
+
+def _binning(image_shape: tuple[int, int]) -> int:
+    return max(1, math.ceil(math.sqrt(math.prod(image_shape) / INPUTS_MAX)))
+
+
+def _second_moment(rows: Tensor) -> Tensor:
+    return rows.T @ rows / len(rows)
+
+
+def _binned(fields: Tensor, image_shape: tuple[int, int], side: int) -> Tensor:
+    pictures = fields.reshape(-1, 1, *image_shape)
+    return torch.nn.functional.avg_pool2d(pictures, side, ceil_mode=True, divisor_override=1).flatten(1)
+
+
+def _spread(basis: Tensor, image_shape: tuple[int, int], side: int) -> Tensor:
+    """The transpose of `_binned`: every pixel of a bin gets its weight."""
+    height, width = image_shape
+    coarse = basis.T.reshape(-1, -(-height // side), -(-width // side))
+    fine = coarse.repeat_interleave(side, dim=1).repeat_interleave(side, dim=2)[:, :height, :width]
+    return fine.flatten(1).T.contiguous()
