@@ -26,7 +26,7 @@ from .file_facts import file_facts
 from .plan import exposure_us
 from .profile import Profile, load_profile
 from .quantise import QuantisedPatterns, quantise_patterns
-from .verify import FileVerdict, verify_file
+from .verify import FileVerdict, verify_file, verify_folder
 
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
@@ -42,7 +42,8 @@ def _configure_verify(parser: argparse.ArgumentParser) -> None:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    verdicts = [verify_file(path) for path in args.paths]
+    groups = [verify_folder(path) if Path(path).is_dir() else [verify_file(path)] for path in args.paths]
+    verdicts = [verdict for group in groups for verdict in group]
     payload = {
         "ok": all(verdict.ok for verdict in verdicts),
         "alerts": [{"path": verdict.path, "message": text} for verdict in verdicts for text in verdict.alerts],

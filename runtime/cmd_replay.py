@@ -19,6 +19,7 @@ from .connection import plan_from_chunks
 from .core import Core
 from .decide import make_decider
 from .errors import DamagedFileError
+from .parts import parts_in, place_of
 from .record import DECISION_DTYPE, Recording, read_recording
 from .wire import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command, unpack_body
 from .wire_commands import Arm, PlanChunk, unpack_arm, unpack_plan
@@ -44,14 +45,18 @@ def replay(recording: Recording, bundle: Bundle) -> tuple[int, str]:
 
 
 def _decisions(core: Core, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
-    """Drive `core` as the live loop did: each ARM begins a stream, which has the session of its frames."""
+    """Drive `core` as the live loop did: each ARM begins a stream, which has the session of its frames; a later part goes on in one."""
     following = iter(arms)
-    session = 0
+    session, place = 0, place_of(recording)
 
     def begin_next() -> list[Any]:
-        nonlocal session
+        nonlocal session, place
         session, arm = next(following)
-        return core.begin(arm.start_tick, arm.n_cycles).decisions
+        output = core.begin(arm.start_tick, arm.n_cycles)
+        if place is not None:
+            core.resume(place)
+            place = None
+        return output.decisions
 
     for _, body in recording.messages():
         frame = unpack_body(body)
@@ -68,7 +73,8 @@ def _decisions(core: Core, arms: list[tuple[int, Arm]], recording: Recording) ->
             yield begin_next()
         except StopIteration:
             break
-    yield core.end().decisions
+    if "part_ended" not in recording.summary:  # the run went on in the next part
+        yield core.end().decisions
 
 
 def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Arm]]]:
@@ -92,11 +98,13 @@ def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Ar
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="a recording (.pansrec)")
+    parser.add_argument("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
     parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.recording.is_dir():
+        return _run_parts(args)
     recording = read_recording(args.recording)
     bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
     n_decisions, sha256 = replay(recording, bundle)
@@ -110,6 +118,25 @@ def _run(args: argparse.Namespace) -> int:
     }
     words = "identical" if identical else f"DIFFERENT from the recorded log ({recording.n_decisions} decisions)"
     emit(args, payload, f"{n_decisions} decisions, SHA-256 {sha256}: {words}")
+    return EXIT_FINE if identical else EXIT_ALERT
+
+
+def _run_parts(args: argparse.Namespace) -> int:
+    """Replay each part of a recording by itself."""
+    rows: list[dict[str, Any]] = []
+    for path in parts_in(args.recording):
+        recording = read_recording(path)
+        bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
+        n_decisions, sha256 = replay(recording, bundle)
+        same = sha256 == recording.decisions_sha256
+        rows.append({"part": path.name, "decisions": n_decisions, "sha256": sha256, "identical": same})
+    identical = all(row["identical"] for row in rows)
+    payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
+    lines = [
+        f"{row['part']}: {row['decisions']} decisions: {'identical' if row['identical'] else 'DIFFERENT'}"
+        for row in rows
+    ]
+    emit(args, payload, "\n".join(lines))
     return EXIT_FINE if identical else EXIT_ALERT
 
 

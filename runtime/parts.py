@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import DamagedFileError, UsageError
-from .recording import Recording, read_recording
+from .recording import Recording
 from .rotate import PART_EVENT, chained
 
 
@@ -84,8 +84,3 @@ def chain_violations(recordings: list[Recording]) -> list[str]:
 
 def _chain_before(part: Mapping[str, Any]) -> str:
     return str((part.get("before") or {}).get("chain_sha256", ""))
-
-
-def read_parts(paths: list[Path]) -> list[Recording]:
-    """Return all of `paths`, each checked block by block."""
-    return [read_recording(path) for path in paths]

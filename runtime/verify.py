@@ -19,6 +19,7 @@ from .bundle import Bundle, golden_violation, load_bundle, parse_bundle, word_me
 from .bundle_format import MAGIC as BUNDLE_MAGIC
 from .decide import make_decider
 from .errors import ConfigError, DamagedFileError, PansError, UsageError
+from .parts import chain_violations, first_decision, parts_in
 from .profile import load_profile, parse_profile, shipped_profiles
 from .record import DecisionFlag, Recording, read_recording
 from .record_format import MAGIC as RECORDING_MAGIC
@@ -85,6 +86,21 @@ def verify_file(path: str | Path) -> FileVerdict:
     return verdict
 
 
+def verify_folder(folder: str | Path) -> list[FileVerdict]:
+    """Check each part of the recording in `folder`, and the chain from one to the next; UsageError if there are none."""
+    paths = parts_in(folder)
+    verdicts = [verify_file(path) for path in paths]
+    chain = FileVerdict(str(folder), "parts")
+    if any(verdict.damaged for verdict in verdicts):
+        chain.violations.append("the chain cannot be checked: a part is damaged")
+    else:
+        try:
+            chain.violations += chain_violations([read_recording(path) for path in paths])
+        except DamagedFileError as error:
+            chain.violations.append(error.message)
+    return [*verdicts, chain]
+
+
 def _what_survives(path: str | Path) -> list[str]:
     try:
         left = read_recording(path, salvage=True)
@@ -138,8 +154,9 @@ def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
     n_classes = _verify_inner_bundle(recording, verdict)
     _verify_inner_profile(recording, verdict)
     decisions = recording.decisions()
-    verdict.violations += _decision_violations(decisions, n_classes)
-    verdict.violations += _timing_violations(recording.timings(), len(decisions))
+    first = first_decision(recording)
+    verdict.violations += _decision_violations(decisions, n_classes, first)
+    verdict.violations += _timing_violations(recording.timings(), first + len(decisions))
     for _ in recording.events():
         pass  # reading them is the check
     for stream, items in (("messages", recording.messages()), ("commands", recording.commands())):
@@ -176,7 +193,7 @@ def _verify_inner_profile(recording: Recording, verdict: FileVerdict) -> None:
         verdict.violations.append(error.message)
 
 
-def _decision_violations(decisions: NDArray[np.void], n_classes: int) -> Iterator[str]:
+def _decision_violations(decisions: NDArray[np.void], n_classes: int, first: int) -> Iterator[str]:
     known = DecisionFlag(0)
     for flag in DecisionFlag:
         known |= flag
@@ -184,7 +201,7 @@ def _decision_violations(decisions: NDArray[np.void], n_classes: int) -> Iterato
     abstained = (flags & int(DecisionFlag.ABSTAINED)) != 0
     finite = np.isfinite(probability) & (probability >= 0) & (probability <= 1)
     checks = {
-        "is not numbered in sequence": decisions["index"] != np.arange(len(decisions), dtype=np.uint64),
+        "is not numbered in sequence": decisions["index"] != first + np.arange(len(decisions), dtype=np.uint64),
         "has flags that this version does not know": (flags & ~np.uint32(int(known))) != 0,
         "abstained, but has a label": abstained & (labels != NO_LABEL),
         f"has a label beyond the {n_classes} classes": ~abstained & (labels >= n_classes),
