@@ -1,6 +1,6 @@
 """The actuation outputs: which pulses were accepted, and which output is open when.
 
-Owns the pulses, bounded, as the ground truth of what was actuated; never decides whether the state allows one (device.py).
+Owns the pulses and refusals, bounded, as the ground truth of what was actuated; never decides whether the state allows one (device.py).
 """
 
 from __future__ import annotations
@@ -26,22 +26,46 @@ class GatePulse(NamedTuple):
     channel: int
 
 
+class GateRefusal(NamedTuple):
+    """One pulse that was asked for at tick `asked_at` and not accepted, and why."""
+
+    tick: int
+    channel: int
+    asked_at: int
+    status: AckStatus
+
+
 class Gates:
-    """All outputs; `pulses` are in the order of their commands, the oldest are forgotten."""
+    """All outputs; `pulses` and `refusals` in the order of their commands, the oldest forgotten; `accepted` and `refused` count all."""
 
     def __init__(self) -> None:
         self.pulses: deque[GatePulse] = deque(maxlen=MAX_KEPT_PULSES)
+        self.refusals: deque[GateRefusal] = deque(maxlen=MAX_KEPT_PULSES)
+        self.accepted = self.refused = 0
+        self._pending: list[int] = []  # ticks, some of them passed
 
     def add(self, gate: Gate, now: int) -> None:
         """Accept a pulse, or raise `Refused`: a pulse that comes too late is never executed."""
+        try:
+            self._check(gate, now)
+        except Refused as refusal:
+            self.refused += 1
+            self.refusals.append(GateRefusal(gate.tick, gate.channel, now, refusal.status))
+            raise
+        self.accepted += 1
+        self._pending.append(gate.tick)
+        self.pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
+
+    def _check(self, gate: Gate, now: int) -> None:
         if gate.tick <= now:
             raise Refused(AckStatus.TOO_LATE, f"gate tick {gate.tick} has passed, it is {now}")
         if gate.channel >= GATE_CHANNELS or not gate.duration_ticks:
             text = f"gate {gate.channel} for {gate.duration_ticks} ticks: channels are 0..{GATE_CHANNELS - 1}"
             raise Refused(AckStatus.OUT_OF_RANGE, text)
-        if sum(pulse.tick > now for pulse in self.pulses) >= MAX_PENDING_GATES:
+        if len(self._pending) >= MAX_PENDING_GATES:
+            self._pending = [tick for tick in self._pending if tick > now]
+        if len(self._pending) >= MAX_PENDING_GATES:
             raise Refused(AckStatus.OUT_OF_RANGE, f"{MAX_PENDING_GATES} gate pulses are pending already")
-        self.pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
 
     def is_open(self, channel: int, now: int) -> bool:
         """Whether output `channel` is open at tick `now`."""
@@ -51,3 +75,4 @@ class Gates:
         """Close what is open and cancel what is to come."""
         kept = [pulse._replace(end_tick=min(pulse.end_tick, now)) for pulse in self.pulses if pulse.tick <= now]
         self.pulses = deque(kept, maxlen=MAX_KEPT_PULSES)
+        self._pending.clear()

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pans.firmware_sim.device import Instrument
-from pans.firmware_sim.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse
+from pans.firmware_sim.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse, GateRefusal
 from pans.firmware_sim.scene import load_scene, scene_from_arrays
 from pans.firmware_sim.upload import word_bytes
 from pans.runtime import wire
@@ -659,7 +659,14 @@ def test_a_late_gate_is_not_executed() -> None:
     assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.TOO_LATE
     assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 50, GATE_CHANNELS)))[0] == AckStatus.OUT_OF_RANGE
     assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 0, 1)))[0] == AckStatus.OUT_OF_RANGE
-    assert not bench.device.gates.pulses
+    gates = bench.device.gates
+    assert not gates.pulses
+    assert list(gates.refusals) == [
+        GateRefusal(3000, 1, 3000, AckStatus.TOO_LATE),
+        GateRefusal(4000, GATE_CHANNELS, 3000, AckStatus.OUT_OF_RANGE),
+        GateRefusal(4000, 1, 3000, AckStatus.OUT_OF_RANGE),
+    ]
+    assert (gates.accepted, gates.refused) == (0, 3)
 
 
 def test_stop_closes_gates_and_cancels_those_to_come() -> None:
@@ -678,6 +685,10 @@ def test_pending_gates_are_limited() -> None:
     for number in range(MAX_PENDING_GATES):
         bench.done(Opcode.GATE, pack_gate(Gate(5000 + number, 1, 0)))
     assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+    bench.run_to(5000)
+    bench.done(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))
+    assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+    assert (bench.device.gates.accepted, bench.device.gates.refused) == (MAX_PENDING_GATES + 1, 2)
 
 
 # -- receive window ----------------------------------------------------------------------------------------------------

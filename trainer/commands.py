@@ -1,4 +1,4 @@
-"""The commands of the trainer: `pans train`, `pans data` (`pans evaluate` is in cmd_evaluate.py).
+"""The trainer's main command: `pans train` (`pans evaluate` is in cmd_evaluate.py, `pans data` in cmd_data.py).
 
 Owns their arguments and how their answers look; the work is in train.py, export.py and tasks.py. Heavy
 packages are imported when a command runs, not before. All accuracies here are SIMULATED through the profile.
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
-from pans.runtime.errors import PansError, UsageError
+from pans.runtime.errors import UsageError
 
 from .cmd_evaluate import DEFAULT_PROFILE, add_data_dir, figures, first, lines, measure
 from .options import ENCODERS, ESTIMATOR_NAMES, HEADS
@@ -90,7 +90,11 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument(
-        "--shift-px", type=int, default=0, metavar="X", help="move training images by up to X along the rows (default 0)"
+        "--shift-px",
+        type=int,
+        default=0,
+        metavar="X",
+        help="move training images by up to X along the rows (default 0)",
     )
     parser.add_argument("--offset-px", type=int, default=0, metavar="Y", help="and by up to Y across them (default 0)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
@@ -240,41 +244,6 @@ def _epoch_line(epoch: EpochReport, options: Options) -> str:
     )
 
 
-# ---- data ----
-
-
-def _configure_data(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", choices=("list", "fetch"), help="what is there, or fetch what is not")
-    parser.add_argument("names", nargs="*", metavar="NAME", help="fashion-mnist, mnist (default: all)")
-    add_data_dir(parser)
-
-
-def _data(args: argparse.Namespace) -> int:
-    from .public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
-
-    unknown = [name for name in args.names if name not in PUBLIC_SETS]
-    if unknown:
-        raise UsageError(f"no data set {unknown[0]!r}, allowed: {', '.join(PUBLIC_SETS)}")
-    folder = data_folder(args.data_dir)
-    rows = []
-    for name in args.names or PUBLIC_SETS:
-        for pinned in PUBLIC_SETS[name].files:
-            path = folder / PUBLIC_SETS[name].folder / pinned.name
-            if args.action == "fetch" and fetch(PUBLIC_SETS[name].source + pinned.name, path, pinned):
-                say(f"fetched {path}")
-            try:
-                check_pinned(path, pinned)
-                state = "ok"
-            except PansError as error:
-                state = "missing" if isinstance(error, UsageError) else "altered"
-            rows.append(
-                {"set": name, "file": pinned.name, "bytes": pinned.n_bytes, "sha256": pinned.sha256, "state": state}
-            )
-    text = "\n".join(f"{row['state']:<8} {row['set']:<14} {row['file']:<28} {row['bytes']:>10}" for row in rows)
-    emit(args, {"folder": str(folder), "rows": rows}, f"{text}\nin {folder}")
-    return EXIT_FINE
-
-
 # ---- shared ----
 
 
@@ -287,4 +256,3 @@ def _torch() -> Any:
 
 
 TRAIN = Command("train patterns and head through a profile, and export a bundle", _configure_train, _train)
-DATA = Command("list or fetch the public data sets", _configure_data, _data)
