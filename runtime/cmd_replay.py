@@ -6,7 +6,6 @@ Owns the command and the way from a recording back to a core; the decisions come
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from .decide import make_decider
 from .errors import DamagedFileError
 from .parts import parts_in, place_of
 from .record import DECISION_DTYPE, Recording, read_recording
+from .record_log import log_hash
 from .wire import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command, unpack_body
 from .wire_commands import Arm, PlanChunk, unpack_arm, unpack_plan
 
@@ -37,9 +37,9 @@ def replay(recording: Recording, bundle: Bundle) -> tuple[int, str]:
     core = Core(
         plan, make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto"))), shots, arms[0][1].n_cycles
     )
-    log, n_decisions = hashlib.sha256(), 0
+    log, n_decisions = log_hash(recording.version), 0
     for decisions in _decisions(core, arms, recording):
-        log.update(np.array(decisions, DECISION_DTYPE).tobytes())
+        log.update(np.array(decisions, DECISION_DTYPE))
         n_decisions += len(decisions)
     return n_decisions, log.hexdigest()
 

@@ -11,7 +11,7 @@ import os
 import secrets
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -141,8 +141,8 @@ def file_prologue(magic: bytes, version: int) -> tuple[bytes, int]:
     return start + _CRC.pack(chain), chain
 
 
-def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
-    """Return the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
+def check_prologue(data: bytes, magic: bytes, versions: Collection[int], where: str) -> tuple[int, int]:
+    """Return the version and the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
     if data[: len(magic)] != magic[: len(data)]:
         raise DamagedFileError(f"{where}: it starts with {data[:8]!a}, expected {magic!a}")
     if len(data) < FILE_PROLOGUE.size:
@@ -150,10 +150,11 @@ def check_prologue(data: bytes, magic: bytes, version: int, where: str) -> int:
     _, found, crc = FILE_PROLOGUE.unpack_from(data)
     if zlib.crc32(data[: FILE_PROLOGUE.size - 4]) != crc:
         raise DamagedFileError(f"{where}: altered within its first {FILE_PROLOGUE.size} bytes")
-    if found != version:
+    if found not in versions:
         remedy = "use the pans-runtime that wrote it"
-        raise DamagedFileError(f"{where}: format version {found}, allowed: {version}", remedy=remedy)
-    return crc
+        allowed = ", ".join(str(version) for version in sorted(versions))
+        raise DamagedFileError(f"{where}: format version {found}, allowed: {allowed}", remedy=remedy)
+    return found, crc
 
 
 def block_bytes(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:

@@ -32,8 +32,8 @@ from .record_format import (
     TIMING_DTYPE,
     DecisionFlag,
     Kind,
-    decision_log_sha256,
 )
+from .record_log import BLOCK_ROWS, LogEncoder, decision_log_sha256
 from .recording import Recording, read_recording
 
 __all__ = [
@@ -114,7 +114,7 @@ class Recorder:
         self._events = _Bytes(Kind.EVENTS, _EVENT_BUFFER_BYTES)
         self._decisions = _Rows(Kind.DECISIONS, DECISION_DTYPE)
         self._timings = _Rows(Kind.TIMINGS, TIMING_DTYPE)
-        self._log_hash = hashlib.sha256()
+        self._log = LogEncoder()
         self._n_decisions = 0
         self._n_blocks = 0
         facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
@@ -161,7 +161,7 @@ class Recorder:
     @property
     def written(self) -> tuple[int, str]:
         """Number of the decisions in the file and the SHA-256 (hex) of their log; all of them after `flush`."""
-        return self._n_decisions, self._log_hash.hexdigest()
+        return self._n_decisions, self._log.hexdigest()
 
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
@@ -179,12 +179,12 @@ class Recorder:
     def add_decisions(self, rows: NDArray[np.void]) -> None:
         """Keep many decisions, DECISION_DTYPE (n,), behind those already added; whole blocks go out at once."""
         self._empty(self._decisions)
-        most = LIMITS[Kind.DECISIONS] // DECISION_DTYPE.itemsize
-        for start in range(0, len(rows), most):
-            payload = np.ascontiguousarray(rows[start : start + most], dtype=DECISION_DTYPE).view(np.uint8).data
-            self._write_block(Kind.DECISIONS, payload)
-            self._log_hash.update(payload)
-            self._n_decisions += len(payload) // DECISION_DTYPE.itemsize
+        for start in range(0, len(rows), BLOCK_ROWS):
+            self._write_decisions(rows[start : start + BLOCK_ROWS])
+
+    def _write_decisions(self, rows: NDArray[np.void]) -> None:
+        self._write_block(Kind.DECISIONS, self._log.block(rows))
+        self._n_decisions += len(rows)
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
@@ -223,7 +223,7 @@ class Recorder:
     def close(self, summary: Mapping[str, Any]) -> str:
         """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log."""
         self.flush()
-        digest = self._log_hash.hexdigest()
+        digest = self._log.hexdigest()
         end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
         self._write_block(Kind.END, canonical_json(end))
         self.sync()
@@ -246,11 +246,12 @@ class Recorder:
     def _empty(self, buffer: _Rows | _Bytes) -> None:
         if not buffer.used:
             return
-        count, payload = buffer.used, buffer.take()
-        self._write_block(buffer.kind, payload)
-        if buffer.kind == Kind.DECISIONS:
-            self._log_hash.update(payload)
-            self._n_decisions += count
+        if buffer is self._decisions:
+            rows = self._decisions.rows[: self._decisions.used]
+            self._decisions.used = 0
+            self._write_decisions(rows)
+            return
+        self._write_block(buffer.kind, buffer.take())
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
         if len(payload) > LIMITS[kind]:

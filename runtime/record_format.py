@@ -1,4 +1,4 @@
-"""What stands in a recording: block kinds with their limits, the decision log's row, its flags and its hash.
+"""What stands in a recording: block kinds with their limits, the decision log's row and its flags.
 
 Owns the vocabulary that writer (record.py), reader (recording.py) and core share; never touches a file. The bytes are in
 docs/FORMATS.md.
@@ -6,19 +6,20 @@ docs/FORMATS.md.
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from enum import IntEnum, IntFlag
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
 FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)  # they differ in DECISIONS blocks alone: record_log.py
 MESSAGE_MAX_BYTES = MIB
 NO_LABEL = 0xFFFF  # the label of a decision that abstained
+LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
+RUN_ROWS_MAX = 1 << 31
 MESSAGE = struct.Struct("<qI")
 
 
@@ -34,13 +35,9 @@ class Kind(IntEnum):
     TIMINGS = 7
     EVENTS = 8
     END = 9
-    VERDICTS = 10  # since version 2: the answers that DENSE blocks name by number
-    DENSE = 11  # since version 2: decisions in the compact form, record_dense.py
 
 
 LIMITS = {int(kind): 2 * MIB for kind in Kind} | {int(Kind.HEADER): 4 * MIB, int(Kind.BUNDLE): FILE_MAX_BYTES}
-# What may stand in a file of each format version that can be read, and how long it may be.
-VERSION_LIMITS = {1: {kind: most for kind, most in LIMITS.items() if kind < Kind.VERDICTS}, 2: LIMITS}
 
 
 class DecisionFlag(IntFlag):
@@ -81,8 +78,3 @@ TIMING_DTYPE = np.dtype(
         ("recorded_ns", "<i8"),
     ]
 )
-
-
-def decision_log_sha256(records: NDArray[np.void]) -> str:
-    """Return the SHA-256 (hex) of decisions, DECISION_DTYPE (n,), in their order: what replay compares."""
-    return hashlib.sha256(np.ascontiguousarray(records, dtype=DECISION_DTYPE).tobytes()).hexdigest()

@@ -20,7 +20,8 @@ from .bundle import Bundle, parse_bundle
 from .clock import CLOCK_DTYPE
 from .container import FILE_PROLOGUE, MIB, Block, check_prologue, parse_json_object, read_block
 from .errors import DamagedFileError, UsageError
-from .record_format import DECISION_DTYPE, FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, TIMING_DTYPE, Kind
+from .record_format import DECISION_DTYPE, LIMITS, MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind
+from .record_log import LogReader, log_reader
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,7 @@ class Recording:
 
     path: Path
     size: int
+    version: int  # of the format
     header: Mapping[str, Any]
     kinds: Mapping[Kind, int]  # number of whole blocks
     n_decisions: int
@@ -41,7 +43,8 @@ class Recording:
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
         with open(self.path, "rb") as file:
-            for block in _blocks(file, str(self.path)):
+            _, chain = _start(file, str(self.path))
+            for block in _blocks(file, chain, str(self.path)):
                 if not wanted or block.kind in wanted:
                     yield block
                 if block.end >= self.end_offset:
@@ -56,8 +59,15 @@ class Recording:
         return self._pairs(Kind.COMMANDS)
 
     def decisions(self) -> NDArray[np.void]:
-        """Return all decisions, DECISION_DTYPE (n,)."""
-        return self._rows(Kind.DECISIONS, DECISION_DTYPE)
+        """Return all decisions, DECISION_DTYPE (n,), whichever form they stand in."""
+        parts = list(self.iter_decisions())
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=DECISION_DTYPE)
+
+    def iter_decisions(self) -> Iterator[NDArray[np.void]]:
+        """Yield the decisions block by block, DECISION_DTYPE (n,); memory holds one block."""
+        reader = log_reader(self.version)
+        for block in self.iter_blocks(Kind.DECISIONS):
+            yield reader.rows(block.payload, f"{self.path}: block {block.index}")
 
     def timings(self) -> NDArray[np.void]:
         """Return the host times of all decisions, TIMING_DTYPE (n,)."""
@@ -107,8 +117,12 @@ def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
     return block.payload
 
 
-def _blocks(file: Any, where: str) -> Iterator[Block]:
-    chain = check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, FORMAT_VERSION, where)
+def _start(file: Any, where: str) -> tuple[int, int]:
+    """Read the prologue: the format version and the checksum that seeds the first block."""
+    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, where)
+
+
+def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
     index = 0
     while (block := read_block(file, index, chain, LIMITS, where)) is not None:
         yield block
@@ -129,7 +143,11 @@ class _Scan:
         self.end: dict[str, Any] | None = None
         self.end_offset = 0
         self.n_decisions = 0
-        self.log_hash = hashlib.sha256()
+        self.version = 0
+        self.log: LogReader = log_reader(1)
+
+    def begin(self, version: int) -> None:
+        self.version, self.log = version, log_reader(version)
 
     def take(self, block: Block) -> None:
         where = f"{self.path}: block {block.index}"
@@ -143,18 +161,16 @@ class _Scan:
             if self.header.get("bundle_sha256") != found:
                 wanted = ascii(self.header.get("bundle_sha256"))[:80]
                 raise DamagedFileError(f"{where}: the bundle has the SHA-256 {found}, the header says {wanted}")
-        elif kind == Kind.DECISIONS:
-            rows = _whole_rows(block, DECISION_DTYPE, self.path)
-            self.n_decisions += len(rows) // DECISION_DTYPE.itemsize
-            self.log_hash.update(rows)
         elif kind == Kind.END:
             self.end = self._check_end(block, where)
+        elif kind == Kind.DECISIONS:
+            self.n_decisions += len(self.log.rows(block.payload, where))
         self.kinds[kind] += 1
         self.end_offset = block.end
 
     def _check_end(self, block: Block, where: str) -> dict[str, Any]:
         end = parse_json_object(block.payload, where)
-        facts = {"blocks": block.index, "decisions": self.n_decisions, "decisions_sha256": self.log_hash.hexdigest()}
+        facts = {"blocks": block.index, "decisions": self.n_decisions, "decisions_sha256": self.log.hexdigest()}
         for key, found in facts.items():
             if end.get(key) != found:
                 raise DamagedFileError(f"{where}: END says {key} = {ascii(end.get(key))[:80]}, found {found}")
@@ -174,7 +190,9 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             try:
-                for block in _blocks(file, str(path)):
+                version, chain = _start(file, str(path))
+                scan.begin(version)
+                for block in _blocks(file, chain, str(path)):
                     scan.take(block)
             except DamagedFileError as error:
                 if not salvage or not scan.kinds[Kind.HEADER]:
@@ -189,10 +207,11 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
     return Recording(
         path=Path(path),
         size=size,
+        version=scan.version,
         header=scan.header,
         kinds={kind: count for kind, count in scan.kinds.items() if count},
         n_decisions=scan.n_decisions,
-        decisions_sha256=scan.log_hash.hexdigest(),
+        decisions_sha256=scan.log.hexdigest(),
         complete=complete,
         end_offset=scan.end_offset,
         summary=scan.end["summary"] if scan.end is not None else {},

@@ -60,16 +60,14 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert found.complete
     assert found.damage == ""
     assert found.header["seed"] == 7
-    assert found.header["format_version"] == 1
+    assert found.header["format_version"] == found.version == 2
     assert found.summary == {"accuracy": 0.75}
     assert found.end_offset == found.size == path.stat().st_size
     assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
     assert list(found.commands()) == [(10, b"arm")]
     wanted = np.array([decision(i) for i in range(5)], dtype=DECISION_DTYPE)
     np.testing.assert_array_equal(found.decisions(), wanted)
-    assert (
-        digest == found.decisions_sha256 == decision_log_sha256(wanted) == hashlib.sha256(wanted.tobytes()).hexdigest()
-    )
+    assert digest == found.decisions_sha256 == decision_log_sha256(wanted)
     assert found.timings()["index"].tolist() == [0, 1, 2, 3, 4]
     assert found.timings().dtype == TIMING_DTYPE
     assert found.clock_samples().tolist() == [(5, 6, 7), (8, 9, 10)]
@@ -88,16 +86,19 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
         last = zlib.crc32(payload, first)
         return start + struct.pack("<I", first) + payload + struct.pack("<I", last), last
 
-    start = b"PANSRECD" + struct.pack("<I", 1)
+    start = b"PANSRECD" + struct.pack("<I", 2)
     chain = zlib.crc32(start)
     wanted = start + struct.pack("<I", chain)
-    row = struct.pack("<QQQIIIHhIfI", 0, 0, 8, 0, 0, 4, 0, -1, 0, 0.5, 12345)
-    end = {"blocks": 3, "decisions": 1, "decisions_sha256": hashlib.sha256(row).hexdigest(), "summary": {}}
-    header = {**HEADER, "format_version": 1}
+    run = struct.pack("<QQQIIIIIIhH", 0, 0, 8, 0, 0, 1, 0, 0, 0, -1, 0)
+    verdict = struct.pack("<IHIfI", 4, 0, 0, 0.5, 12345)
+    parts = [hashlib.sha256(part).digest() for part in (verdict, bytes(2), run)]
+    log = hashlib.sha256(b"".join(parts)).hexdigest()
+    end = {"blocks": 3, "decisions": 1, "decisions_sha256": log, "summary": {}}
+    header = {**HEADER, "format_version": 2}
     payloads = [
         (1, json.dumps(header, sort_keys=True, separators=(",", ":")).encode()),
         (3, struct.pack("<qI", -5, 2) + b"hi"),
-        (6, row),
+        (6, struct.pack("<III", 1, 1, 1) + run + verdict + bytes(2)),
         (9, json.dumps(end, sort_keys=True, separators=(",", ":")).encode()),
     ]
     for index, (kind, payload) in enumerate(payloads):
@@ -114,7 +115,7 @@ def test_rows_are_packed_as_documented() -> None:
     assert DECISION_DTYPE.itemsize == 52
     assert TIMING_DTYPE.itemsize == 40
     flags = [int(flag) for flag in DecisionFlag]
-    assert flags == [1, 2, 4, 8, 16, 32, 64]
+    assert flags == [1, 2, 4, 8, 16, 32, 64, 128, 256]
 
 
 def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:
@@ -199,7 +200,7 @@ def test_salvage_reads_what_stands_before_the_damage(tmp_path: Path) -> None:
 
 def forged(path: Path, blocks: list[tuple[int, bytes]]) -> Path:
     """A file whose checksums all fit, whatever its blocks say."""
-    start = b"PANSRECD" + struct.pack("<I", 1)
+    start = b"PANSRECD" + struct.pack("<I", 2)
     chain = zlib.crc32(start)
     out = start + struct.pack("<I", chain)
     for index, (kind, payload) in enumerate(blocks):
@@ -220,7 +221,7 @@ def forged(path: Path, blocks: list[tuple[int, bytes]]) -> Path:
         ([(1, b'{"a": NaN}')], "JSON"),
         ([(1, b"{}"), (77, b"")], "kind 77"),
         ([(1, b"{}"), (2, b"abc")], "header says None"),
-        ([(1, b"{}"), (6, b"abc")], "multiple of 52"),
+        ([(1, b"{}"), (6, b"abc")], "3 bytes"),
         ([(1, b"{}"), (9, b"{}")], "blocks = None, found 1"),
         ([(1, b"{}"), (9, json.dumps({"blocks": 1, "decisions": 9}).encode())], "decisions = 9, found 0"),
         ([(1, b"{}"), (3, bytes((2 << 20) + 1))], "allowed at most 2097152"),
@@ -241,7 +242,7 @@ def test_messages_cannot_reach_past_their_block(payload: bytes, tmp_path: Path) 
 
 
 def test_a_length_beyond_the_file_allocates_nothing(tmp_path: Path) -> None:
-    start = b"PANSRECD" + struct.pack("<I", 1)
+    start = b"PANSRECD" + struct.pack("<I", 2)
     head = struct.pack("<IIBxxx", 0xFFFFFFFF, 0, 1)
     crc = zlib.crc32(start)
     path = tmp_path / "f.pansrec"
