@@ -18,15 +18,30 @@ from .connection import plan_from_chunks
 from .core import Core
 from .decide import make_decider
 from .errors import DamagedFileError
+from .flow import FlowCore
+from .follower import Follower
 from .parts import parts_in, place_of
+from .picture_log import PictureLog
+from .plan import Plan
 from .record import DECISION_DTYPE, Recording, read_recording
 from .record_log import log_hash
+from .run_dark import made_guard
+from .run_flow import replayed_core, replayed_figures
+from .verdict import Decider
 from .wire import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command, unpack_body
 from .wire_commands import Arm, PlanChunk, unpack_arm, unpack_plan
 
 
-def replay(recording: Recording, bundle: Bundle) -> tuple[int, str]:
-    """Return how many decisions `recording` gives with `bundle`, and the SHA-256 of their log."""
+def replay(
+    recording: Recording,
+    bundle: Bundle,
+    pictures: PictureLog | None = None,
+    figures: dict[str, Any] | None = None,
+) -> tuple[int, str]:
+    """Return how many decisions `recording` gives with `bundle`, and the SHA-256 of their log.
+
+    `pictures` collects those given back, `figures` what the decisions about passing objects were worth.
+    """
     config = recording.header.get("config", {})
     try:
         chunks, arms = sent_plan(recording)
@@ -34,17 +49,33 @@ def replay(recording: Recording, bundle: Bundle) -> tuple[int, str]:
         shots = int(config["shots"])
     except (KeyError, TypeError, ValueError, MalformedMessage) as error:
         raise DamagedFileError(f"{recording.path}: the run cannot be rebuilt: {error}") from error
-    core = Core(
-        plan, make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto"))), shots, arms[0][1].n_cycles
-    )
+    decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")))
+    if pictures is not None:
+        decider = pictures.over(decider)
+    core = _core(config, plan, decider, bundle, shots, arms[0][1].n_cycles)
     log, n_decisions = log_hash(recording.version), 0
     for decisions in _decisions(core, arms, recording):
         log.update(np.array(decisions, DECISION_DTYPE))
         n_decisions += len(decisions)
+        if pictures is not None:
+            pictures.note(decisions)
+    if figures is not None and isinstance(core, FlowCore):
+        figures |= replayed_figures(core, recording.events())
     return n_decisions, log.hexdigest()
 
 
-def _decisions(core: Core, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
+def _core(
+    config: dict[str, Any], plan: Plan, decider: Decider, bundle: Bundle, shots: int, n_cycles: int
+) -> Core | FlowCore:
+    guard = made_guard(config.get("dark", {}).get("guard", {}), plan, bundle, shots)
+    if "flow" not in config:
+        return Core(plan, decider, shots, n_cycles, guard)
+    core = replayed_core(config["flow"], plan, decider, bundle, shots, n_cycles)
+    core.guard = guard
+    return core
+
+
+def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
     """Drive `core` as the live loop did: each ARM begins a stream, which has the session of its frames; a later part goes on in one."""
     following = iter(arms)
     session, place = 0, place_of(recording)
@@ -100,6 +131,13 @@ def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Ar
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
     parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
+    parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head gives back")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="SCENE.npz",
+        help="compare these pictures with the scene's images (SSIM, squared error)",
+    )
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -107,7 +145,9 @@ def _run(args: argparse.Namespace) -> int:
         return _run_parts(args)
     recording = read_recording(args.recording)
     bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
-    n_decisions, sha256 = replay(recording, bundle)
+    pictures = PictureLog() if args.pictures or args.truth else None
+    figures: dict[str, Any] = {}
+    n_decisions, sha256 = replay(recording, bundle, pictures, figures)
     identical = sha256 == recording.decisions_sha256
     payload = {
         "decisions": n_decisions,
@@ -115,7 +155,12 @@ def _run(args: argparse.Namespace) -> int:
         "recorded_sha256": recording.decisions_sha256,
         "identical": identical,
         "complete": recording.complete,
+        **figures,
     }
+    if pictures is not None and args.pictures:
+        pictures.write(args.pictures)
+    if pictures is not None and args.truth:
+        payload |= pictures.compare(args.truth)
     words = "identical" if identical else f"DIFFERENT from the recorded log ({recording.n_decisions} decisions)"
     emit(args, payload, f"{n_decisions} decisions, SHA-256 {sha256}: {words}")
     return EXIT_FINE if identical else EXIT_ALERT

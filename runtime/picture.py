@@ -57,5 +57,5 @@ def _blur(images: F64) -> F64:
         edge[axis] = (half, half)
         padded = np.pad(images, edge)
         size = images.shape[axis]
-        images = sum(w * padded.take(range(i, i + size), axis=axis) for i, w in enumerate(weight))  # type: ignore[assignment]
+        images = sum(w * padded.take(range(i, i + size), axis=axis) for i, w in enumerate(weight))
     return images
