@@ -65,6 +65,11 @@ class Calibration:
         chosen = scaled[np.arange(channels) % len(rows)]
         return chosen[:, 0], chosen[:, 1], chosen[:, 2]
 
+    def dark_clicks(self, channels: int) -> NDArray[np.int64]:
+        """How many dark clicks each channel's rate was estimated from, int64 (channels,)."""
+        rows = self.values["channels"]
+        return np.array([int(row["dark_clicks"]) for row in rows], np.int64)[np.arange(channels) % len(rows)]
+
     def applied_to(self, profile: Profile) -> Profile:
         """The profile with the projector's measured brightness in place of its own figure: plans then expose for the light that
         is there."""

@@ -24,6 +24,8 @@ from .errors import UsageError
 from .flow_settings import FlowSettings
 from .link import open_link
 from .profile import Profile, load_profile
+from .run_dark import DarkRun
+from .run_dark import add_options as add_dark_options
 from .run_flow import add_options, settings_of
 from .run_words import closing_words, recording_header, what_was_run
 
@@ -105,6 +107,7 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
     _configure_common(parser, trials=1)
     add_options(parser)
+    add_dark_options(parser)
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
@@ -215,7 +218,7 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         from .core import Core
         from .decide import make_decider
         from .live import live_view
-        from .loop import LiveCore, Onlookers, RunConfig, run_live
+        from .loop import LiveCore, LiveRun, Onlookers, RunConfig, run_live
         from .plan import build_plan
         from .record import Recorder
         from .recovery import Recovery
@@ -225,21 +228,23 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
 
         bundle, bundle_sha256 = load_bundle(job.bundle_path)
         decider = make_decider(bundle, shots=job.shots, backend=job.backend)
+        honest = DarkRun.of(args, job.profile)
         n_objects, passing = -(-job.decisions // job.trials), None
         core: LiveCore
         if job.flow is not None:
-            plan, flow_core, n_cycles = core_of(job.profile, bundle, decider, job.flow, job.shots, job.seconds)
+            plan, flow_core, n_cycles = core_of(honest.profile, bundle, decider, job.flow, job.shots, job.seconds)
+            flow_core.guard = honest.guard(plan, bundle, job.shots)
             core, passing = flow_core, FlowRun(flow_core, open_actuator(job.act))
         else:
             plan = build_plan(
-                job.profile,
+                honest.profile,
                 bundle,
                 shots_per_object=job.shots * job.trials,
                 dark_slots_per_cycle=job.dark_slots,
                 order=job.order,
             )
             n_cycles = n_objects * plan.cycles_per_object
-            core = Core(plan, decider, job.shots, n_cycles)
+            core = Core(plan, decider, job.shots, n_cycles, honest.guard(plan, bundle, job.shots))
         config = RunConfig(
             job.shots,
             n_cycles,
@@ -253,11 +258,14 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
         recording = job.record or job.out / "run.pansrec"
         expected = n_objects * job.trials
         header = recording_header(job, bundle_sha256, decider, n_objects)
+        header["config"]["dark"] = honest.header()
         if passing is not None:
             header["config"]["flow"] = passing.header()
     except BaseException:
         _close_quietly(opening)
         raise
+    for warning in honest.warnings:
+        say(f"pans: {warning}")
     link = opening.result()
     if job.trace is not None:
         link = TracedLink(link, job.trace, job.device)
@@ -265,8 +273,14 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
         title = f"{bundle.name} on {job.profile.name}"
         with live_view(title, bundle.classes, expected, link.simulated) as watch:
-            onlookers = Onlookers(watch, None if passing is None else passing.prepared)
-            result = run_live(link, job.profile, bundle, plan, core, config, recorder, recovery, onlookers)
+
+            def prepared(run: LiveRun) -> None:
+                honest.check_device(run)
+                if passing is not None:
+                    passing.prepared(run)
+
+            onlookers = Onlookers(watch, prepared)
+            result = run_live(link, honest.profile, bundle, plan, core, config, recorder, recovery, onlookers)
         frames = job.shots * (1 if job.flow is None else job.flow.pool)
         summary = summarise(
             result,

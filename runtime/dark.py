@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 ALARM_PROBABILITY = 1e-6  # of seeing this many dark clicks or more, if the profile's dark rate were right
 Z_95 = 1.959963984540054
@@ -24,6 +25,12 @@ class DarkReport:
     high: float
     expected: float
     alarm: str
+    policy: str = "warn"
+    findings: tuple[dict[str, Any], ...] = ()  # states of the detector that began or ended (channels.py), in order
+    present: tuple[str, ...] = ()  # those that last, in words
+    channels: tuple[
+        dict[str, float], ...
+    ] = ()  # exposures, clicks, rate and its interval by channel, where a guard watched
 
 
 class DarkMonitor:

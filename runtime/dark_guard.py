@@ -11,6 +11,7 @@ lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from .bundle import Bundle
 from .channels import LEVELS, ChannelHealth, Finding
+from .dark import DarkReport, wilson_interval
 from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
 from .dark_watch import ChannelWatch
 from .decide import Decider
@@ -130,9 +132,35 @@ class DarkGuard:
         if len(self._seen) and self.policy in ("tables", "mask") and not self.health.present:
             self._seen[int(counts @ (1 << np.arange(len(counts))))] += 1
 
+    def report(self, report: DarkReport) -> DarkReport:
+        """Return `report` with the findings, what lasts, and every channel's rate with its interval."""
+        n = self.watch.exposures
+        rows = []
+        for clicks, expected in zip(self.watch.clicks.tolist(), self.watch.expected.tolist()):
+            low, high = wilson_interval(clicks, n)
+            rate = clicks / n if n else 0.0
+            rows.append(
+                {"exposures": n, "clicks": clicks, "per_exposure": rate, "low": low, "high": high, "expected": expected}
+            )
+        return replace(
+            report,
+            policy=self.policy,
+            findings=tuple(finding.event() for finding in self.findings),
+            present=tuple(f"{finding.level}: {finding.words}" for finding in self.health.present),
+            channels=tuple(rows),
+        )
+
     def words(self) -> str:
         """One line on the present state, for the live view; "" when nothing is wrong."""
-        return "; ".join(f"{finding.level}: {finding.words}" for finding in self.health.present)
+        return "; ".join(
+            f"{finding.kind} ({finding.level}, {finding.rate / finding.expected:.3g} times the expected rate"
+            + (
+                f", channel {', '.join(map(str, finding.channels))})"
+                if len(finding.channels) < self.watch.n_channels
+                else ")"
+            )
+            for finding in self.health.present
+        )
 
     def _all_concerned(self, serious: list[Finding]) -> bool:
         return not self._parallel or any(len(finding.channels) == self.watch.n_channels for finding in serious)

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import flow_kernels as kernels
+from .dark_guard import DarkGuard
 from .decide import Decider
 from .errors import UsageError
 from .flow_settings import FlowLimits, FlowSettings
@@ -57,7 +58,8 @@ class FlowCore(Follower):
             )
         self.settings, self.limits, self.shots = settings, limits, shots
         self.frames = shots * settings.pool  # of a decision
-        self.matcher = PassageMatcher(decider.n_classes, gated, lag=self._lag())
+        self.guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
+        self.matcher = PassageMatcher(decider.n_classes, gated, self._lag(), touching=settings.kind == "tape")
         self.n_passages = 0
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
         self.dark_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in dark frames
@@ -109,6 +111,8 @@ class FlowCore(Follower):
         kernels.skip_frames(2, 3, words, counts, state)
         kernels.window_clicks(words, counts, 0, 1, spare)
         self._decider.decide(np.zeros(len(spare), np.int64), self.shots)
+        if self.guard is not None:
+            self.guard.warm_up()
 
     # -- what the follower asks for ------------------------------------------------------------------------------------
 
@@ -127,7 +131,8 @@ class FlowCore(Follower):
             self._channel_mask,
         )  # fmt: skip
         stop = block.exposure_index + n_exposures
-        output = self._settle(stop, end_tick)
+        events = [] if self.guard is None else self.guard.take(block)
+        output = joined(Output([], events, None), self._settle(stop, end_tick))
         self.matcher.settle(stop)
         return output
 
@@ -143,6 +148,8 @@ class FlowCore(Follower):
     def _give_up(self) -> Output:
         output = self._close()
         self._cycles_before += -(-self.tracker.next_exposure // self._slots_per_cycle)
+        if self.guard is not None:
+            self.guard.restart()
         self.matcher.finish()
         dark, empty = self._state[kernels.DARK_FRAMES], self._state[kernels.EMPTY_FRAMES]
         self._state[:] = 0
@@ -164,6 +171,8 @@ class FlowCore(Follower):
     def _place(self) -> dict[str, Any] | None:
         if self._state[kernels.STATE] == kernels.OPEN:
             return None
+        if self.guard is not None and self.guard.policy != "warn":
+            return None  # what it has learnt decides too
         frames = np.arange(int(self._state[kernels.NEXT]) - self._kept_frames(), int(self._state[kernels.NEXT]))
         slots = frames & (len(self._words) - 1)
         return {
@@ -211,6 +220,9 @@ class FlowCore(Follower):
                 flags |= DecisionFlag.GAP
             else:
                 clicks, crc = int(self._clicks.sum()), zlib.crc32(self._clicks.tobytes())
+        if self.guard is not None:
+            alarmed = self.guard.flags
+            flags |= alarmed if alarmed & DecisionFlag.ABSTAINED else NO_FLAGS
         if not flags:
             label, probability = self._verdict()
             if not probability > 0:

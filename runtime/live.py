@@ -110,5 +110,12 @@ def _headline(run: LiveRun, expected: int) -> str:
     return (
         f"{tally.decisions}{f' of {expected}' if expected else ''} decisions{accuracy} · {clicks:.2f} clicks each"
         f" · p99 {timing.total.quantile_ns(0.99) / 1e6:.2f} ms · late {timing.late}"
-        f" · lost {run.core.tracker.counters.lost_exposures}"
+        f" · lost {run.core.tracker.counters.lost_exposures}{_dark(run)}"
     )
+
+
+def _dark(run: LiveRun) -> str:
+    """What is wrong with the dark counts, if anything."""
+    guard = getattr(run.core, "guard", None)
+    words = "" if guard is None else guard.words()
+    return f" · dark counts: {words}" if words else ""

@@ -20,6 +20,7 @@ from .bundle import Bundle
 from .clicks import click_law, click_probability
 from .connection import Connection, check_device
 from .dark import DarkMonitor, DarkReport
+from .dark_guard import DarkGuard
 from .errors import LinkError, RecordingError
 from .link import Link, link_facts
 from .live_run import LiveCore as LiveCore
@@ -172,11 +173,13 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     device["simulated"] = bool(device["simulated"] or facts.get("simulated"))
     dark = DarkMonitor(float(click_probability(click_law(profile, run.plan.exposure_us), 0.0)))
     tallies, stream = run.core.tallies, run.core.tracker.counters
+    found = dark.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
+    guard: DarkGuard | None = getattr(run.core, "guard", None)
     fit = run.connection.known_clock().fit
     return RunResult(
         tally=run.tally,
         timing=run.timing,
-        dark=dark.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS])),
+        dark=found if guard is None else guard.report(found),
         stream={name: getattr(stream, name) for name in stream.__slots__},
         decoder=dict(run.decoded),
         clock={} if fit is None else {"drift_ppm": fit.drift_ppm, "uncertainty_us": fit.uncertainty_ns / 1000},

@@ -84,6 +84,7 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
         faults.append(f"{tally.decisions} of {expected_decisions} decisions were made; the run ended: {result.ended}")
     if result.dark.alarm:
         faults.append(result.dark.alarm)
+    faults += [event["words"] for event in result.dark.findings if event["level"] == "alarm"]
     return faults
 
 
