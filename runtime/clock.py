@@ -113,6 +113,11 @@ class ClockModel:
         fit = self._ready()
         return fit.reference_tick + round((host_ns - fit.reference_host_ns) / fit.ns_per_tick)
 
+    def history(self) -> npt.NDArray[np.void]:
+        """Return the probes that the fit is made of, CLOCK_DTYPE (n,), oldest first: what a part of a recording begins with."""
+        kept = self.samples[: min(self._kept, HISTORY)]
+        return kept[np.argsort(kept["tick"], kind="stable")]
+
     def take_samples(self) -> npt.NDArray[np.void]:
         """Return the probes since the last call, CLOCK_DTYPE (n,), for the recording; of more than 4096 the oldest are gone."""
         taken = np.array(list(self._unrecorded), CLOCK_DTYPE)

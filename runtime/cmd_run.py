@@ -9,17 +9,16 @@ from __future__ import annotations
 import argparse
 import importlib.resources
 import shlex
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from .cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, Command, emit, say
+from .continuous import Continuous, add_continuous_options, continuous_of
 from .errors import UsageError
 from .flow_settings import FlowSettings
 from .link import open_link
@@ -28,6 +27,7 @@ from .run_dark import DarkRun
 from .run_dark import add_options as add_dark_options
 from .run_flow import add_options, settings_of
 from .run_words import closing_words, recording_header, what_was_run
+from .stopping import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 
 if TYPE_CHECKING:
     pass
@@ -73,6 +73,7 @@ class Job:
     command: str
     flow: FlowSettings | None
     act: str
+    continuous: Continuous
 
 
 def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
@@ -108,6 +109,7 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     _configure_common(parser, trials=1)
     add_options(parser)
     add_dark_options(parser)
+    add_continuous_options(parser)
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
@@ -165,6 +167,7 @@ def _job(
         command=shlex.join(["pans", *sys.argv[1:]]),
         flow=flow,
         act=getattr(args, "act", "device"),
+        continuous=continuous_of(args),
     )
 
 
@@ -199,28 +202,24 @@ class _Background(Generic[T]):
         return self._value[0]
 
 
-def _leave(signum: int, frame: FrameType | None) -> NoReturn:
-    """SIGTERM and a closed terminal end a run as Ctrl-C does: the light goes off first."""
-    raise KeyboardInterrupt
-
-
 def _execute(args: argparse.Namespace, job: Job) -> int:
+    with stop_signals(continuous=not (job.seconds or job.decisions)) as stop:
+        return _carry_out(args, job, stop)
+
+
+def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
     started_ns = process_start_ns()
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), _leave)
     opening = _Background(lambda: open_link(job.device))
     try:
         from .actuate import open_actuator
         from .bundle import load_bundle
         from .container import read_file
+        from .continuous import Attendants, open_recorder
         from .core import Core
         from .decide import make_decider
         from .live import live_view
         from .loop import LiveCore, LiveRun, Onlookers, RunConfig, run_live
         from .plan import build_plan
-        from .record import Recorder
         from .recovery import Recovery
         from .report import summarise, write_markdown
         from .run_flow import FlowRun, core_of
@@ -270,16 +269,17 @@ def _execute(args: argparse.Namespace, job: Job) -> int:
     if job.trace is not None:
         link = TracedLink(link, job.trace, job.device)
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
-    with Recorder(recording, header, bundle=read_file(job.bundle_path), overwrite=True) as recorder:
-        title = f"{bundle.name} on {job.profile.name}"
-        with live_view(title, bundle.classes, expected, link.simulated) as watch:
+    with open_recorder(recording, header, read_file(job.bundle_path), job.continuous.limits) as recorder:
+        title, seen = f"{bundle.name} on {job.profile.name}", Attendants(job.continuous, recorder)
+        with seen, live_view(title, bundle.classes, expected, link.simulated) as watch:
 
             def prepared(run: LiveRun) -> None:
                 honest.check_device(run)
+                seen.prepared(run)
                 if passing is not None:
                     passing.prepared(run)
 
-            onlookers = Onlookers(watch, prepared)
+            onlookers = Onlookers(watch, prepared, stop)
             result = run_live(link, honest.profile, bundle, plan, core, config, recorder, recovery, onlookers)
         frames = job.shots * (1 if job.flow is None else job.flow.pool)
         summary = summarise(
@@ -325,7 +325,9 @@ def _close_quietly(opening: _Background[Any]) -> None:
 
 
 def _exit_code(summary: dict[str, Any]) -> int:
-    if summary["ended"] == "interrupted":
+    if summary["ended"] == ASKED_TO_STOP:
+        return EXIT_FINE  # what went wrong on the way stands in the summary
+    if summary["ended"] == INTERRUPTED:
         return EXIT_INTERRUPTED
     if summary["link_lost"]:
         return EXIT_DEVICE

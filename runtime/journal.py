@@ -6,12 +6,15 @@ recorder only the list is kept.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from .connection import Connection
 from .rotate import AnyRecorder
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
+MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
+TROUBLE = ("blame", "gap", "link_lost", "clock_step", "gate_refused", "parts_trouble", "beyond_plan")
 
 
 class Journal:
@@ -19,11 +22,17 @@ class Journal:
 
     def __init__(self, recorder: AnyRecorder | None) -> None:
         self.events: list[dict[str, Any]] = []
+        self.trouble: dict[str, Any] | None = None  # the latest
         self.recorder = recorder
+        self._kept: Counter[str] = Counter()
 
     def event(self, event: dict[str, Any]) -> None:
         """Note one event: a map with its `kind` and what belongs to it, units in the keys."""
-        if len(self.events) < MAX_EVENTS:
+        kind = event["kind"]
+        if kind in TROUBLE:
+            self.trouble = event
+        if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
+            self._kept[kind] += 1
             self.events.append(event)
         if self.recorder is not None:
             self.recorder.add_event(event)

@@ -267,6 +267,7 @@ class LiveRun:
             self.journal.event(event)
         if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place, self._setup, now_ns)
+            recorder.add_clock(self.connection.known_clock().history())
             self.journal.session(self.connection)
 
     def drop_recorder(self) -> None:

@@ -31,6 +31,7 @@ from .plan import Plan
 from .profile import Profile
 from .recovery import Recovery
 from .rotate import AnyRecorder
+from .stopping import INTERRUPTED, Stop
 from .tally import RunTally
 from .timing import TimingLedger, arm_realtime
 from .window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
@@ -60,6 +61,7 @@ class Onlookers:
 
     watch: Watcher | None = None
     prepared: Callable[[LiveRun], None] | None = None
+    stop: Stop | None = None
 
 
 NOBODY = Onlookers()
@@ -137,9 +139,9 @@ def run_live(
                 if onlookers.prepared is not None:
                     onlookers.prepared(run)
                 run.arm()
-                _until_ended(run, recovery, prepare, onlookers.watch)
-            except KeyboardInterrupt:
-                run.ended = "interrupted"
+                _until_ended(run, recovery, prepare, onlookers)
+            except KeyboardInterrupt as interrupt:
+                run.ended = str(interrupt) or INTERRUPTED
             except RecordingError:
                 run.drop_recorder()
                 raise
@@ -151,12 +153,17 @@ def run_live(
 
 
 def _until_ended(
-    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], watch: Watcher | None
+    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], onlookers: Onlookers
 ) -> None:
+    stop = onlookers.stop or Stop()
     while not run.ended:
         try:
-            run.turn(watch)
+            stop.polled = True
+            run.turn(onlookers.watch)
+            run.ended = run.ended or stop.word
+            stop.polled = False
         except LinkError as error:
+            stop.polled = False
             if recovery is None:
                 run.lose_link(error)
             else:

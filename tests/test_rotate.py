@@ -45,8 +45,10 @@ def record(
             if recorder._now.size_bytes >= limits.rotate_bytes and recorder._ready.empty():
                 recorder._ready.put(recorder._ready.get(timeout=20))
 
-        onlookers = Onlookers(wait, prepared)
-        result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, url, 10.0), onlookers)
+        onlookers, recovery = Onlookers(wait, prepared), Recovery.of(link, url, 10.0)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("pans.runtime.live_run.FLUSH_EVERY_NS", 20_000_000)  # small parts need small blocks
+            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, onlookers)
         result.decisions_sha256 = recorder.close({"decisions": result.tally.decisions})
     return result
 
@@ -54,13 +56,13 @@ def record(
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("parts")
-    record(folder, PartLimits(32 * KIB))
+    record(folder, PartLimits(48 * KIB))
     return folder
 
 
 def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
     paths = parts_in(parts)
-    assert len(paths) > 4
+    assert len(paths) > 2
     numbers = []
     for path in paths:
         recording = read_recording(path)
@@ -95,9 +97,9 @@ def test_the_commands_take_a_folder(parts: Path, capsys: pytest.CaptureFixture[s
 
 @pytest.mark.parametrize("faults", ["loss:0.01,duplicate:0.01,flip:0.01", "stall:300ms/700ms,disconnect:100ms/900ms"])
 def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
-    result = record(tmp_path, PartLimits(32 * KIB), faults=faults)
+    result = record(tmp_path, PartLimits(48 * KIB), faults=faults)
     paths = parts_in(tmp_path)
-    assert len(paths) > 3
+    assert len(paths) > 2
     for path in paths:
         recording = read_recording(path)
         assert replay(recording, recording.bundle()) == (recording.n_decisions, recording.decisions_sha256), path
@@ -106,10 +108,10 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
 
 
 def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> None:
-    result = record(tmp_path, PartLimits(32 * KIB, 128 * KIB))
+    result = record(tmp_path, PartLimits(48 * KIB, 192 * KIB))
     paths = parts_in(tmp_path)
     assert part_of(read_recording(paths[0]))["number"] > 1  # type: ignore[index]
-    assert sum(path.stat().st_size for path in paths) <= 128 * KIB + 32 * KIB
+    assert sum(path.stat().st_size for path in paths) <= 192 * KIB + 48 * KIB
     index = json.loads(index_path(tmp_path / "run.pansrec").read_text())
     assert [entry["name"] for entry in index["parts"]] == [path.name for path in paths]
     assert index["deleted"]["parts"] + len(paths) == part_of(read_recording(paths[-1]))["number"]  # type: ignore[index]
@@ -124,7 +126,7 @@ def test_a_hole_and_a_strange_part_are_found(parts: Path, tmp_path: Path) -> Non
     recordings = [read_recording(path) for path in paths]
     assert chain_violations(recordings) == []
     assert "one is missing between" in chain_violations([recordings[0], recordings[2]])[0]
-    record(tmp_path, PartLimits(32 * KIB), cycles=1500)
+    record(tmp_path, PartLimits(48 * KIB), cycles=1500)
     others = [read_recording(path) for path in parts_in(tmp_path)]
     text = " ".join(chain_violations([recordings[0], others[1]]))
     assert "parts of 2 runs" in text
