@@ -14,7 +14,7 @@ from .paper_tables import PASSIVE, UNPRINTED, ActiveRow, PassiveRow
 DPI = 90
 
 
-def _new(width: float = 10.0, height: float = 4.0, panels: int = 2) -> tuple[Any, Any]:
+def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2) -> tuple[Any, Any]:
     import matplotlib
 
     matplotlib.use("Agg")
@@ -23,7 +23,7 @@ def _new(width: float = 10.0, height: float = 4.0, panels: int = 2) -> tuple[Any
     return pyplot.subplots(1, panels, figsize=(width, height), layout="constrained")
 
 
-def _save(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path) -> None:
     from matplotlib import pyplot
 
     beside = path.with_name(path.name + ".part")
@@ -36,7 +36,7 @@ def accuracy_against_photons(path: Path, name: str, done: list[tuple[ActiveRow, 
     """Draw the first 200 test images against clicks, as the paper does, and all of them against photons."""
     from matplotlib.ticker import ScalarFormatter
 
-    figure, (left, right) = _new()
+    figure, (left, right) = new_figure()
     clicks = [figures["first_200"]["1"]["clicks_mean"] for _, figures in done]
     left.plot([row.clicks for row, _ in done], [row.simulation[0] for row, _ in done], "o--", label="paper, simulation")
     left.plot([row.clicks for row, _ in done], [row.experiment[0] for row, _ in done], "s:", label="paper, experiment")
@@ -61,13 +61,13 @@ def accuracy_against_photons(path: Path, name: str, done: list[tuple[ActiveRow, 
         axis.grid(alpha=0.3)
         axis.legend()
     figure.suptitle("SIMULATED", fontsize=9)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def measure_over_patterns(path: Path, name: str, done: list[tuple[PassiveRow, dict[str, Any]]]) -> None:
     """Draw accuracy or SSIM over the number of patterns, one colour per dark count: ours solid, the paper's dashed."""
     table = PASSIVE.get(name) or UNPRINTED[name]
-    figure, axis = _new(width=6.0, panels=1)
+    figure, axis = new_figure(width=6.0, panels=1)
     for i, dark in enumerate(table.dark):
         measured = [(row, figures) for row, figures in done if figures["dark"] == dark]
         printed = [row for row in table.rows if row.values]
@@ -79,4 +79,4 @@ def measure_over_patterns(path: Path, name: str, done: list[tuple[PassiveRow, di
     axis.grid(alpha=0.3)
     if done:
         axis.legend()
-    _save(figure, path)
+    save_figure(figure, path)

@@ -133,6 +133,35 @@ def _time(name: str, args: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
+def _equal(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from .reproduce_equal import equal_table
+
+    result = equal_table(args.cache, args.data_dir, args.collect, say)
+    if args.out:
+        _write(args.out, name, result, None)
+    return result
+
+
+def _sweeps(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from .figures_light import sweeps
+    from .reproduce_sweeps import sweep_table
+
+    result = sweep_table(args.data_dir, say)
+    if args.out:
+        _write(args.out, name, result, lambda path: sweeps(path, result["rows"]))
+    return result
+
+
+def _information(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    from .figures_light import information
+    from .reproduce_information import information_table
+
+    result = information_table(args.data_dir, say)
+    if args.out:
+        _write(args.out, name, result, lambda path: information(path, result["rows"]))
+    return result
+
+
 def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path], None] | None) -> None:
     """Write NAME.json, NAME.md and, where `draw` is given, NAME.png, each whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -153,6 +182,9 @@ NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     **dict.fromkeys([*PASSIVE, *UNPRINTED], _passive),
     "estimators": _estimators,
     "time": _time,
+    "equal-photons": _equal,
+    "sweeps": _sweeps,
+    "fig-2c": _information,
 }
 
 REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)

@@ -45,15 +45,13 @@ def recipe(name: str, row: ActiveRow) -> Options:
         return replace(small, starts=8) if row.features > 4 else replace(small, starts=5, restarts=2)
     if row.features <= EXACT_FEATURES_MAX:
         exact = replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
-        return exact if name != "mnist" else replace(exact, epochs=40, starts=2, restarts=3, alpha=1e-4, polish=0.5)
+        return exact if name != "mnist" else replace(exact, epochs=40, starts=2, restarts=3, alpha=1e-4, mix=0.5)
     local = replace(shared, estimator="local", warm=0.4, head_rate=2e-3, epochs=32, hidden=256)
     if row.features < 36:
         return local
-    return (
-        replace(local, epochs=44, alpha=1e-5)
-        if row.features == 36
-        else replace(local, epochs=36, hidden=128, alpha=1e-5)
-    )
+    if row.features == 36:
+        return replace(local, epochs=44, alpha=1e-5)
+    return replace(local, epochs=60, alpha=1e-5)
 
 
 def row_files(cache: Path, name: str, features: int) -> tuple[Path, Path]:
