@@ -113,8 +113,7 @@ def log_likelihood(counts: Counts, model: CountModel, level: float, dark: float)
     """Return the log likelihood without its binomial constants; -inf where the rates forbid what was seen."""
     log_miss = model.log_miss(counts.drive * level + dark) + counts.log_other
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_hit = np.log(-np.expm1(log_miss))
-    hits = np.where(counts.clicks > 0, counts.clicks * log_hit, 0.0)
+        hits = np.where(counts.clicks > 0, counts.clicks * np.log(-np.expm1(log_miss)), 0.0)
     return float((hits + (counts.exposures - counts.clicks) * log_miss).sum())
 
 

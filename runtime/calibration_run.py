@@ -102,7 +102,7 @@ def _random_patterns(profile: Profile, drives: F64, rng: np.random.Generator) ->
     panel = min(profile.projector.width_px, profile.projector.height_px)
     sides = [side for side in _SIDES if side <= panel] or [panel]
     top = profile.projector.levels - 1
-    side = next((side for side in sides if drives.max() <= side * side // 2), sides[-1])
+    side = next((side for side in sides if drives.max() <= top * (side * side // 2)), sides[-1])
     pixels = side * side
     lit_level = min(top, max(1, int(np.ceil(drives.max() / (pixels // 2)))))
     lit = np.clip(np.rint(drives / lit_level), 1, pixels).astype(np.int64)

@@ -37,7 +37,10 @@ _VALUE_CHARACTERS = 200
 
 def _configure_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "paths", nargs="+", metavar="PATH", help="a bundle, a recording, or a profile (file or shipped name)"
+        "paths",
+        nargs="+",
+        metavar="PATH",
+        help="a bundle, a recording, a calibration, or a profile (file or shipped name)",
     )
 
 
@@ -70,7 +73,9 @@ def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
 
 
 def _configure_info(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", metavar="PATH", help="a bundle, a recording, or a profile (file or shipped name)")
+    parser.add_argument(
+        "path", metavar="PATH", help="a bundle, a recording, a calibration, or a profile (file or shipped name)"
+    )
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -237,6 +242,6 @@ def _load_array(path: Path) -> NDArray[Any]:
     return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-VERIFY = Command("check bundles, recordings and profiles", _configure_verify, _verify)
+VERIFY = Command("check bundles, recordings, calibrations and profiles", _configure_verify, _verify)
 INFO = Command("show what a file holds", _configure_info, _info)
 BUNDLE = Command("make a bundle from any trained model", _configure_bundle, _bundle)

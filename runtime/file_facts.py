@@ -16,19 +16,30 @@ import numpy as np
 
 from .analyser import Analyser
 from .bundle import Bundle, load_bundle
+from .calibration import load_calibration, now_utc
 from .profile import Profile, load_profile
 from .record import DecisionFlag, Recording, read_recording
 from .verify import file_kind
 
 
 def file_facts(path: str | Path) -> dict[str, Any]:
-    """Return what `path` holds; `kind` is bundle, recording or profile. UsageError or DamagedFileError if nothing can be read."""
+    """Return what `path` holds, its `kind` among it; UsageError or DamagedFileError if nothing can be read."""
     kind = file_kind(path)
     if kind == "bundle":
         bundle, sha256 = load_bundle(path)
         return {"kind": kind, "path": str(path), "sha256": sha256, **_bundle_facts(bundle)}
     if kind == "recording":
         return {"kind": kind, "path": str(path), **_recording_facts(read_recording(path, salvage=True))}
+    if kind == "calibration":
+        calibration = load_calibration(path)
+        facts = {key: value for key, value in calibration.values.items() if key != "sha256"}
+        return {
+            "kind": kind,
+            "path": str(path),
+            "sha256": calibration.sha256,
+            "age_h": calibration.age_h(now_utc()),
+            **facts,
+        }
     return {"kind": kind, "path": str(path), **_profile_facts(load_profile(str(path)))}
 
 

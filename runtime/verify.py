@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .bundle import Bundle, golden_violation, load_bundle, parse_bundle, word_means
 from .bundle_format import MAGIC as BUNDLE_MAGIC
+from .calibration import find_warnings, load_calibration, now_utc
 from .decide import make_decider
 from .errors import ConfigError, DamagedFileError, PansError, UsageError
 from .parts import chain_violations, first_decision, parts_in
@@ -46,7 +47,7 @@ class FileVerdict:
 
 
 def file_kind(path: str | Path) -> str:
-    """Return `bundle`, `recording` or `profile`; UsageError for a missing file, DamagedFileError for anything else."""
+    """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
     try:
@@ -54,13 +55,13 @@ def file_kind(path: str | Path) -> str:
             start = file.read(len(BUNDLE_MAGIC))
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile"}
+    suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
     by_magic = {BUNDLE_MAGIC: "bundle", RECORDING_MAGIC: "recording"}
     kind = by_magic.get(start) or suffixes.get(Path(path).suffix)  # a damaged magic still has its name
     if kind is None:
         raise DamagedFileError(
             f"{path}: it starts with {start!a}, which is no file of this project",
-            remedy="allowed: bundles (.pans), recordings (.pansrec), profiles (.toml, or a shipped name)",
+            remedy="allowed: bundles (.pans), recordings (.pansrec), profiles (.toml, or a shipped name), calibrations (.json)",
         )
     return kind
 
@@ -74,6 +75,8 @@ def verify_file(path: str | Path) -> FileVerdict:
             _verify_bundle(load_bundle(path)[0], verdict)
         elif verdict.kind == "recording":
             _verify_recording(read_recording(path), verdict)
+        elif verdict.kind == "calibration":
+            verdict.alerts += find_warnings(load_calibration(path), now_utc())
         else:
             load_profile(str(path))
     except UsageError:
