@@ -14,6 +14,7 @@ from pans.runtime.bench import BenchOptions, Row, cpu_time
 from pans.runtime.bundle import load_bundle
 from pans.runtime.clicks import ClickLaw
 
+from .bench_flow import flow_rows
 from .detector import DetectorModel, first_click_probability, sample_clicks
 from .detector_kernels import sample_words, sparse_patterns, sparse_sums
 
@@ -36,7 +37,7 @@ def bench_sim(options: BenchOptions) -> list[Row]:
     base = rows[0]["ns"]
     for row in rows:
         row["of_plain"] = round(row["ns"] / base, 2)
-    return [*rows, _dead_time_row(), *_optics_rows(options)]
+    return [*rows, _dead_time_row(), *_optics_rows(options), *flow_rows(options.quick)]
 
 
 def _click_row(name: str, model: DetectorModel, quick: bool) -> Row:
