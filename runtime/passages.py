@@ -52,12 +52,14 @@ class _Row(NamedTuple):
 class PassageMatcher:
     """Matches decisions with marks while both come; `lag` exposures after leaving the field, nothing more can come."""
 
-    def __init__(self, n_classes: int, gated: frozenset[int], lag: int) -> None:
+    def __init__(self, n_classes: int, gated: frozenset[int], lag: int, *, touching: bool = False) -> None:
+        """`touching`: objects follow each other without a space, as bars do, and that is no coincidence."""
         self.confusion: npt.NDArray[np.int64] = np.zeros((n_classes, n_classes), np.int64)  # truth x decision
         self.counts: Counter[str] = Counter()
         self.aborted: Counter[str] = Counter()  # all decisions
         self._gated = gated
-        self._lag = lag
+        self._lag, self._touching = lag, touching
+        self._seen = 0  # exposures of the stream so far
         self._marks: deque[Mark] = deque()
         self._rows: deque[_Row] = deque()
         self._gaps: deque[tuple[int, int]] = deque(maxlen=MAX_GAPS)
@@ -103,6 +105,7 @@ class PassageMatcher:
 
     def settle(self, next_exposure: int) -> None:
         """Match what can no longer change, `next_exposure` being the next one of the stream."""
+        self._seen = next_exposure
         marks = self._marks
         while marks and marks[0].exposure_index + marks[0].half_exposures + self._lag < next_exposure:
             mark = marks.popleft()
@@ -111,10 +114,14 @@ class PassageMatcher:
             self._drop_rows(next_exposure - 2 * self._lag)
 
     def finish(self) -> None:
-        """The stream has ended: match all that is left; exposures count from 0 again."""
+        """The stream has ended: match all that is left; what was still in the field is cut off, and counted as that."""
         while self._marks:
             mark = self._marks.popleft()
-            self._settle_mark(mark, self._marks[0] if self._marks else None)
+            if until_field(mark) < self._seen:
+                self._settle_mark(mark, self._marks[0] if self._marks else None)
+            else:
+                self.counts["cut_off"] += 1
+                self._rows = deque(row for row in self._rows if row.centre < mark.exposure_index - mark.half_exposures)
         self._drop_rows(1 << 62)
         self._gaps.clear()
         self._left_field = -1
@@ -138,7 +145,7 @@ class PassageMatcher:
         while self._rows and self._rows[0].centre <= until:
             mine.append(self._rows.popleft())
         overlaps = following is not None and following.exposure_index - following.half_exposures < until_field(mark)
-        coincident = overlaps or centre - half < self._left_field
+        coincident = (overlaps or centre - half < self._left_field) and not self._touching
         self._left_field = max(self._left_field, centre + half)
         in_gap = any(first <= centre + half and stop > centre - half for first, stop in self._gaps)
         counts = self.counts
@@ -220,7 +227,7 @@ class PassageMatcher:
                 name: counts[name]
                 for name in (
                     "decisions", "marks", "alone", "missed", "doubled", "coincident", "coincident_aborted", "coincident_labelled",
-                    "in_gaps", "without_mark", "targets", "pulses", "pulses_on_target", "pulses_pure",
+                    "in_gaps", "cut_off", "without_mark", "targets", "pulses", "pulses_on_target", "pulses_pure",
                 )
             },
             "clicks_mean": counts["alone_clicks"] / seen if seen else _ratio(counts["clicks"], counts["decisions"]),
