@@ -126,6 +126,7 @@ class ChannelHealth:
             state.last, state.since_exposure = self._watch.clicks.copy(), self._watch.exposures
             if state.evidence * _UNIT > RETURN_EVIDENCE:
                 del self._states[channels]
+                self._watch.restart()
                 over.append(self._over(state))
         return over
 

@@ -38,7 +38,13 @@ class DarkGuard:
     """Watches the dark exposures of one run and does what `policy` says."""
 
     def __init__(
-        self, plan: Plan, watch: ChannelWatch, policy: str = "warn", bundle: Bundle | None = None, shots: int = 1
+        self,
+        plan: Plan,
+        watch: ChannelWatch,
+        policy: str = "warn",
+        bundle: Bundle | None = None,
+        shots: int = 1,
+        afterpulses: bool = False,
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
@@ -52,6 +58,7 @@ class DarkGuard:
         self.findings: list[Finding] = []
         self.dropped_findings = 0
         self._dark_slot = plan.slot_pattern == DARK_PATTERN
+        self._afterpulses = afterpulses  # whether the detector has them: then exposures behind a click are left out
         self._any_dark = bool(self._dark_slot.any())
         self._silent_before: bool | None = None  # of the exposure before the next block; None where it is not known
         self._next = 0
@@ -71,7 +78,7 @@ class DarkGuard:
     def take(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
         """Take the dark exposures of a block and return events.
 
-        With one detector an exposure right behind a click is left out: an afterpulse is no dark count.
+        With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
         """
         if isinstance(block, FrameBlock):
             if not self._any_dark:
@@ -79,6 +86,8 @@ class DarkGuard:
             slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
             return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
         bits, dark = np.asarray(block.bits), np.asarray(block.patterns) == DARK_PATTERN
+        if not self._afterpulses:
+            return self.take_dark_words(bits[dark].reshape(-1, 1))
         known = self._silent_before if block.exposure_index == self._next else False
         silent = np.concatenate([[bool(known)], bits[:-1] == 0])
         self._next, self._silent_before = block.exposure_index + len(bits), bool(bits[-1] == 0)

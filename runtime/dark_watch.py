@@ -152,6 +152,12 @@ class ChannelWatch:
         self.update_words(np.frombuffer(b"", np.uint8).reshape(0, 1))  # a view of a message is a type of its own
         self.update(0, np.zeros(self.n_channels, np.int64))
 
+    def restart(self) -> None:
+        """Begin every test from 0: what their sums hold belongs to a state that is over."""
+        self._state[:, SUM] = 0
+        self._state[:, SINCE] = self._state[:, LAST]
+        self._at_zero[:] = self.clicks
+
     def sums(self) -> F64:
         """Return every test's sum as a fraction of its threshold, float64 (tests,), for a live view; 1 is an alarm."""
         return self._state[:, SUM] / self._state[:, THRESHOLD]

@@ -101,6 +101,7 @@ class DarkRun:
             "expected": expected.tolist(),
             "low": low.tolist(),
             "high": high.tolist(),
+            "afterpulses": self.profile.detector.afterpulse_probability > 0,
         }
         return made_guard(self._header, plan, bundle, shots)
 
@@ -131,4 +132,4 @@ def made_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int
     expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
     settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
     watch = ChannelWatch(len(expected), expected, settings, low, high)
-    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots)
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]))

@@ -1,0 +1,202 @@
+"""Detector states told apart, tables for a changed detector against exact Bayes, and the policies in live runs and replays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pans.runtime.channels import ChannelHealth, Finding
+from pans.runtime.cli import main
+from pans.runtime.dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
+from pans.runtime.dark_watch import ChannelWatch, WatchSettings
+
+N = 8
+
+
+def found_states(bits: NDArray[np.bool_], rate: float = 0.01, block: int = 500) -> tuple[ChannelHealth, list[Finding]]:
+    watch = ChannelWatch(bits.shape[1], np.full(bits.shape[1], rate), WatchSettings(arl_exposures=1e7))
+    health, found = ChannelHealth(watch), []
+    words = np.packbits(bits, axis=1, bitorder="little")
+    for first in range(0, len(words), block):
+        found += health.take(watch.update_words(words[first : first + block]))
+    return health, found
+
+
+def dark(seed: int, n: int, rates: float | NDArray[np.float64], channels: int = N) -> NDArray[np.bool_]:
+    return np.random.default_rng(seed).random((n, channels)) < rates
+
+
+def test_nothing_wrong() -> None:
+    health, found = found_states(dark(1, 200_000, 0.01))
+    assert found == []
+    assert health.present == []
+    assert health.rates().tolist() == [0.01] * N
+
+
+@pytest.mark.parametrize("factor", [3.0, 20.0])
+def test_a_hot_channel(factor: float) -> None:
+    rates = np.full(N, 0.01)
+    rates[5] *= factor
+    health, found = found_states(np.concatenate([dark(2, 20_000, 0.01), dark(3, 20_000, rates)]))
+    assert [(one.kind, one.channels) for one in found] == [("hot", (5,))]
+    assert found[0].level == ("warning" if factor < 5 else "alarm")
+    assert health.rates()[5] == pytest.approx(0.01 * factor, rel=0.1)
+    assert health.rates()[4] == 0.01
+    assert abs(found[0].since - 20_000) < 300
+    assert "channel 5" in found[0].words
+
+
+def test_a_burst_ends() -> None:
+    bits = np.concatenate([dark(4, 20_000, 0.01), dark(5, 2_000, 0.2), dark(6, 60_000, 0.01)])
+    health, found = found_states(bits)
+    assert [one.kind for one in found] == ["burst", "over"]
+    assert found[0].level == "alarm"
+    assert len(found[0].channels) == N
+    assert "all channels" in found[0].words
+    assert health.present == []
+
+
+def test_a_drift() -> None:
+    slow = 0.01 * np.linspace(1.0, 2.5, 40_000)[:, None]
+    _, found = found_states(np.concatenate([dark(7, 10_000, 0.01), dark(8, 40_000, slow)]))
+    assert found[0].kind == "drift"
+    assert len(found[0].channels) == N
+    assert {one.kind for one in found} == {"drift"}
+
+
+def test_a_dead_channel() -> None:
+    rates = np.full(N, 0.01)
+    rates[2] = 0.0
+    health, found = found_states(np.concatenate([dark(9, 20_000, 0.01), dark(10, 20_000, rates)]))
+    assert [(one.kind, one.channels) for one in found] == [("dead", (2,))] or (
+        [(one.kind, one.channels) for one in found] == [("quiet", (2,))]
+    )
+    assert health.rates()[2] < 0.003
+
+
+def test_one_detector() -> None:
+    _, found = found_states(np.concatenate([dark(11, 20_000, 0.01, 1), dark(12, 3_000, 0.3, 1)]))
+    assert [one.kind for one in found] == ["burst"]
+    assert "the detector clicks" in found[0].words
+
+
+# ---- tables ----
+
+
+def bayes(
+    light: NDArray[np.float64], dark_rates: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """P(c | object) of every word, float64 (objects, 2**d), and the log posterior of the classes (two objects each)."""
+    p = 1 - np.exp(-light) * (1 - dark_rates)
+    words = np.arange(1 << light.shape[1])
+    bits = (words[:, None] >> np.arange(light.shape[1])) & 1
+    like = np.prod(np.where(bits[None], p[:, None, :], 1 - p[:, None, :]), axis=2)
+    return like, np.log(like.reshape(-1, 2, len(words)).sum(axis=1).T + 1e-300)
+
+
+def accuracy(labels: NDArray[np.int64], like: NDArray[np.float64]) -> float:
+    truth = np.arange(len(like)) // 2
+    return float(np.mean([(like[row] * (labels == truth[row])).sum() for row in range(len(like))]))
+
+
+def test_tables_for_more_dark_counts_are_nearly_those_of_exact_bayes() -> None:
+    rng = np.random.default_rng(3)
+    lost, kept = [], []
+    for _ in range(8):
+        light = rng.exponential(0.8, (8, 8)) * (rng.random((8, 8)) < 0.5)
+        before, after = np.zeros(8), np.full(8, 0.15)
+        after[rng.integers(8)] = 0.6
+        like, scores = bayes(light, before)
+        like_now, scores_now = bayes(light, after)
+        seen = rng.multinomial(20_000, like.mean(axis=0))
+        made = adapted_scores(
+            scores.astype(np.float32), word_prior(seen), extra_probability(after, before), np.zeros(8, np.bool_)
+        )
+        best = accuracy(scores_now.argmax(axis=1), like_now)
+        lost.append(best - accuracy(scores.argmax(axis=1), like_now))
+        kept.append(best - accuracy(made.argmax(axis=1), like_now))
+    assert np.mean(lost) > 0.05  # the old tables suffer
+    assert np.mean(kept) < 0.01  # and the new ones hardly
+    assert max(kept) < 0.03
+
+
+def test_a_masked_channel_says_nothing_and_costs_what_it_must() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.exponential(0.8, (8, 6))
+    like, scores = bayes(light, np.zeros(6))
+    masked = np.zeros(6, np.bool_)
+    masked[[1, 4]] = True
+    made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), np.zeros(6), masked)
+    bits = (np.arange(64)[:, None] >> np.arange(6)) & 1
+    key = bits[:, ~masked] @ (1 << np.arange(4))
+    for value in range(16):
+        rows = made[key == value]
+        assert np.ptp(rows, axis=0).max() < 1e-5
+    without, _ = bayes(light[:, ~masked], np.zeros(4))
+    exact = np.log(without.reshape(-1, 2, 16).sum(axis=1).T)
+    assert (made.argmax(axis=1) == exact.argmax(axis=1)[key]).all()
+
+
+def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
+    rng = np.random.default_rng(5)
+    scores = rng.normal(size=(64, 3)).astype(np.float32)
+    made = adapted_scores(scores, word_prior(np.ones(64, np.int64)), np.zeros(6), np.zeros(6, np.bool_))
+    assert (made.argmax(axis=1) == scores.argmax(axis=1)).all()
+    table = AdaptedTable(made)
+    assert table.decide(np.array([1, 0, 1, 0, 0, 1]), 1).label == int(scores[0b100101].argmax())
+
+
+def test_prior_is_a_distribution_also_without_words() -> None:
+    assert word_prior(np.zeros(32, np.int64)) == pytest.approx(np.full(32, 1 / 32))
+    seen = np.zeros(32, np.int64)
+    seen[3] = 1_000_000
+    assert word_prior(seen).sum() == pytest.approx(1.0)
+    assert word_prior(seen)[3] > 0.999
+
+
+# ---- whole runs ----
+
+SCENE = """kind = "still"
+images = "fashion200"
+[[change]]
+at_s = 30.0
+kind = "dark"
+factor = 20000.0
+"""
+
+
+@pytest.mark.parametrize("policy", ["warn", "tables", "mask", "abstain"])
+def test_a_run_says_so_and_a_replay_agrees(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle = Path(__file__).parent.parent / "runtime" / "shipped" / "fashion10.pans"
+    (tmp_path / "hot.toml").write_text(SCENE)
+    device = f"sim:oled-qcmos?scene={tmp_path}/hot.toml&pace=fast&seed=2"
+    words = [
+        "run",
+        str(bundle),
+        "--device",
+        device,
+        "--decisions",
+        "400",
+        "--on-dark",
+        policy,
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
+    assert main(words) == 1
+    summary = json.loads(capsys.readouterr().out)
+    kinds = {one["state"] for one in summary["dark"]["findings"]}
+    assert kinds == {"burst"}
+    assert summary["dark"]["policy"] == policy
+    assert summary["dark"]["channels"][0]["clicks"] == summary["dark"]["clicks"]
+    assert any("times as often as expected" in fault for fault in summary["faults"])
+    assert (summary["abstained"] > 50) == (policy in ("abstain", "mask"))
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert replayed["identical"]
+    assert replayed["decisions"] == 400
+    assert main(["verify", str(tmp_path / "run.pansrec")]) == 0
