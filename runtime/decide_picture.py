@@ -57,7 +57,7 @@ class PictureDecider:
 
     def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
         """Return label 0 and probability 1, or 0 where the pixels are not finite, for click counts, int64 (n, d_f)."""
-        whole: NDArray[np.float32] = np.isfinite(self._pixels(counts, shots)).all(axis=1).astype(np.float32)
+        whole = np.asarray(np.isfinite(self._pixels(counts, shots)).all(axis=1), np.float32)
         return Verdicts(np.zeros(len(counts), np.uint16), whole)
 
     def _pixels(self, counts: NDArray[np.int64], shots: int) -> NDArray[np.float32]:
