@@ -16,7 +16,7 @@ import numpy.typing as npt
 from .core import NO_LABEL, Decision
 from .record import DecisionFlag
 
-MAX_OBJECTS = 1 << 20
+MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
 
 
 class RunTally:
@@ -32,6 +32,7 @@ class RunTally:
         self.photons_known = 0
         self._trials: dict[int, list[int]] = {}  # window within the visit -> [decided, right]
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
+        self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
 
     def add(self, decision: Decision, photons_per_shot: float) -> None:
         """Count one decision; `photons_per_shot` is NaN where the instrument does not know it."""
@@ -53,14 +54,33 @@ class RunTally:
             sums[1] += right
 
     def _object_sums(self, index: int) -> list[int]:
-        if index not in self._objects and len(self._objects) >= MAX_OBJECTS:
-            return [0, 0]
-        return self._objects.setdefault(index, [0, 0])
+        sums = self._objects.get(index)
+        if sums is None:
+            if len(self._objects) >= MAX_OBJECTS:
+                self._sum_up(next(iter(self._objects)))
+            sums = self._objects[index] = [0, 0]
+        return sums
+
+    def _sum_up(self, index: int) -> None:
+        """Keep of an object only what it adds to the sums; should it come back, it counts as another one."""
+        decided, right = self._objects.pop(index)
+        for place, value in enumerate((1, right / decided, (right / decided) ** 2)):
+            self._past[place] += value
+
+    def _spread_over_objects(self) -> float | None:
+        """Standard error of the mean accuracy from having measured only these objects; None below two."""
+        here = np.array([right / decided for decided, right in self._objects.values()])
+        if not self._past[0]:
+            return float(np.std(here, ddof=1) / math.sqrt(len(here))) if len(here) > 1 else None
+        n = self._past[0] + len(here)
+        mean = (self._past[1] + float(here.sum())) / n
+        squares = self._past[2] + float((here**2).sum())
+        return math.sqrt(max(squares - n * mean**2, 0.0) / (n - 1) / n)
 
     @property
     def objects(self) -> int:
         """Distinct objects with a known truth."""
-        return len(self._objects)
+        return int(self._past[0]) + len(self._objects)
 
     @property
     def accuracy(self) -> float | None:
@@ -71,13 +91,10 @@ class RunTally:
     def summary(self) -> dict[str, Any]:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
         per_trial = [right / n for n, right in self._trials.values() if n]
-        per_object = [right / n for n, right in self._objects.values() if n]
         return {
             "accuracy": self.accuracy,
             "accuracy_std_trials": float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
-            "accuracy_stderr_objects": (
-                float(np.std(per_object, ddof=1) / math.sqrt(len(per_object))) if len(per_object) > 1 else None
-            ),
+            "accuracy_stderr_objects": self._spread_over_objects(),
             "objects": self.objects,
             "trials": len(self._trials),
             "decisions": self.decisions,

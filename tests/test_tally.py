@@ -48,3 +48,21 @@ def test_without_truth_there_is_no_accuracy() -> None:
     assert summary["accuracy"] is None
     assert summary["accuracy_std_trials"] is None
     assert summary["photons_mean"] == 6.0  # two shots of three photons each
+
+
+def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    right = rng.random((500, 4)) < rng.random((500, 1))
+    summaries = []
+    for most in (1 << 14, 7):
+        monkeypatch.setattr("pans.runtime.tally.MAX_OBJECTS", most)
+        tally = RunTally(2, 1)
+        for obj, row in enumerate(right):
+            for trial, value in enumerate(row):
+                tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
+        assert len(tally._objects) <= most
+        summaries.append(tally.summary())
+    whole, summed = summaries
+    assert summed["objects"] == 500
+    assert summed.pop("accuracy_stderr_objects") == pytest.approx(whole.pop("accuracy_stderr_objects"), rel=1e-12)
+    assert summed == whole
