@@ -12,7 +12,7 @@ import gc
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -125,7 +125,9 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
         gc.enable()
         gc.unfreeze()
         if granted.get("sched_fifo") == "granted":
-            _set_scheduler(threads, "SCHED_OTHER", 0)
+            for thread in threads:
+                with suppress(ProcessLookupError):  # a thread that has ended needs nothing
+                    _set_scheduler([thread], "SCHED_OTHER", 0)
         if granted.get("mlockall") == "granted":
             ctypes.CDLL(None).munlockall()
 
