@@ -54,7 +54,9 @@ def recipe(name: str, row: PassiveRow, dark: float, *, conserving: bool = False)
             front_rate=FIELD_RATES[name],
             estimator="exact" if row.features <= EXACT_FEATURES_MAX else "local",
         )
-        return replace(field, clicks=CLICKS_AIM_FIBER * row.clicks, epochs=60) if name == "fiber" else field
+        if name != "fiber":
+            return field
+        return replace(field, clicks=CLICKS_AIM_FIBER * row.clicks, epochs=60 if row.features <= 3 else 30)
     exact = row.features <= EXACT_FEATURES_MAX
     aim = CLICKS_AIM_MMF if name == "mmf-mnist" else CLICKS_AIM
     return replace(
