@@ -97,6 +97,7 @@ class Role:
     """A child that says one JSON line when it is ready, and waits for the start time on its standard input."""
 
     def __init__(self, name: str, *words: str) -> None:
+        self.name = name
         command = [sys.executable, "-m", "pans.firmware_sim.blameparts", name, *words]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self.process = subprocess.Popen(
@@ -108,7 +109,7 @@ class Role:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            raise RuntimeError(f"{self.process.args} ended with {self.process.wait()}")
+            raise RuntimeError(f"the {self.name} ended with {self.process.wait()}")
         return dict(json.loads(line))
 
     def tell(self, word: object) -> None:

@@ -60,6 +60,11 @@ def continuous_of(args: argparse.Namespace) -> Continuous:
         raise UsageError("--rotate-mb and --keep-mb must not be negative")
     if keep_mb and not rotate_mb:
         raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
+    if rotate_mb and getattr(args, "on_dark", "warn") != "warn":
+        raise UsageError(
+            f"--rotate-mb with --on-dark {args.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
+            remedy="record without parts, or use --on-dark warn",
+        )
     from .rotate import PartLimits
 
     limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None

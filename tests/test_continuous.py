@@ -158,7 +158,13 @@ def _wait_for(condition: Any) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [["--keep-mb", "1"], ["--rotate-mb", "-1"], ["--rotate-mb", "2", "--keep-mb", "3"], ["--metrics", "nowhere"]],
+    [
+        ["--keep-mb", "1"],
+        ["--rotate-mb", "-1"],
+        ["--rotate-mb", "2", "--keep-mb", "3"],
+        ["--metrics", "nowhere"],
+        ["--rotate-mb", "2", "--on-dark", "abstain"],
+    ],
 )
 def test_what_cannot_be_meant(bundle_file: Path, tmp_path: Path, options: list[str]) -> None:
     words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path)]
