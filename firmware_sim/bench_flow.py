@@ -24,6 +24,7 @@ from .scene_file import open_scene
 PROFILE, SESSION, START_TICK = "flow-snspd", 7, 1000
 LIT_SHARE, TOP_LEVEL = 0.02, 30
 CHUNK_PIXELS = 4096
+REPEATS = 4
 # scene, patterns, exposure in microseconds, frames of a block
 CASES = (
     ("cells-in-flow", 10, 5.0, 80),
@@ -36,20 +37,24 @@ CASES = (
 
 def flow_rows(quick: bool) -> list[Row]:
     """Return one row for each case: microseconds of CPU time per block and per frame, and the cores that real pace would take."""
-    return [_row(*case, 0.2 if quick else 2.0) for case in CASES]
+    return [_row(*case, 0.1 if quick else 0.5) for case in CASES]
 
 
 def _row(name: str, n_patterns: int, exposure_us: float, block_frames: int, seconds: float) -> Row:
     device = _armed(name, n_patterns, exposure_us, block_frames)
-    end = START_TICK + round(seconds * device.profile.clock.tick_hz)
     decoder = wire.FrameDecoder()
     decoder.use_kernels()
-    sent = []
-    began = time.thread_time_ns()
-    while (due := device.next_event_tick()) is not None and due < end:
-        sent.append(device.step(due, b""))
-    spent_us = (time.thread_time_ns() - began) / 1e3
-    frames = decoder.feed(b"".join(sent))
+    stretches = []
+    for number in range(REPEATS + 1):  # the first one warms up
+        end = START_TICK + round((number + 1) * seconds * device.profile.clock.tick_hz)
+        sent = []
+        began = time.thread_time_ns()
+        while (due := device.next_event_tick()) is not None and due < end:
+            sent.append(device.step(due, b""))
+        stretches.append((time.thread_time_ns() - began, b"".join(sent)))
+    spent_ns, data = min(stretches[1:], key=lambda stretch: stretch[0])
+    spent_us = spent_ns / 1e3
+    frames = decoder.feed(data)
     blocks = [wire.decode_frames(frame.payload) for frame in frames if frame.type == wire.MessageType.FRAMES]
     marks = sum(frame.type == wire.MessageType.MARK for frame in frames)
     n_frames = sum(len(block.words) for block in blocks)

@@ -6,6 +6,7 @@ Owns the command's arguments and its way to end; never the instrument. The first
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -24,7 +25,7 @@ from .shell import open_port, serve
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
-    parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark or a .npz file")
+    parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark, a .npz or a .toml file")
     parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
     parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
@@ -67,6 +68,7 @@ def _run(args: argparse.Namespace) -> int:
         emit(args, payload, port.url)
         if not args.until_stdin_closes:
             say(f"SIMULATED instrument {args.profile} before scene {args.scene}; Ctrl-C ends it")
+        gc.freeze()  # what was made so far is never collected: hardware has no pauses
         serve(instrument, clock, port, orphaned.is_set)
     finally:
         port.close()

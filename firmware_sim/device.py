@@ -7,6 +7,7 @@ sent. Whatever arrives, it answers, refuses or counts; it never raises over byte
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -125,7 +126,12 @@ class Instrument:
         return sent
 
     def next_event_tick(self) -> int | None:
-        """Tick at which the device does something by itself next; None when it only waits for the host."""
+        """Tick at which the device does something by itself next; None when it only waits for the host.
+
+        Shells ask when they have sent what there was and are about to wait: that is the time to draw clicks ahead.
+        """
+        if self._run is not None:
+            self._run.draw_ahead()
         event = self._next_event()
         return None if event is None else event[0]
 
@@ -290,6 +296,9 @@ class Instrument:
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
             self._plan.load(unpack_plan(body))
+            if self._plan.program is not None:
+                with suppress(Refused):  # ARM says what is wrong
+                    self._light_table(self._plan.program)  # seconds for many pictures in flow: ARM must not wait for it
         elif opcode == Opcode.ARM:
             self._require_idle("ARM")
             self._arm(unpack_arm(body))

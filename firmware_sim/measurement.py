@@ -2,7 +2,8 @@
 
 Owns the schedule of exposures, objects and blocks and the clicks drawn for them; never knows about sessions, windows or
 buffers (device.py). `Measurement.emit` returns messages without sequence number and drop count, which the device adds.
-Clicks are drawn ahead in batches: they depend on the exposure's number alone, so the batch size changes nothing.
+Clicks are drawn ahead in batches, of parallel instruments while the shell has nothing else to do (`draw_ahead`): they depend on the
+exposure's number alone, so the size of batches changes nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from .exposures import Exposures
 from .light import RunLight, StillObjects
 from .upload import Program, Refused, word_bytes
 
-BATCH_NUMBERS = 1 << 14
+BATCH_NUMBERS = 1 << 14  # clicks of a sequential instrument drawn at a time
+AHEAD_EXPOSURES = 512  # of a parallel one
 MAX_LEASE_MS = 3_600_000
 MAX_ARM_AHEAD_S = 3600
 MAX_TICK = 1 << 62
@@ -106,6 +108,17 @@ class Measurement:
         self._schedule()
         return message
 
+    def draw_ahead(self) -> None:
+        """Draw clicks of exposures to come (parallel instruments), so that a block that is due need not wait for them."""
+        if not self._parallel or self.next_tick is None:
+            return
+        first, _ = self._program.blocks[self._block]
+        drawn = self._batch_first + len(self._batch) - (self._cycle * self._program.n_slots + first)
+        left = self._left(first)
+        if drawn < min(AHEAD_EXPOSURES, left):
+            self._drop(len(self._batch) - drawn)
+            self._extend(min(AHEAD_EXPOSURES, left - drawn))
+
     def cut(self, tick: int) -> StreamMessage | None:
         """Return the finished exposures of the block under way when the run is broken off at `tick`; None without any."""
         if self.next_tick is None:
@@ -147,28 +160,46 @@ class Measurement:
             return FrameBlock(*head, clicks)
         return ClickBlock(*head, program.patterns[first : first + count], clicks[:, 0])
 
+    def _left(self, first: int) -> int:
+        """Exposures that are still to come from slot `first` of this cycle on, as far as they concern `draw_ahead`."""
+        n_exposures = self._exposures.n_exposures
+        if n_exposures is None:
+            return 2 * AHEAD_EXPOSURES
+        return n_exposures - self._cycle * self._program.n_slots - first
+
     def _clicks(self, first: int, count: int) -> NDArray[np.uint8]:
         start = first - self._batch_first
         if start + count > len(self._batch):
-            if start:
-                self._before_batch = self._unpacked(self._batch[start - 1])
-            self._batch_first, start = first, 0
-            self._batch = self._draw(first, max(count, BATCH_NUMBERS // self._program.channels))
+            self._drop(start)
+            start = 0
+            missing = count - len(self._batch)
+            self._extend(missing if self._parallel else max(missing, BATCH_NUMBERS // self._program.channels))
         return self._batch[start : start + count]
+
+    def _drop(self, count: int) -> None:
+        """Forget the first `count` exposures of the batch, but for the clicks of the last one."""
+        if count:
+            self._before_batch = self._unpacked(self._batch[count - 1])
+            self._batch, self._batch_first = self._batch[count:], self._batch_first + count
+
+    def _extend(self, count: int) -> None:
+        before = self._unpacked(self._batch[-1]) if len(self._batch) else self._before_batch
+        new = self._draw(self._batch_first + len(self._batch), count, before)
+        self._batch = np.concatenate([self._batch, new]) if len(self._batch) else new
 
     def _unpacked(self, row: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.unpackbits(row, bitorder="little", count=self._program.channels) if self._parallel else row
 
-    def _draw(self, first: int, count: int) -> NDArray[np.uint8]:
-        """The clicks of exposures first..first+count-1, as a batch holds them."""
+    def _draw(self, first: int, count: int, before: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The clicks of exposures first..first+count-1, as a batch holds them, after those of the exposure `before`, uint8 (channels,)."""
         probability, row_of = self._probability(first, count)
         number = self._first_draw + first
         if not self._parallel:
-            return sample_clicks(self._model, probability[row_of], self._seed, number, self._before_batch)
+            return sample_clicks(self._model, probability[row_of], self._seed, number, before)
         from .detector_kernels import sample_words  # numba is loaded only for instruments of many channels
 
         words = np.zeros((count, self._batch.shape[1]), np.uint8)
-        sample_words(self._model, probability, row_of, self._seed, number, self._before_batch.copy(), words)
+        sample_words(self._model, probability, row_of, self._seed, number, before.copy(), words)
         if self._changes.any_dead:  # nor does crosstalk wake a dead channel
             times_s = self._exposures.seconds(self._exposures.begins(first, count))
             alive = np.packbits(self._changes.alive(times_s), axis=1, bitorder="little")

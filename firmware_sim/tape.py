@@ -29,7 +29,7 @@ from .optics import photons_per_level
 
 BAR_STREAM, JITTER_STREAM = 24, 25
 CHUNK = 4096  # bars drawn at a time
-MARK_CHUNK = 1024
+MARK_CHUNK = 256
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -83,8 +83,7 @@ class TapeFlow:
     def mark(self) -> Mark:
         """The next window's mark; `tick` counts from the start of the run."""
         if self._next_mark >= len(self._marks):
-            self._marks, self._next_mark = self._marks_of(self._n_marked, MARK_CHUNK), 0
-            self._n_marked += MARK_CHUNK
+            self._draw_marks()
         return self._marks[self._next_mark]
 
     def take_mark(self) -> None:
@@ -102,7 +101,14 @@ class TapeFlow:
         rows[0] = 0.0
         row_of = np.where(lit, np.arange(1, count + 1), 0)
         _fill(start, stop, self._bits, self._first_bar, self._table.light, self._table.dark, rows)
+        while not self._marks or self._marks[-1].exposure_index < first + count:
+            self._draw_marks()  # now, that there is time: whoever asks for a mark is about to send it
         return rows, row_of
+
+    def _draw_marks(self) -> None:
+        self._marks = self._marks[self._next_mark :] + self._marks_of(self._n_marked, MARK_CHUNK)
+        self._next_mark = 0
+        self._n_marked += MARK_CHUNK
 
     def _path(self, begins: F64) -> tuple[F64, F64]:
         """Where the window begins, in bars, when exposures begin and end; float64 (n,) each."""

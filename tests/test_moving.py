@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_moving import mean_light, shifted, tape_field
 
+from pans.firmware_sim import bench_flow, measurement, shifts
 from pans.firmware_sim import cells as cells_module
-from pans.firmware_sim import measurement, shifts
 from pans.firmware_sim.cells import CellFlow
 from pans.firmware_sim.changes import Changes
 from pans.firmware_sim.detector import detector_model
@@ -313,17 +313,24 @@ def test_tape_marks_stand_where_the_window_is_aligned() -> None:
 def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = SceneFile("x", what, (Change("drift", 0.0, 1.0, -1, -50.0),))
 
-    def story() -> list[Any]:
+    def story(ahead: bool = False) -> list[Any]:
         run = run_of(scene, program(dark=(3,)), cycles=120)
-        return [
-            (*message[:6], message.words.tobytes()) if isinstance(message, wire.FrameBlock) else message
-            for message in emitted(run, 10_000)
-        ]
+        messages = []
+        while run.next_tick is not None:
+            if ahead:
+                run.draw_ahead()
+            message = run.emit()
+            messages.append(
+                (*message[:6], message.words.tobytes()) if isinstance(message, wire.FrameBlock) else message
+            )
+        return messages
 
     whole = story()
     assert len(whole) > 120
-    monkeypatch.setattr(measurement, "BATCH_NUMBERS", 10)
-    assert story() == whole
+    for size in (1, 37, 10_000):
+        monkeypatch.setattr(measurement, "AHEAD_EXPOSURES", size)
+        assert story() == whole
+        assert story(ahead=True) == whole
 
 
 def test_messages_come_in_the_order_of_ticks() -> None:
@@ -418,3 +425,39 @@ def test_a_moving_scene_needs_all_channels_at_once(tmp_path: Path) -> None:
 def test_bars_that_do_not_fit_the_patterns_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"patterns have 48 pixels, the tape needs a multiple of 40"):
         BarTable(FLOW, TAPE, LEVELS, 2.0)
+
+
+# -- the whole device --------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_run_is_the_same_bytes_however_it_is_stepped() -> None:
+    def run(name: str, ticks: list[int]) -> bytes:
+        device = bench_flow._armed(name, 10, 5.0, 40)
+        return b"".join(device.step(tick, b"") for tick in ticks)
+
+    end = 2_000_000  # 20 ms
+    for name in ("clothes-in-flow", "bar-tape"):
+        coarse = run(name, [end])
+        assert len(coarse) > 10_000
+        assert coarse == run(name, [end]) == run(name, [*range(77_777, end, 77_777), end])
+
+
+def test_clicks_follow_the_light_that_the_scene_passes() -> None:
+    """Sums over 40 000 exposures, channel by channel, against the probabilities they were drawn with; 5 sigma."""
+    dim = replace(FLOW.projector, peak_photoelectrons_hz=4e4)
+    profile = replace(FLOW, projector=dim, detector=replace(FLOW.detector, crosstalk_probability=0.0))
+    scene, plan = SceneFile("x", CELLS, (Change("dark", 0.02, 9.0, 1, 500.0),)), program()
+    exposures, changes = Exposures(plan, None, TICK_HZ), Changes(scene.changes, 3)
+    model = detector_model(profile, 2.0)
+
+    def light() -> Any:
+        return begin(scene, prepare(profile, scene, LEVELS, 2.0), plan, exposures, changes, 3, 0)
+
+    run = Measurement(plan, Arm(10, 0, 1), light(), exposures, model, changes, 3, 0)
+    words = np.concatenate([block.words for block in emitted(run, 5500) if isinstance(block, wire.FrameBlock)])[:40_000]
+    clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3]
+    times_s = exposures.seconds(exposures.begins(0, len(words)))
+    probability = changes.probability(model, light_of(light(), 0, len(words)), times_s, 2e-6)
+    assert 0.01 < probability.mean() < 0.9
+    spread = np.sqrt((probability * (1 - probability)).sum(axis=0))
+    assert (np.abs(clicks.sum(axis=0) - probability.sum(axis=0)) < 5 * spread).all()
