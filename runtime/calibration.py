@@ -71,11 +71,16 @@ class Calibration:
         return np.array([int(row["dark_clicks"]) for row in rows], np.int64)[np.arange(channels) % len(rows)]
 
     def applied_to(self, profile: Profile) -> Profile:
-        """The profile with the projector's measured brightness in place of its own figure: plans then expose for the light that
-        is there."""
-        return replace(
-            profile, projector=replace(profile.projector, peak_photoelectrons_hz=self.values["peak_photoelectrons_hz"])
-        )
+        """The profile with the projector's measured brightness, so that plans expose for the light that is there.
+
+        Where the profile's own figure lies within the measured interval it stays: the measurement does not contradict it.
+        """
+        low, high = self.values["peak_photoelectrons_hz_ci"]
+        said = profile.projector.peak_photoelectrons_hz
+        if low <= said and (high is None or said <= high):
+            return profile
+        projector = replace(profile.projector, peak_photoelectrons_hz=self.values["peak_photoelectrons_hz"])
+        return replace(profile, projector=projector)
 
 
 def save_calibration(path: str | Path, values: Mapping[str, Any]) -> str:

@@ -215,7 +215,7 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
         from .bundle import load_bundle
         from .container import read_file
         from .continuous import Attendants, open_recorder
-        from .core import Core
+        from .core import Core, Output
         from .decide import make_decider
         from .live import live_view
         from .loop import LiveCore, LiveRun, Onlookers, RunConfig, run_live
@@ -279,7 +279,11 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
                 if passing is not None:
                     passing.prepared(run)
 
-            onlookers = Onlookers(watch, prepared, stop)
+            def look(run: LiveRun, output: Output) -> None:
+                honest.look(run, output)
+                watch(run, output)
+
+            onlookers = Onlookers(look, prepared, stop)
             result = run_live(link, honest.profile, bundle, plan, core, config, recorder, recovery, onlookers)
         frames = job.shots * (1 if job.flow is None else job.flow.pool)
         summary = summarise(
@@ -288,6 +292,7 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
             expected_decisions=expected,
             flow=None if passing is None else passing.summary(),
         )
+        honest.add_to(summary)
         if passing is not None:
             result.tally.confusion += passing.core.matcher.confusion
         result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)

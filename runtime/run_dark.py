@@ -18,17 +18,21 @@ from numpy.typing import NDArray
 from .calibration import MAX_AGE_H, Calibration, find_objections, find_warnings, load_calibration, now_utc
 from .clicks import click_law, click_probability
 from .errors import UsageError
+from .light_watch import LightWatch
 from .profile import Profile
+from .record_format import DecisionFlag
 
 if TYPE_CHECKING:
     from .bundle import Bundle
     from .dark_guard import DarkGuard
+    from .follower import Output
     from .live_run import LiveRun
     from .plan import Plan
 
 FALSE_ALARM_H = 240.0  # hours between false alarms about the dark counts, in the mean
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
+NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
 F64 = NDArray[np.float64]
 
 
@@ -60,6 +64,7 @@ class DarkRun:
         self.calibration, self.policy, self.warnings = calibration, policy, warnings
         self.profile = profile if calibration is None else calibration.applied_to(profile)
         self._header: dict[str, Any] = {}
+        self.light = LightWatch()
 
     @staticmethod
     def of(args: argparse.Namespace, profile: Profile) -> DarkRun:
@@ -120,6 +125,27 @@ class DarkRun:
             find_objections(self.calibration, self.profile, None if serial is None else str(serial))
         for warning in self.warnings:
             run.journal.event({"kind": "calibration_warning", "words": warning})
+
+    def look(self, run: LiveRun, output: Output) -> None:
+        """After a block: compare the clicks of its decisions with those of the run's beginning."""
+        for decision in output.decisions:
+            if not decision.flags & NOT_MEASURED:
+                words = self.light.take(decision.clicks)
+                if words:
+                    run.journal.event({"kind": "light_changed", **self.light.found[-1]})
+
+    def add_to(self, summary: dict[str, Any]) -> None:
+        """Add calibration, its warnings and the light to a run's summary; data that contradict the calibration are a fault."""
+        one = self.calibration
+        summary["calibration"] = (
+            None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
+        )
+        summary["calibration_warnings"] = self.warnings
+        summary["light"] = self.light.report()
+        contradicted = [] if one is None else [str(found["words"]) for found in self.light.found]
+        if contradicted:
+            summary["faults"] = [*summary["faults"], *contradicted]
+            summary["verdict"] = "FAIL"
 
 
 def made_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -156,7 +157,9 @@ def test_command_and_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert find_warnings(calibration, now_utc()) == []
     assert "25.0 h old" in find_warnings(calibration, calibration.made + timedelta(hours=25))[0]
     assert "no calibration" in find_warnings(None, now_utc())[0]
-    assert calibration.applied_to(profile).projector.peak_photoelectrons_hz == pytest.approx(2000.0, rel=0.03)
+    assert calibration.applied_to(profile) is profile  # within the interval
+    brighter = replace(profile, projector=replace(profile.projector, peak_photoelectrons_hz=3000.0))
+    assert calibration.applied_to(brighter).projector.peak_photoelectrons_hz == pytest.approx(2000.0, rel=0.03)
     expected, floor, top = calibration.dark_probability(profile, 400.0, 3)
     assert floor[0] < expected[0] == expected[2] < top[0]
     assert -math.log1p(-expected[0]) == pytest.approx(-10 * math.log1p(-payload["dark_per_exposure"]), rel=1e-6)
