@@ -133,7 +133,6 @@ def test_only_scenes_with_a_bright_background_start_in_a_basis():
     task = columns(200, 12, 2, light="field")
     row = UNPRINTED["nebula"].rows[0]
     options = recipe("nebula", row, 0.01)
-    profile = information.load_profile("ideal")
-    assert basis_of("nebula", task, profile, options).shape[0] == 144
-    assert basis_of("mmf-mnist", task, profile, options) is None
-    assert basis_of("nebula", task, profile, dataclasses.replace(options, conserving=True)) is None
+    assert basis_of("nebula", task, options).shape[0] == 144
+    assert basis_of("mmf-mnist", task, options) is None
+    assert basis_of("nebula", task, dataclasses.replace(options, conserving=True)) is None

@@ -5,20 +5,20 @@ Owns the choices; never trains and never measures. The clicks are held to the pa
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.profile import Profile
+from pans.runtime.incident import incident_field
 
 from . import task_mmf
 from .field_basis import discriminant_basis
 from .options import EXACT_FEATURES_MAX, Options
 from .paper_tables import CLICKS_TOLERANCE, PassiveRow
 from .tasks import Objects, Task, load_task
-from .training_data import encoder_input
 
 CLICKS_AIM = 1.02
 CLICKS_AIM_MMF = 0.98  # the test images click a few percent more than the training images
@@ -73,14 +73,18 @@ def recipe(name: str, row: PassiveRow, dark: float, *, conserving: bool = False)
     )
 
 
-def basis_of(name: str, task: Task, profile: Profile, options: Options) -> Tensor | None:
+def basis_of(name: str, task: Task, options: Options) -> Tensor | None:
     """Return the fields (pixels, size) in which the encoder of `name` is trained, or None: pixel by pixel."""
-    if name not in FIELD_RATES or options.conserving:
-        return None
-    x = encoder_input(task, task.train, profile, options)
+    return None if name not in FIELD_RATES or options.conserving else _fields(task)
+
+
+@functools.lru_cache(maxsize=1)  # the rows of a table share it
+def _fields(task: Task) -> Tensor:
+    x = torch.from_numpy(incident_field(task.train.images, task.light, task.optics)).flatten(1)
     return discriminant_basis(x, torch.from_numpy(task.train.labels), task.image_shape, BASIS_SIZE)
 
 
+@functools.lru_cache(maxsize=1)
 def load(name: str, data_dir: str | None) -> Task:
     """Return the task; MMF tasks with the release's input: normalised speckle intensity as a real field."""
     task = load_task(TASKS.get(name, name), data_dir)

@@ -93,7 +93,7 @@ def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
 
 def _pans(task: Task, photons: float) -> dict[str, Any]:
     options, profile = recipe(task.name, photons), load_profile(PROFILE)
-    trained = train(task, profile, options, basis=basis_of(task.name, task, profile, options))
+    trained = train(task, profile, options, basis=basis_of(task.name, task, options))
     return measure(task.name, task, task, trained) | {"options": plain_options(options)}
 
 

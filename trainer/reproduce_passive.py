@@ -60,12 +60,12 @@ def make_cell(
     options = recipe(name, row, dark)
     path = _path(cache, name, row, dark)
     task, profile = load(name, data_dir), load_profile(PROFILE)
-    target = load_task(TASKS.get(name, name), data_dir)  # of images: what lies behind the speckle
+    target = load_task(name, data_dir) if task.target == "image" else task  # what lies behind the speckle
     started = time.process_time()
     trained = (
         solve(options, profile)
         if name == "barcode"
-        else train(task, profile, options, basis=basis_of(name, task, profile, options))
+        else train(task, profile, options, basis=basis_of(name, task, options))
     )
     seconds = time.process_time() - started
     figures = {
