@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--photons", type=float, default=8.0, help="photoelectrons of a bright bar (default 8)")
     parser.add_argument("--dark", type=float, default=0.0, help="dark photoelectrons per exposure (default 0)")
     parser.add_argument("--pixels-per-bar", type=int, default=8, help="default 8")
-    parser.add_argument("--lit-px", type=int, default=4, help="lit pixels in the middle of a bar (default 4)")
+    parser.add_argument("--lit-px", type=int, default=2, help="lit pixels in the middle of a bar (default 2)")
     parser.add_argument("--exposure-us", type=float, default=5.0, help="default 5")
     parser.add_argument("-o", "--out", type=Path, required=True, help="the bundle to write")
     args = parser.parse_args()
