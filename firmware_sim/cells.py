@@ -25,7 +25,6 @@ from .detector import uniform_numbers
 from .exposures import Exposures
 from .moving import Cells
 from .shifts import ShiftTable
-from .shifts import warm_up as warm_up_table
 
 ARRIVAL_STREAM = 16  # five numbers per arrival: waiting time, picture, offset, two for the velocity
 CHUNK = 256  # arrivals drawn at a time
@@ -146,8 +145,7 @@ class CellFlow:
 
 
 def warm_up() -> None:
-    """Compile or load the kernels of this module and of the table before it."""
-    warm_up_table()
+    """Compile or load the kernels of this module."""
     ints, floats, rows = np.zeros(1, np.int64), np.ones(1), np.zeros((3, 1))
     cell = (floats, floats, ints, ints)
     table = (np.zeros((1, 1, 3, 1), np.uint32), np.zeros((1, 3, 1)), 1.0, 1.0, floats, floats)
