@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from .errors import DamagedFileError, UsageError
 
 FULL_SCALE_16 = 65535
+LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
+PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
 
 
 class LabelledPictures(NamedTuple):
@@ -29,17 +31,33 @@ class LabelledPictures(NamedTuple):
 
 
 def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
-    """Return the pictures of `folder`: one folder per class, pictures of one size inside; names that begin with a dot are passed over.
+    """Return the pictures of `folder`: one folder per class, pictures of one size inside.
 
-    UsageError for what does not fit, or for more than `pixels_max` pixels in all; else as `read_grey`.
+    What systems leave behind (names that begin with a dot, Thumbs.db, desktop.ini, __MACOSX) is passed over. UsageError for a class
+    without pictures, folders within a class, pictures beside the class folders, pictures of different sizes, or for more than
+    `pixels_max` pixels in all; else as `read_grey`.
     """
-    classes = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    entries = _entries(folder)
+    classes = [entry.name for entry in entries if entry.is_dir()]
+    beside = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in PICTURE_SUFFIXES]
+    if beside and classes:
+        raise UsageError(f"{beside[0]}: a picture beside the class folders", remedy="move it into its class's folder")
     images: list[NDArray[np.uint8]] = []
     labels: list[int] = []
     digest = hashlib.sha256()
     n_pixels = 0
     for label, name in enumerate(classes):
-        for path in sorted(entry for entry in (folder / name).iterdir() if entry.is_file() and entry.name[0] != "."):
+        inside = _entries(folder / name)
+        if nested := [entry for entry in inside if entry.is_dir()]:
+            raise UsageError(
+                f"{nested[0]}: a folder within the class folder {name!r}",
+                remedy="one folder per class, the pictures directly inside: flatten it, or name the folder above the classes",
+            )
+        if not inside:
+            raise UsageError(
+                f"{folder / name}: a class folder without pictures", remedy="remove it, or put the class's pictures in"
+            )
+        for path in inside:
             image = read_grey(path, pixels_max - n_pixels)
             n_pixels += image.size
             if images and image.shape != images[0].shape:
@@ -54,6 +72,11 @@ def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
     if not images:
         raise UsageError(f"{folder}: no images in class folders", remedy="put the images of each class into a folder")
     return LabelledPictures(np.stack(images), np.array(labels), tuple(classes), digest.hexdigest())
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What stands in `folder`, in order, without what systems leave behind."""
+    return sorted(entry for entry in folder.iterdir() if entry.name[0] != "." and entry.name.lower() not in LITTER)
 
 
 def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
@@ -76,19 +99,22 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
             if frames != 1:
                 raise UsageError(f"{path}: {frames} frames", remedy="one picture per file: save the frames apart")
             if picture.mode.startswith("I") or picture.mode == "F":
-                return _scaled(path, np.asarray(picture), 1.0 if picture.mode == "F" else float(FULL_SCALE_16))
+                return to_8_bits(path, np.asarray(picture), 1.0 if picture.mode == "F" else float(FULL_SCALE_16))
             return np.asarray(picture.convert("L"), dtype=np.uint8)
     except Image.DecompressionBombError as error:
         raise UsageError(f"{path}: {error}") from error
     except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
-        raise DamagedFileError(f"{path}: not an image that can be read: {error}") from error
+        raise DamagedFileError(
+            f"{path}: not an image that can be read: {error}", remedy="repair it, or move it elsewhere"
+        ) from error
 
 
-def _scaled(path: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
+def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[np.uint8]:
+    """Return `values` (any shape), 0 to `full_scale`, as nearest of 256 grey levels; UsageError for any beyond, or not finite."""
     low, high = float(values.min()), float(values.max())
     if not (low >= 0 and high <= full_scale):  # NaN fails it too
         raise UsageError(
-            f"{path}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}",
+            f"{where}: values from {low:g} to {high:g}, allowed: 0 to {full_scale:g}",
             remedy="scale them, or save 8 bits",
         )
     return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)

@@ -118,7 +118,9 @@ def test_own_file_with_a_test_part(tmp_path):
 @pytest.mark.parametrize(
     "arrays",
     [
-        {"images": np.zeros((20, 3, 4)), "labels": np.zeros(20, int)},
+        {"images": np.full((20, 3, 4), 1.5), "labels": np.arange(20) % 2},
+        {"images": np.full((20, 3, 4), np.nan), "labels": np.arange(20) % 2},
+        {"images": np.zeros((20, 3, 4), np.int64), "labels": np.arange(20) % 2},
         {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.zeros(19, int)},
         {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.full(20, -1)},
         {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.zeros(20)},
@@ -126,7 +128,7 @@ def test_own_file_with_a_test_part(tmp_path):
         {"images": np.zeros((3, 3, 4), np.uint8), "labels": np.arange(3)},
         {"pictures": np.zeros(3)},
     ],
-    ids=["float", "lengths", "negative label", "float label", "flat", "too few", "names"],
+    ids=["beyond full scale", "nan", "signed", "lengths", "negative label", "float label", "flat", "too few", "names"],
 )
 def test_unfit_own_files_are_refused(tmp_path, arrays):
     np.savez(tmp_path / "own.npz", **arrays)
@@ -163,6 +165,62 @@ def test_folder_of_class_folders(tmp_path):
     (tmp_path / "set" / "dark" / "zz.png").write_text("no image")
     with pytest.raises(DamagedFileError, match=r"zz\.png"):
         load_task(str(tmp_path / "set"))
+
+
+@pytest.mark.parametrize("kind", ["uint16", "float32", "float64", "bool"])
+def test_images_of_other_types_keep_their_full_scale(tmp_path, kind):
+    grey = RNG.integers(0, 256, (20, 3, 4), dtype=np.uint8)
+    given = {"uint16": grey.astype(np.uint16) * 257, "bool": grey > 99}.get(kind, (grey / 255).astype(kind))
+    np.savez(tmp_path / "own.npz", images=given, labels=np.arange(20) % 2)
+    task = load_task(str(tmp_path / "own.npz"))
+    wanted = np.where(grey > 99, 255, 0) if kind == "bool" else grey
+    assert np.array_equal(task.everything().images, wanted)
+    assert "full scale" in task.source
+    dim = (given // 2) if kind == "uint16" else given  # a dim camera stays dim: nothing is stretched
+    np.savez(tmp_path / "dim.npz", images=dim, labels=np.arange(20) % 2)
+    assert load_task(str(tmp_path / "dim.npz")).everything().images.max() <= 255 // (2 if kind == "uint16" else 1) + 1
+
+
+def class_folders(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for i in range(10):
+            image.fromarray(np.full((4, 5), 20 * i, np.uint8)).save(tmp_path / name / f"{i}.png")
+    return image
+
+
+def test_what_systems_leave_behind_is_passed_over(tmp_path):
+    class_folders(tmp_path)
+    wanted = load_task(str(tmp_path)).sha256
+    for litter in ("Thumbs.db", ".DS_Store", "desktop.ini"):
+        (tmp_path / litter).write_bytes(b"litter")
+        (tmp_path / "a" / litter).write_bytes(b"litter")
+    (tmp_path / "__MACOSX").mkdir()
+    (tmp_path / "README.txt").write_text("about these images")
+    assert load_task(str(tmp_path)).sha256 == wanted
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("empty", "a class folder without pictures"),
+        ("nested", "a folder within the class folder"),
+        ("beside", "beside the class"),
+    ],
+)
+def test_folders_that_cannot_be_meant(tmp_path, what, said):
+    image = class_folders(tmp_path)
+    if what == "empty":
+        (tmp_path / "c").mkdir()
+        (tmp_path / "c" / ".DS_Store").write_bytes(b"litter")
+    elif what == "nested":
+        (tmp_path / "a" / "more").mkdir()
+    else:
+        image.fromarray(np.zeros((4, 5), np.uint8)).save(tmp_path / "lost.PNG", format="PNG")
+    with pytest.raises(UsageError, match=said) as caught:
+        load_task(str(tmp_path))
+    assert caught.value.remedy
 
 
 def test_unknown_task_and_missing_folder_have_a_remedy(tmp_path, monkeypatch):

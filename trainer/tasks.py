@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.grey import read_class_folder
+from pans.runtime.grey import read_class_folder, to_8_bits
 from pans.runtime.incident import Light, Optics
 
 from .generators import GENERATORS, generate
@@ -81,6 +81,8 @@ class Task:
         return Objects(images, labels)
 
 
+# what white is, by type of the array: nothing is stretched, so that the same grey means the same light in every file
+_FULL_SCALES = {"uint8": 255.0, "uint16": 65535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0, "bool": 1.0}
 _SPLIT_BY_POSITION = f"every {HOLD_OUT_EVERY}th object held out"
 _SPLIT_OF_FILE = "the test part of the data"
 _SPLIT_OF_SEED = "drawn from other random streams"
@@ -164,7 +166,13 @@ def _load_npz(path: Path) -> Task:
         )
     n_classes = int(max(train.labels.max(), test.labels.max())) + 1
     classes = tuple(str(name) for name in arrays.get("classes", np.arange(n_classes)).ravel())
-    return _checked(Task(path.stem, classes, train, test, file_sha256(path), split), path)
+    given = arrays["images" if "images" in arrays else "train_images"].dtype
+    source = (
+        ""
+        if given == np.uint8
+        else f"{given.name} images, full scale {_FULL_SCALES[given.name]:g}, rounded to 256 grey levels"
+    )
+    return _checked(Task(path.stem, classes, train, test, file_sha256(path), split, source=source), path)
 
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
@@ -190,8 +198,15 @@ def _load_folder(folder: Path) -> Task:
 
 
 def _objects(where: Path, images: NDArray[Any], labels: NDArray[Any]) -> Objects:
-    if images.dtype != np.uint8 or images.ndim != 3 or 0 in images.shape:
-        raise UsageError(f"{where}: images are {images.dtype} {images.shape}, allowed: uint8 (n, height, width)")
+    full_scale = _FULL_SCALES.get(images.dtype.name)
+    if full_scale is None or images.ndim != 3 or 0 in images.shape:
+        raise UsageError(
+            f"{where}: images are {images.dtype} {images.shape}, allowed: (n, height, width) of uint8, uint16 (full scale 65535), "
+            "float16, float32, float64 (full scale 1) or bool",
+            remedy="convert them; several colours or frames per image are not taken apart here",
+        )
+    if images.dtype != np.uint8:
+        images = to_8_bits(where, images, full_scale)
     if labels.shape != (len(images),) or not np.issubdtype(labels.dtype, np.integer):
         raise UsageError(f"{where}: labels are {labels.dtype} {labels.shape}, allowed: integers ({len(images)},)")
     return Objects(images, labels.astype(np.int64))
