@@ -11,16 +11,17 @@ import select
 import socket
 from array import array
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import usb.backend
 import usb.core
 
+from pans.runtime.errors import UsageError
 from pans.runtime.link import Link
 from pans.runtime.link_usb import UsbLink
 
-from .inprocess import ThreadedInstrument
-from .serve import SimOptions, parse_sim_url
+from .inprocess import GOODBYE_S, ThreadedInstrument
+from .serve import parse_sim_url
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0x0001  # the pair that pid.codes sets aside for tests
 SERIAL_NUMBER = "SIM-USB"
@@ -30,12 +31,39 @@ GET_DESCRIPTOR, STRING_TYPE = 6, 3
 GONE = (errno.ENODEV, "No such device (it may have been disconnected)")
 
 
+class Behind(Protocol):
+    """What stands behind the bus: `connect` returns a socket to it."""
+
+    def connect(self) -> socket.socket: ...
+
+    def close(self) -> None: ...
+
+
+class Listening:
+    """An instrument that listens elsewhere, in a process of its own: HOST:PORT."""
+
+    def __init__(self, target: str) -> None:
+        host, _, port = target.rpartition(":")
+        if not host or not port.isdecimal():
+            raise UsageError(f"socket://{target} is no address", remedy="write simusb:socket://127.0.0.1:PORT")
+        self._address = (host, int(port))
+
+    def connect(self) -> socket.socket:
+        """See `Behind`."""
+        connection = socket.create_connection(self._address, timeout=GOODBYE_S)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return connection
+
+    def close(self) -> None:
+        """Leave it to the process that it lives in."""
+
+
 class SimBackend(usb.backend.IBackend):  # type: ignore[misc]
     """The bus: `plugged` False takes the device off it, as a pulled cable does."""
 
-    def __init__(self, options: SimOptions) -> None:
+    def __init__(self, instrument: Behind) -> None:
         self.plugged = True
-        self._instrument = ThreadedInstrument(options)
+        self._instrument = instrument
         self._socket: socket.socket | None = None
 
     def close(self) -> None:
@@ -171,7 +199,11 @@ class SimUsbLink(UsbLink):
     simulated = True
 
     def __init__(self, url: str) -> None:
-        self.backend = SimBackend(parse_sim_url("sim:" + url.partition(":")[2]))
+        target = url.partition(":")[2]
+        address = target.removeprefix("socket://")
+        self.backend = SimBackend(
+            Listening(address) if address != target else ThreadedInstrument(parse_sim_url(f"sim:{target}"))
+        )
         try:
             self._open()
         except BaseException:
@@ -197,5 +229,8 @@ class SimUsbLink(UsbLink):
 
 
 def open_simusb(url: str) -> Link:
-    """Open `simusb:PROFILE?...` (entry point of `pans.devices`): the simulator through real pyusb, in this process."""
+    """Open `simusb:PROFILE?...` (entry point of `pans.devices`): the simulator through real pyusb, in this process.
+
+    `simusb:socket://HOST:PORT` reaches one that listens there (`pans simulate --listen tcp:...`).
+    """
     return SimUsbLink(url)

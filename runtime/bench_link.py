@@ -1,9 +1,11 @@
 """`pans bench link`: the round trip from a command to a click block, beside the raw echo of the same bytes in the same run.
 
-Owns the measurement and its report; the instrument is the simulator in a process of its own (over pyusb: in a thread). The device holds
-finished blocks back until the receive window lets them out, and each GRANT that moves the window by one releases exactly one. What is
-timed is from making the GRANT until the core has digested the block. The raw echo sends as many bytes and gets as many back, through the
-same link, from a process that does nothing else. Both alternate in short turns, so that whatever else the machine does hits both.
+Owns the measurement and its report; instrument and echo are simulators in processes of their own. The device holds finished blocks back
+until the receive window lets them out, and each GRANT that moves the window by one releases exactly one. What is timed is the live
+loop's own path, from making the GRANT: until the click block is decoded, checked and in sequence (`command to click block`), and until it
+is decided and accounted for (`command to decision`). The raw echo sends as many bytes and gets as many back through the same kind of
+link, once waiting in an ordinary read, and once awake, as the live loop waits for an answer (LinkReader). All
+alternate in short turns, so that whatever else the machine does hits all of them.
 """
 
 from __future__ import annotations
@@ -13,21 +15,24 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from .bundle import Bundle, make_bundle
 from .connection import Connection
-from .core import Core
+from .core import Core, Output
 from .decide import make_decider
 from .errors import LinkError
 from .link import Link, open_link
+from .live_run import LiveRun
+from .loop import RunConfig
 from .plan import Plan, build_plan
 from .profile import load_profile
 from .timing import arm_realtime
-from .wire import DeviceState, FrameDecoder, Opcode
+from .wire import ClickBlock, DeviceState, Frame, FrameBlock, Opcode
 from .wire_commands import Arm, pack_arm
 
 PROFILE = "ideal"
@@ -41,8 +46,7 @@ WARM_UP = 200
 def bench_link(transports: Sequence[str] = ("pty", "tcp", "usb"), samples: int = 4000) -> list[dict[str, Any]]:
     """Return rows of {name, p50_us, p99_us, p999_us, max_us, samples, ratio_p50}; `ratio_p50` is to the raw echo of that transport.
 
-    Rows per transport: the raw echo, the round trip read directly, and through the reading thread of the live loop. pyusb's echo is
-    the loopback socket below its backend, since nothing is nearer to a wire there.
+    Over pyusb both the instrument and the echo stand behind its backend's socket; the same echo without pyusb is told beside it.
     """
     rows = []
     for transport in transports:
@@ -55,14 +59,18 @@ def bench_link(transports: Sequence[str] = ("pty", "tcp", "usb"), samples: int =
 def _bench_transport(transport: str, samples: int) -> list[dict[str, Any]]:
     listen = "pty" if transport == "pty" else "tcp:127.0.0.1:0"
     request, answer_bytes = _sizes()
-    with _simulator(listen, "--echo", str(answer_bytes)) as echo_url, _instrument(transport, listen) as link:
-        echo = open_link(echo_url)
-        trip = _RoundTrip(link)
-        times: dict[str, list[int]] = {"raw echo": [], "round trip": [], "through the reader thread": []}
-        turns: dict[str, Callable[[], int]] = {
-            "raw echo": lambda: _echo_once(echo, request, answer_bytes),
-            "round trip": trip.direct,
-        }
+    echoes = ("raw echo", "raw echo of its socket") if transport == "usb" else ("raw echo",)
+    with ExitStack() as stack:
+        trip = _RoundTrip(_opened(stack, transport, listen, "--buffer", str(BUFFER_MESSAGES)))
+        stack.callback(trip.close)
+        turns: dict[str, Callable[[], tuple[int, ...]]] = {}
+        for name in echoes:
+            kind = transport if name == "raw echo" else "tcp"
+            echo = _opened(stack, kind, listen, "--echo", str(answer_bytes))
+            turns[name] = partial(_echo_once, echo, request, answer_bytes, 1.0)
+            turns[f"{name}, awake"] = partial(_echo_once, echo, request, answer_bytes, 0.0)
+        turns["round trip"] = trip.once
+        times: dict[str, list[tuple[int, ...]]] = {name: [] for name in turns}
         with arm_realtime(True):
             for _ in range(WARM_UP):
                 for once in turns.values():
@@ -70,14 +78,11 @@ def _bench_transport(transport: str, samples: int) -> list[dict[str, Any]]:
             for _ in range(-(-samples // TURN)):
                 for name, once in turns.items():
                     times[name] += [once() for _ in range(TURN)]
-            trip.start_reader()
-            for _ in range(WARM_UP + samples):
-                times["through the reader thread"].append(trip.through_reader())
-        del times["through the reader thread"][:WARM_UP]
-        echo.close()
-        trip.stop_reader()
     raw_us = float(np.median(times["raw echo"])) / 1000
-    return [_row(f"{transport}: {name}", values, raw_us) for name, values in times.items()]
+    rows = [_row(f"{transport}: {name}", [one[0] for one in times[name]], raw_us) for name in turns if "echo" in name]
+    for place, name in enumerate(("command to click block", "command to decision")):
+        rows.append(_row(f"{transport}: {name}", [one[place] for one in times["round trip"]], raw_us))
+    return rows
 
 
 def _row(name: str, times_ns: list[int], raw_us: float) -> dict[str, Any]:
@@ -93,82 +98,72 @@ def _row(name: str, times_ns: list[int], raw_us: float) -> dict[str, Any]:
     }
 
 
-def _echo_once(link: Link, request: bytes, answer_bytes: int) -> int:
+def _echo_once(link: Link, request: bytes, answer_bytes: int, timeout_s: float) -> tuple[int, ...]:
     started = time.perf_counter_ns()
     link.write(request)
     missing = answer_bytes
     while missing > 0:
-        missing -= len(link.read(1.0))
-    return time.perf_counter_ns() - started
+        missing -= len(link.read(timeout_s))
+    return (time.perf_counter_ns() - started,)
+
+
+class _NotingCore(Core):
+    """A core that notes when a click block reached it: decoded, checked and in sequence."""
+
+    block_ns = 0
+
+    def _on_status(self, frame: Frame) -> Output:
+        """The device has long finished, which would settle all blocks that have not been asked for."""
+        return Output([], [], None)
+
+    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        self.block_ns = time.perf_counter_ns()
+        return super()._take(block, n_exposures, end_tick)
 
 
 class _RoundTrip:
-    """A device full of finished blocks, and the ways to ask for the next one."""
+    """A device full of finished blocks, and a live run that asks for the next one."""
 
     def __init__(self, link: Link) -> None:
         bundle, plan = _bundle_and_plan()
-        self._link = link
-        self._connection = Connection(link)
-        self._connection.handshake()
-        self._connection.upload(plan, bundle)
-        clock = self._connection.synchronise()
-        self._core = Core(plan, make_decider(bundle), 1, 0)
+        self._connection = connection = Connection(link)
+        connection.handshake()
+        connection.upload(plan, bundle)
+        clock = connection.synchronise()
+        connection.decoder.use_kernels()
+        self._core = _NotingCore(plan, make_decider(bundle), 1, 0)
         self._core.warm_up()
-        session = self._connection.session
+        self._run = LiveRun(connection, plan, self._core, len(bundle.classes), RunConfig(deadline_us=1e9), None, 0)
+        session = connection.session
         start = clock.to_tick(link.now_ns() + 50_000_000)
         cycles = BUFFER_MESSAGES - 1  # and one mark
         session.submit(Opcode.ARM, pack_arm(Arm(start, cycles, 60_000)))
-        self._connection.settle()
+        connection.settle()
         deadline = link.now_ns() + int(PATIENCE_S * 1e9)
         while session.status is None or session.status.state != DeviceState.IDLE or session.status.tick < start:
-            self._connection.pump(0.05)
+            connection.pump(0.05)
             if link.now_ns() > deadline:
                 raise LinkError(f"the simulated instrument did not finish its exposures within {PATIENCE_S:g} s")
         self._core.begin(start, 0)
+        self._run.lateness.attach(connection, link.now_ns())
         self._limit = 0
-        self._decoder: FrameDecoder = self._connection.decoder
-        self._connection.reader.stop()
-        self.direct()  # the mark
+        self.once()  # the mark
 
-    def direct(self) -> int:
-        """Ask for one message and digest it; return the nanoseconds that it took."""
-        session, link, started = self._connection.session, self._link, time.perf_counter_ns()
-        self._limit += 1
-        session.grant(self._limit, 0)
-        link.write(session.take_output())
-        while True:
-            data = link.read(1.0)
-            arrival_ns = time.perf_counter_ns()
-            for frame in self._decoder.feed(data):
-                if session.on_frame(frame, arrival_ns):
-                    self._core.step(frame)
-            if self._core.tracker.next_seq == self._limit:
-                return time.perf_counter_ns() - started
-
-    def start_reader(self) -> None:
-        """Read through a thread from now on, as the live loop does."""
-        self._connection = _rejoin(self._connection, self._link)
-
-    def through_reader(self) -> int:
-        """As `direct`, by the live loop's own pump."""
-        connection, started = self._connection, time.perf_counter_ns()
+    def once(self) -> tuple[int, ...]:
+        """Ask for one message; return the nanoseconds until its click block was there, and until it was dealt with."""
+        run, connection, tracker, started = self._run, self._connection, self._core.tracker, time.perf_counter_ns()
         self._limit += 1
         connection.session.grant(self._limit, 0)
-        while True:
-            for _, frame in connection.pump(1.0):
-                self._core.step(frame)
-            if self._core.tracker.next_seq == self._limit:
-                return time.perf_counter_ns() - started
+        while tracker.next_seq != self._limit:
+            run.take(connection.pump(1.0))
+            if time.perf_counter_ns() - started > PATIENCE_S * 1e9:
+                raise LinkError(f"no click block within {PATIENCE_S:g} s of asking for it")
+        return self._core.block_ns - started, time.perf_counter_ns() - started
 
-    def stop_reader(self) -> None:
-        """End the thread."""
+    def close(self) -> None:
+        """Leave the link to whoever opened it."""
+        self._run.lateness.close()
         self._connection.detach()
-
-
-def _rejoin(before: Connection, link: Link) -> Connection:
-    connection = Connection(link)
-    connection.session, connection.decoder, connection.clock = before.session, before.decoder, before.clock
-    return connection
 
 
 def _bundle_and_plan() -> tuple[Bundle, Plan]:
@@ -200,21 +195,12 @@ def _sizes() -> tuple[bytes, int]:
     return encode_grant(Grant(1000, 0), 0x12345678), len(encode_clicks(block, 0x12345678))
 
 
-@contextmanager
-def _instrument(transport: str, listen: str) -> Iterator[Link]:
-    if transport == "usb":
-        link = open_link(f"simusb:{PROFILE}?scene=uniform&buffer={BUFFER_MESSAGES}")
-        try:
-            yield link
-        finally:
-            link.close()
-        return
-    with _simulator(listen, "--buffer", str(BUFFER_MESSAGES)) as url:
-        link = open_link(url)
-        try:
-            yield link
-        finally:
-            link.close()
+def _opened(stack: ExitStack, transport: str, listen: str, *more: str) -> Link:
+    """Return a link of that kind to a new simulator; both end with the stack."""
+    url = stack.enter_context(_simulator(listen, *more))
+    link = open_link(f"simusb:{url.removeprefix('serial:')}" if transport == "usb" else url)
+    stack.callback(link.close)
+    return link
 
 
 @contextmanager

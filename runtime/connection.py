@@ -62,10 +62,10 @@ class Connection:
     def pump(self, timeout_s: float) -> list[Arrived]:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return the stream frames among them."""
         self.session.poll(self.link.now_ns())
-        self.flush()
+        asked = self.flush()
         stream: list[Arrived] = []
         began_ns = self.link.now_ns()
-        chunks = self.reader.wait(timeout_s)
+        chunks = self.reader.wait(timeout_s, eager=asked)
         if self.evidence is not None:
             self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
             for chunk in chunks:
@@ -85,13 +85,14 @@ class Connection:
                     self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
         return stream
 
-    def flush(self) -> None:
-        """Send what the session has to say."""
+    def flush(self) -> bool:
+        """Send what the session has to say; return whether that was anything."""
         data = self.session.take_output()
         if data:
             self.link.write(data)
             if self.on_sent is not None:
                 self.on_sent(self.link.now_ns(), data)
+        return bool(data)
 
     def handshake(self) -> Welcome:
         """Open the session and return what the device says of itself; the device leaves SAFE if it was latched there."""

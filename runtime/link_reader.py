@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 LOOK_EVERY_S = 0.002  # how often the stand-in looks whether the loop has left
 STAND_IN_POLL_S = 0.005  # and how long it may keep a loop that has come back from the chair, if nothing arrives
+EAGER_NS = 200_000
 MAX_QUEUED_BYTES = 1 << 24
 
 
@@ -56,15 +57,20 @@ class LinkReader:
         """Native id of the stand-in's thread, for the scheduler; None without one."""
         return None if self._thread is None else self._thread.native_id
 
-    def wait(self, timeout_s: float) -> list[Chunk]:
-        """Return the chunks that are there, waiting at most `timeout_s` for the first; LinkError when the link is gone."""
+    def wait(self, timeout_s: float, *, eager: bool = False) -> list[Chunk]:
+        """Return the chunks that are there, waiting at most `timeout_s` for the first; LinkError when the link is gone.
+
+        `eager` when an answer is due at once: the first EAGER_NS are waited awake, since falling asleep and waking take
+        about as long as the answer itself.
+        """
         self._away = False
         self._visits += 1
         try:
             if self._chair.acquire(blocking=False):
                 try:
                     if not self._chunks and self._death is None:
-                        data = self._link.read(timeout_s)
+                        data = self._read_awake() if eager and self._thread is not None else b""
+                        data = data or self._link.read(timeout_s)
                         return [Chunk(self._link.now_ns(), data)] if data else []
                 except Exception as error:
                     self._death = error
@@ -87,6 +93,13 @@ class LinkReader:
         """Stop the thread and close the link."""
         self.stop()
         self._link.close()
+
+    def _read_awake(self) -> bytes:
+        link = self._link
+        until_ns = link.now_ns() + EAGER_NS
+        while not (data := link.read(0.0)) and link.now_ns() < until_ns:
+            pass
+        return data
 
     def _queued(self, timeout_s: float) -> list[Chunk]:
         """Take what the stand-in has read, or is about to; nothing as soon as it has given the chair back."""

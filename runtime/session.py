@@ -19,7 +19,8 @@ UNKNOWN_STATUS = 0xFFFF
 HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
-STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
+STREAM_TYPES = frozenset(int(kind) for kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
+GRANT, _GRANT = int(MessageType.GRANT), wire.STRUCTS["GRANT"]
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS
 RETRY_GIVE_UP_NS = 10_000 * NS_PER_MS
@@ -106,7 +107,7 @@ class HostSession:
 
     def grant(self, stream_limit: int, lease_ms: int) -> None:
         """Move the receive window and renew the lease."""
-        self._output.append(wire.encode_grant(wire.Grant(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
+        self._output.append(wire.encode_frame(GRANT, _GRANT.pack(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
 
     @property
     def has_room(self) -> bool:
@@ -130,6 +131,8 @@ class HostSession:
 
     def take_output(self) -> bytes:
         """Return the bytes to send now, and forget them."""
+        if not self._output:
+            return b""
         data = b"".join(self._output)
         self._output.clear()
         return data

@@ -105,6 +105,8 @@ from .wire_schema import (
     StateReason as StateReason,
 )
 
+_LITTLE_U16 = np.dtype("<u2")
+_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")  # of each byte value
 U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 
@@ -348,8 +350,8 @@ def encode_clicks(block: ClickBlock, session: int) -> bytes:
     """Return a sequential click block."""
     count = len(block.patterns)
     head = STRUCTS["CLICKS"].pack(*block[:5], count, 0, block.object_index)
-    bits = np.packbits(block.bits, bitorder="little").tobytes()
-    return encode_frame(MessageType.CLICKS, head + block.patterns.astype("<u2").tobytes() + bits, session)
+    clicks = block.patterns.astype("<u2").tobytes() + np.packbits(block.bits, bitorder="little").tobytes()
+    return encode_frame(MessageType.CLICKS, head + clicks, session)
 
 
 def decode_clicks(payload: bytes) -> ClickBlock:
@@ -358,9 +360,12 @@ def decode_clicks(payload: bytes) -> ClickBlock:
     expected = BLOCK_HEADER_BYTES + 2 * count + (count + 7) // 8
     if count == 0 or len(payload) != expected:
         raise MalformedMessage(f"CLICKS of {count} exposures has {len(payload)} bytes, expected {expected}")
-    patterns = np.frombuffer(payload, "<u2", count, BLOCK_HEADER_BYTES).astype(np.uint16)
-    packed = np.frombuffer(payload, np.uint8, -1, BLOCK_HEADER_BYTES + 2 * count)
-    bits = np.unpackbits(packed, count=count, bitorder="little")
+    patterns = np.frombuffer(payload, _LITTLE_U16, count, BLOCK_HEADER_BYTES).astype(np.uint16)
+    if count <= 8:  # a short block is one that somebody waits for
+        bits = _BITS[payload[-1], :count].copy()
+    else:
+        packed = np.frombuffer(payload, np.uint8, -1, BLOCK_HEADER_BYTES + 2 * count)
+        bits = np.unpackbits(packed, count=count, bitorder="little")
     return ClickBlock(seq, drops, tick, first, period, object_index, patterns, bits)
 
 
@@ -385,8 +390,7 @@ def decode_frames(payload: bytes) -> FrameBlock:
 
 def encode_mark(mark: Mark, session: int) -> bytes:
     """Return an object mark."""
-    packed = STRUCTS["MARK"].pack(*mark[:3], mark.half_exposures, *mark[3:6])
-    return encode_frame(MessageType.MARK, packed, session)
+    return encode_frame(MessageType.MARK, STRUCTS["MARK"].pack(*mark[:3], mark.half_exposures, *mark[3:6]), session)
 
 
 def decode_mark(payload: bytes) -> Mark:

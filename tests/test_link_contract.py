@@ -74,6 +74,10 @@ def rig(kind: str) -> Rig:
     if kind in ("pty", "tcp"):
         url, vanish = served("pty" if kind == "pty" else "tcp:127.0.0.1:0")
         return Rig(open_link(url), vanish, url)
+    if kind == "usb elsewhere":
+        url, vanish = served("tcp:127.0.0.1:0")
+        url = url.replace("serial:", "simusb:")
+        return Rig(open_link(url), vanish, url)
     url = {
         "handler": "simserial:ideal?scene=uniform",
         "usb": "simusb:ideal?scene=uniform",
@@ -92,7 +96,7 @@ def rig(kind: str) -> Rig:
     return Rig(link, lambda: setattr(link, "_broken", True), url, lambda: None)
 
 
-KINDS = ["tcp", "handler", "usb", "child", "virtual", *(["pty"] if hasattr(os, "openpty") else [])]
+KINDS = ["tcp", "handler", "usb", "usb elsewhere", "child", "virtual", *(["pty"] if hasattr(os, "openpty") else [])]
 
 
 @pytest.fixture(params=KINDS)
@@ -280,7 +284,7 @@ def test_a_port_that_another_link_holds_is_busy() -> None:
 
 
 def test_usb_errors_are_told_apart() -> None:
-    backend = usb_backend.SimBackend(OPTIONS)
+    backend = usb_backend.SimBackend(ThreadedInstrument(OPTIONS))
     name = f"{usb_backend.VENDOR_ID:04x}:{usb_backend.PRODUCT_ID:04x}"
     try:
         first = UsbLink(name, backend)
@@ -379,6 +383,56 @@ def test_the_readers_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert flood.reads <= first + 1  # the thread has stopped reading
     assert sum(len(chunk.data) for chunk in reader.wait(1.0)) <= 12_000
     reader.close()
+
+
+class Counting(Flood):
+    """A link that sends 0, 1, 2, ... one byte per read, until it breaks."""
+
+    broken = False
+
+    def read(self, timeout_s: float) -> bytes:
+        if self.broken:
+            raise LinkError("the cable was pulled")
+        threading.Event().wait(0.0005)
+        self.reads += 1
+        return bytes([(self.reads - 1) % 256])
+
+
+def test_a_thread_stands_in_while_the_loop_is_busy_and_keeps_the_order() -> None:
+    link = Counting()
+    reader = LinkReader(link)
+    arrived: list[Any] = []
+    deadline = time.monotonic() + PATIENCE_S
+    stood_in = 0
+    while stood_in < 3 and time.monotonic() < deadline:
+        arrived += reader.wait(0.1, eager=len(arrived) % 2 == 0)
+        before = link.reads
+        threading.Event().wait(0.03)  # the loop is busy
+        stood_in += link.reads > before
+    arrived += reader.wait(0.1)
+    reader.stop()
+    while left := list(reader._chunks):
+        arrived += reader.wait(0.0)
+        assert left
+    assert stood_in == 3
+    assert b"".join(chunk.data for chunk in arrived) == bytes(number % 256 for number in range(len(arrived)))
+    stamps = [chunk.arrival_ns for chunk in arrived]
+    assert stamps == sorted(stamps)
+
+
+def test_a_link_that_breaks_while_the_loop_is_busy_ends_every_further_wait() -> None:
+    link = Counting()
+    reader = LinkReader(link)
+    assert reader.wait(0.1)
+    link.broken = True
+    deadline = time.monotonic() + PATIENCE_S
+    while reader._death is None and time.monotonic() < deadline:
+        threading.Event().wait(0.001)
+    for _ in range(3):
+        with pytest.raises(LinkError, match="the cable was pulled"):
+            while True:
+                reader.wait(0.01)
+    reader.stop()
 
 
 def test_an_instrument_in_a_thread_ends(monkeypatch: pytest.MonkeyPatch) -> None:
