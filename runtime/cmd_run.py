@@ -232,7 +232,7 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
         core: LiveCore
         if job.flow is not None:
             plan, flow_core, n_cycles = core_of(honest.profile, bundle, decider, job.flow, job.shots, job.seconds)
-            flow_core.guard = honest.guard(plan, bundle, job.shots)
+            flow_core.guard = honest.guard(plan, bundle, job.shots, flow=True)
             core, passing = flow_core, FlowRun(flow_core, open_actuator(job.act))
         else:
             plan = build_plan(

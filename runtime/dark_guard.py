@@ -21,7 +21,7 @@ from .bundle import Bundle
 from .channels import LEVELS, ChannelHealth, Finding
 from .dark import DarkReport, wilson_interval
 from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
-from .dark_watch import ChannelWatch
+from .dark_watch import Alarm, ChannelWatch
 from .decide import Decider
 from .errors import UsageError
 from .plan import Plan
@@ -94,10 +94,15 @@ class DarkGuard:
         return self.take_dark_words(bits[dark & silent].reshape(-1, 1))
 
     def take_dark_words(self, words: NDArray[np.uint8]) -> list[dict[str, Any]]:
-        """Take dark exposures (or those of an empty field), words uint8 (n, bytes), in the order of time; return events."""
-        if not len(words):
-            return []
-        found = self.health.take(self.watch.update_words(words))
+        """Take dark exposures, words uint8 (n, bytes), in the order of time; return events."""
+        return self._found(self.watch.update_words(words)) if len(words) else []
+
+    def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return events."""
+        return self._found(self.watch.update(frames, clicks)) if frames else []
+
+    def _found(self, alarms: list[Alarm]) -> list[dict[str, Any]]:
+        found = self.health.take(alarms)
         kept = found[: max(0, MAX_FINDINGS - len(self.findings))]
         self.findings += kept
         self.dropped_findings += len(found) - len(kept)

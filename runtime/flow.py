@@ -33,6 +33,7 @@ from .wire import DARK_PATTERN, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Sta
 MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of the kernel; it is called again
 NO_FLAGS = DecisionFlag(0)
+WATCHED_FRAMES = 256  # empty frames that the guard is told of at once
 Q = 32  # bits after the point of a bar's alignment, in exposures
 
 I64 = npt.NDArray[np.int64]
@@ -59,6 +60,10 @@ class FlowCore(Follower):
         self.settings, self.limits, self.shots = settings, limits, shots
         self.frames = shots * settings.pool  # of a decision
         self.guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
+        self._watched: tuple[int, I64] = (
+            0,
+            np.zeros(decider.n_features, np.int64),
+        )  # empty frames that it has been told of
         self.matcher = PassageMatcher(decider.n_classes, gated, self._lag(), touching=settings.kind == "tape")
         self.n_passages = 0
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
@@ -131,10 +136,20 @@ class FlowCore(Follower):
             self._channel_mask,
         )  # fmt: skip
         stop = block.exposure_index + n_exposures
-        events = [] if self.guard is None else self.guard.take(block)
+        events = [] if self.guard is None or not self._dark_cycle else self.guard.take(block)
         output = joined(Output([], events, None), self._settle(stop, end_tick))
+        if self.guard is not None and not self._dark_cycle:
+            output = joined(output, Output([], self._watch_empty(self.guard), None))
         self.matcher.settle(stop)
         return output
+
+    def _watch_empty(self, guard: DarkGuard) -> list[dict[str, Any]]:
+        """Without dark slots, the frames in which no object was found tell the dark rates."""
+        frames, clicks = self.empty_frames - self._watched[0], self.empty_channels - self._watched[1]
+        if frames < WATCHED_FRAMES:
+            return []
+        self._watched = (self.empty_frames, self.empty_channels.copy())
+        return guard.take_empty(frames, np.minimum(clicks, frames))
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
         following = int(self._state[kernels.NEXT])

@@ -80,14 +80,17 @@ class DarkRun:
         warnings = find_warnings(calibration, now_utc(), max_age_h) if asked else []
         return DarkRun(profile, calibration, getattr(args, "on_dark", "warn"), warnings)
 
-    def guard(self, plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:
-        """Return the guard of a core; None where the plan has nothing dark in it and nothing was asked for."""
-        if not plan.dark_slots_per_cycle and self.policy != "warn":
+    def guard(self, plan: Plan, bundle: Bundle, shots: int, flow: bool = False) -> DarkGuard | None:
+        """Return the guard of a core; None where the plan has nothing dark in it and nothing was asked for.
+
+        A `flow` without dark slots is watched in the frames in which no object was found.
+        """
+        if not plan.dark_slots_per_cycle and not flow:
+            if self.policy == "warn":
+                return None
             raise UsageError(
                 f"--on-dark {self.policy}: the plan has no dark slots", remedy="use --dark-slots 1 or more"
             )
-        if not plan.dark_slots_per_cycle:
-            return None
         channels = plan.n_patterns if plan.mode == "parallel" else 1
         if self.calibration is None:
             rate = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
@@ -99,7 +102,7 @@ class DarkRun:
             expected = np.where(
                 few, np.clip(said, low, high), expected
             )  # hardly measured: the profile's, as far as possible
-        per_hour = plan.dark_slots_per_cycle * 3.6e9 / plan.cycle_us
+        per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,
             "arl_dark_exposures": max(LEAST_ARL, FALSE_ALARM_H * per_hour),
