@@ -1,10 +1,12 @@
 """Tasks: pinned public files, a user's own data, and what is refused before it is unpacked."""
 
 import gzip
+import json
 
 import numpy as np
 import pytest
 
+from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.trainer import tasks
 from pans.trainer.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
@@ -221,6 +223,20 @@ def test_folders_that_cannot_be_meant(tmp_path, what, said):
     with pytest.raises(UsageError, match=said) as caught:
         load_task(str(tmp_path))
     assert caught.value.remedy
+
+
+def test_the_list_names_every_task_and_what_is_there(tmp_path, capsys):
+    assert main(["data", "list", "--data-dir", str(tmp_path), "--json"]) == 0
+    rows = {row["task"]: row for row in json.loads(capsys.readouterr().out)["tasks"]}
+    assert set(rows) == set(tasks.task_names())
+    assert (rows["mmf-mnist"]["state"], rows["mmf-mnist"]["encoder"]) == ("not there", "coherent")
+    assert (rows["tissue"]["state"], rows["tissue"]["encoder"]) == ("drawn on demand", "incoherent")
+
+
+def test_a_drawn_task_follows_its_data_seed():
+    first, second = (load_task("barcode", data_seed=seed) for seed in (0, 5))
+    assert first.sha256 != second.sha256
+    assert "seed 5" in second.source
 
 
 def test_unknown_task_and_missing_folder_have_a_remedy(tmp_path, monkeypatch):

@@ -71,29 +71,72 @@ def _objects(name: str, args: argparse.Namespace) -> tuple[tuple[str, ...], Obje
 
 
 def _sets(args: argparse.Namespace) -> int:
-    from .public_sets import PUBLIC_SETS, check_pinned, data_folder, fetch
+    from .public_sets import PUBLIC_SETS, data_folder
 
     unknown = [name for name in args.names if name not in PUBLIC_SETS]
     if unknown:
         raise UsageError(f"no data set {unknown[0]!r}, allowed: {', '.join(PUBLIC_SETS)}")
     folder = data_folder(args.data_dir)
-    rows = []
-    for name in args.names or PUBLIC_SETS:
-        for pinned in PUBLIC_SETS[name].files:
-            path = folder / PUBLIC_SETS[name].folder / pinned.name
-            if args.action == "fetch" and fetch(PUBLIC_SETS[name].source + pinned.name, path, pinned):
-                say(f"fetched {path}")
-            try:
-                check_pinned(path, pinned)
-                state = "ok"
-            except PansError as error:
-                state = "missing" if isinstance(error, UsageError) else "altered"
-            rows.append(
-                {"set": name, "file": pinned.name, "bytes": pinned.n_bytes, "sha256": pinned.sha256, "state": state}
-            )
+    rows = [row for name in args.names or PUBLIC_SETS for row in _files(folder, name, fetching=args.action == "fetch")]
+    payload = {"folder": str(folder), "rows": rows}
     text = "\n".join(f"{row['state']:<8} {row['set']:<14} {row['file']:<28} {row['bytes']:>10}" for row in rows)
-    emit(args, {"folder": str(folder), "rows": rows}, f"{text}\nin {folder}")
+    text += f"\nin {folder}"
+    if args.action == "list" and not args.names:
+        payload["tasks"] = tasks = _tasks({str(row["set"]) for row in rows if row["state"] != "ok"})
+        lines = (f"{task['task']:<16} {task['encoder']:<10} {task['state']:<15} {task['about']}" for task in tasks)
+        text += "\n\ntask             encoder    images\n" + "\n".join(lines)
+    emit(args, payload, text)
     return EXIT_FINE
+
+
+def _files(folder: Path, name: str, *, fetching: bool) -> list[dict[str, object]]:
+    """The state of each file of a public set, fetched before if wanted."""
+    from .public_sets import PUBLIC_SETS, check_pinned, fetch
+
+    rows: list[dict[str, object]] = []
+    for pinned in PUBLIC_SETS[name].files:
+        path = folder / PUBLIC_SETS[name].folder / pinned.name
+        if fetching and fetch(PUBLIC_SETS[name].source + pinned.name, path, pinned):
+            say(f"fetched {path}")
+        try:
+            check_pinned(path, pinned)
+            state = "ok"
+        except PansError as error:
+            state = "missing" if isinstance(error, UsageError) else "altered"
+        facts = {"set": name, "file": pinned.name, "bytes": pinned.n_bytes, "sha256": pinned.sha256}
+        rows.append({**facts, "state": state})
+    return rows
+
+
+def _tasks(absent: set[str]) -> list[dict[str, str]]:
+    """Every task by name: the encoder that its physics asks for, and whether its images can be had now."""
+    from .public_sets import PUBLIC_SETS
+    from .tasks import FIBRE_TASKS
+
+    here = {False: "there", True: "not there"}
+    rows = [
+        {
+            "task": name,
+            "encoder": "active",
+            "state": here[name in absent],
+            "about": f"public, {PUBLIC_SETS[name].licence}",
+        }
+        for name in PUBLIC_SETS
+    ]
+    wants = {"class": "which digit", "image": "the image itself is asked for"}
+    rows += [
+        {
+            "task": name,
+            "encoder": "coherent",
+            "state": here["mnist" in absent],
+            "about": f"MNIST behind a fibre: {wants[target]}",
+        }
+        for name, target in FIBRE_TASKS.items()
+    ]
+    drawn = {"state": "drawn on demand"}
+    return rows + [
+        drawn | {"task": name, "encoder": one.encoder, "about": one.summary} for name, one in GENERATORS.items()
+    ]
 
 
 DATA = Command("list or fetch the public data sets; write a scene for the simulator", _configure, _data)
