@@ -37,6 +37,7 @@ SPACING_S = (0.9, 1.2)
 LENGTH_MS = (25, 70)
 DISK_HOLD_MS = 560  # the loop writes every 500 ms: this one blocks for at least 60 ms
 SETTLE_S = 1.5
+NEAR_NS = 60_000_000  # an injection and what the machine does so shortly before or after it are one incident
 HOST_CORE, INSTRUMENT_CORE = 0, 1
 ORCHESTRATOR_PRIORITY, HOG_PRIORITY = 70, 60
 READY_S = 60.0
@@ -65,8 +66,14 @@ def make_script(injections: int, seed: int) -> list[Injection]:
     return script
 
 
-def compare(script: Iterable[Injection], start_ns: int, verdicts: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return, for each injection, the verdict whose late work overlaps it most ("nothing" if none does)."""
+def compare(
+    script: Iterable[Injection], start_ns: int, verdicts: list[dict[str, Any]], canary: list[tuple[int, int]]
+) -> list[dict[str, Any]]:
+    """Return, for each injection, the verdict whose late work overlaps it most ("nothing" if none does).
+
+    `canary` holds the times in which a process of higher priority than the host's did not get the host's core: an injection that
+    one of them touches is `disturbed`, since two causes were at work. The hog's own times are no disturbance.
+    """
     compared = []
     for injection in script:
         begin = start_ns + injection.at_ns
@@ -75,6 +82,8 @@ def compare(script: Iterable[Injection], start_ns: int, verdicts: list[dict[str,
         def overlap(verdict: dict[str, Any], begin: int = begin, end: int = end) -> int:
             return min(end, int(verdict["end_ns"])) - max(begin, int(verdict["begin_ns"]))
 
+        hogged = injection.kind == "host" and injection.variant % 2 == 0
+        disturbed = not hogged and any(since < end + NEAR_NS and until > begin - NEAR_NS for since, until in canary)
         best = max(verdicts, key=overlap, default=None)
         found = best if best is not None and overlap(best) > 0 else {"cause": "nothing", "sure": False, "why": ""}
         compared.append(
@@ -83,6 +92,7 @@ def compare(script: Iterable[Injection], start_ns: int, verdicts: list[dict[str,
                 "variant": injection.variant % 2,
                 "length_ms": injection.length_ns / 1e6,
                 "named": found["cause"],
+                "disturbed": disturbed,
                 "sure": found["sure"],
                 "why": found["why"],
             }
@@ -105,12 +115,19 @@ class Role:
         )
 
     def said(self) -> dict[str, Any]:
-        """Return the next line of the child."""
+        """Return the next line of the child, an object."""
+        return dict(self._line())
+
+    def said_list(self) -> list[Any]:
+        """Return the next line of the child, a list."""
+        return list(self._line())
+
+    def _line(self) -> Any:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(f"the {self.name} ended with {self.process.wait()}")
-        return dict(json.loads(line))
+        return json.loads(line)
 
     def tell(self, word: object) -> None:
         """Send the child one line."""
@@ -139,13 +156,16 @@ def run_all(script: list[Injection], listen: str, folder: Path, seed: int) -> tu
         url = roles[0].said()["url"]
         roles.append(Role("host", url, str(plan_file), str(recording)))
         roles.append(Role("hog", str(plan_file)))
+        roles.append(Role("canary", str(script[-1].at_ns * 1e-9 + 1.0)))
         host = roles[1].said()
         roles[2].said()
+        roles[3].said()
         start_ns = time.perf_counter_ns() + 500_000_000
         for role in roles:
             role.tell(start_ns)
         _stop_and_go(script, start_ns, {"host": int(host["pid"]), "disk": int(host["disk_pid"])})
-        return start_ns, roles[1].said(), recording
+        words = roles[1].said()
+        return start_ns, words | {"canary": roles[3].said_list()}, recording
     finally:
         for role in reversed(roles):
             role.end()
@@ -176,6 +196,8 @@ def _sleep_until(at_ns: int) -> None:
 
 def report(compared: list[dict[str, Any]], others: Counter[str], host: dict[str, Any]) -> dict[str, Any]:
     """Return the confusion matrix and its sums."""
+    disturbed = [entry for entry in compared if entry["disturbed"]]
+    compared = [entry for entry in compared if not entry["disturbed"]]
     named = sorted({entry["named"] for entry in compared} - set(KINDS))
     matrix = {
         kind: {name: sum(1 for entry in compared if (entry["kind"], entry["named"]) == (kind, name)) for name in (*KINDS, *named)}
@@ -190,6 +212,9 @@ def report(compared: list[dict[str, Any]], others: Counter[str], host: dict[str,
         "sure": sum(entry["sure"] for entry in compared),
         "sure_and_wrong": sum(entry["sure"] and entry["kind"] != entry["named"] for entry in compared),
         "matrix": matrix,
+        "disturbed": len(disturbed),
+        "disturbed_right": sum(entry["kind"] == entry["named"] for entry in disturbed),
+        "disturbed_named": dict(Counter(entry["named"] for entry in disturbed)),
         "not_injected": dict(others),
         "wrong": [entry for entry in compared if entry["kind"] != entry["named"]],
         "host": host,
@@ -207,6 +232,8 @@ def show(result: dict[str, Any]) -> str:
         "",
         f"{result['right']} of {result['injections']} named rightly ({result['share']:.1%}); "
         f"{result['sure']} verdicts say that they are sure, {result['sure_and_wrong']} of these are wrong",
+        f"besides: {result['disturbed']} injections that the machine disturbed at the same time (a canary of higher priority was kept "
+        f"from the host's core); {result['disturbed_right']} of them named rightly, all: {result['disturbed_named']}",
         f"late work that nobody injected (the machine's own): {result['not_injected'] or 'none'}",
         f"host: {result['host']}",
     ]
@@ -230,7 +257,7 @@ def main() -> int:
         start_ns, host, recording = run_all(script, args.listen, Path(folder), args.seed)
         events = [event for event in read_recording(recording).events() if event["kind"] == "blame"]
     verdicts = [event for event in events if event["what"] == "late"]
-    compared = compare(script, start_ns, verdicts)
+    compared = compare(script, start_ns, verdicts, host.pop("canary"))
     spans = [(start_ns + one.at_ns, start_ns + one.at_ns + one.length_ns) for one in script]
     others = Counter(
         str(verdict["cause"])

@@ -18,6 +18,7 @@ when it was sent, so that only a PONG or a STATUS that falls into the silence ca
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -66,8 +67,10 @@ def _shares(facts: Facts) -> dict[str, int]:
         shares[cause] = _length(spans) - _shared(spans, collecting)
     overslept = _clipped(facts.spans, OVERSLEPT, begin, end)
     asleep = _length(overslept) - _shared(overslept, collecting)
-    starved = min(max(facts.run_delay_ns, asleep, facts.steal_ns), total)
     own = max(total - _covered(facts.spans, begin, end), 0)
+    # What the hypervisor took explains work that took long; a loop that woke up on time was not robbed.
+    stolen = min(facts.steal_ns, own + shares["inference"] + shares["disk"])
+    starved = min(max(facts.run_delay_ns, asleep, stolen), total)
     # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.
     hidden = max(starved - asleep, 0)
     shares["decode"] = own
@@ -91,7 +94,8 @@ def _stopped(facts: Facts, shares: dict[str, int]) -> int:
     for span in facts.spans:
         length = min(span.end_ns, facts.end_ns) - max(span.begin_ns, facts.begin_ns)
         expected = facts.pause_ns > 0 and span.end_ns - span.begin_ns > 4 * facts.pause_ns
-        if span.kind != INFERENCE or not expected or 2 * facts.cpu_ns > length or length > shares["inference"]:
+        computed = facts.cpu_ns if span.cpu_ns < 0 else span.cpu_ns
+        if span.kind != INFERENCE or not expected or 2 * computed > length or length > shares["inference"]:
             continue
         margin = facts.pause_ns
         if not any(span.begin_ns + margin < arrival < span.end_ns - margin for arrival in facts.arrivals_ns):
@@ -212,50 +216,59 @@ class LateWork(NamedTuple):
 
 
 @dataclass(slots=True)
+class _Incident:
+    first: LateWork
+    worst: LateWork
+    last: LateWork
+    decisions: int = 1
+
+
+@dataclass(slots=True)
 class Incidents:
     """Late decisions in a row are one incident with one cause, judged from its worst decision once it is quiet again."""
 
     evidence: Evidence
     causes: dict[str, int] = field(default_factory=dict)  # late decisions by cause
     missing: dict[str, int] = field(default_factory=dict)  # lost exposures by cause
-    _worst: LateWork | None = None
-    _first: LateWork | None = None
-    _last: LateWork | None = None
-    _decisions: int = 0
+    _waiting: deque[_Incident] = field(default_factory=deque)  # for their verdicts, the oldest first
 
     def late(self, work: LateWork) -> None:
-        """Take one late decision; the first of an incident reads the system's counters at once."""
-        if self._first is None or self._worst is None:
-            self._first = self._worst = work
-            self._decisions = 0
-            self.evidence.sample(work.end_ns)
-        if work.end_ns - work.begin_ns > self._worst.end_ns - self._worst.begin_ns:
-            self._worst = work
-        self._last = work
-        self._decisions += 1
+        """Take one late decision; the first of an incident reads the system's counters at once.
 
-    @property
-    def open(self) -> bool:
-        """Whether late decisions wait for their verdict."""
-        return self._first is not None
+        It belongs to the incident before it if that was not over when its own exposure ended.
+        """
+        latest = self._waiting[-1] if self._waiting else None
+        if (
+            latest is None
+            or work.begin_ns > latest.last.end_ns
+            or work.end_ns - latest.first.end_ns > LONGEST_INCIDENT_NS
+        ):
+            self._waiting.append(_Incident(work, work, work))
+            self.evidence.sample(work.end_ns)
+            return
+        if work.end_ns - work.begin_ns > latest.worst.end_ns - latest.worst.begin_ns:
+            latest.worst = work
+        latest.last = work
+        latest.decisions += 1
 
     def verdict(self, now_ns: int, *, final: bool = False) -> dict[str, Any] | None:
         """Return the event that closes the incident under way, None while there is none or it is not over."""
-        first, worst, last = self._first, self._worst, self._last
-        if first is None or worst is None or last is None:
+        if not self._waiting:
             return None
-        if not final and now_ns - last.end_ns < QUIET_NS and now_ns - first.end_ns < LONGEST_INCIDENT_NS:
+        oldest = self._waiting[0]
+        if not final and now_ns - oldest.last.end_ns < QUIET_NS and now_ns - oldest.first.end_ns < LONGEST_INCIDENT_NS:
             return None
+        self._waiting.popleft()
+        first, worst, last, decisions = oldest.first, oldest.worst, oldest.last, oldest.decisions
         self.evidence.sample(now_ns)
         verdict = judge(self.evidence.facts(*worst[1:]))
-        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + self._decisions
-        self._first = self._worst = self._last = None
+        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + decisions
         return {
             "kind": "blame",
             "what": "late",
             "first_decision": first.number,
             "last_decision": last.number,
-            "decisions": self._decisions,
+            "decisions": decisions,
             "worst_us": (worst.end_ns - worst.begin_ns) / 1000,
             "begin_ns": worst.begin_ns,
             "end_ns": worst.end_ns,
@@ -275,8 +288,10 @@ def judge_gap(gap: dict[str, Any], facts: Facts, damaged_frames: int) -> Verdict
     """Return who is to blame for a gap: what the device dropped was held up by whoever did not take it, the rest got lost on the link."""
     dropped = int(gap["dropped_by_device"])
     if 2 * dropped < int(gap["exposures"]):
-        damage = f"{damaged_frames} damaged frames were thrown away" if damaged_frames else "not even damaged"
-        why = f"{gap['messages']} messages left the device and never came ({damage})"
+        why = (
+            f"{gap['messages']} stream messages left the device (their numbers are missing) and never came; "
+            f"{damaged_frames} damaged frames were thrown away meanwhile"
+        )
         return Verdict("link", 0, True, why, {})
     held_up = judge(facts)
     full = f"the device dropped {dropped} exposures because its buffer was full"

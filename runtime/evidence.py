@@ -34,11 +34,15 @@ GC, DISK, INFERENCE, IDLE, OVERSLEPT = "gc", "disk", "inference", "idle", "overs
 
 
 class Span(NamedTuple):
-    """What the loop did from `begin_ns` to `end_ns`: one of GC, DISK, INFERENCE, IDLE (awake, waiting for bytes), OVERSLEPT."""
+    """What the loop did from `begin_ns` to `end_ns`: one of GC, DISK, INFERENCE, IDLE (awake, waiting for bytes), OVERSLEPT.
+
+    `cpu_ns` is how long its thread had computed since it last waited, an upper bound for the span; -1 where nobody looked.
+    """
 
     kind: str
     begin_ns: int
     end_ns: int
+    cpu_ns: int = -1
 
 
 class Sample(NamedTuple):
@@ -89,7 +93,7 @@ class Evidence:
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
-        self._collecting_ns = 0
+        self._collecting_ns = self._cpu_mark_ns = 0
         self._due_ns = 0
         self._counters = _Counters([])
 
@@ -115,10 +119,13 @@ class Evidence:
     def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
         """Note that the loop was busy with `kind`."""
         if end_ns - begin_ns >= self.floor_ns:
-            self._spans.append(Span(kind, begin_ns, end_ns))
+            cpu_ns = -1 if self._virtual else time.thread_time_ns() - self._cpu_mark_ns
+            self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:
         """Note a wait for bytes of at most `asked_s`: what it took beyond that, no timer takes; the machine gave us no time."""
+        if not self._virtual:
+            self._cpu_mark_ns = time.thread_time_ns()
         asked_ns = begin_ns + int(asked_s * NS_PER_S)
         last = self._spans[-1] if self._spans else None
         if last is not None and last.kind == IDLE and begin_ns - last.end_ns < self.floor_ns:
@@ -168,7 +175,12 @@ class Evidence:
             delay_ns,
             last.steal_ns - first.steal_ns,
             last.switches - first.switches,
-            tuple(message for message in self._stamped if message.arrival_ns >= begin_ns and message.left_ns <= end_ns),
+            tuple(
+                message
+                for message in self._stamped
+                if message.arrival_ns >= begin_ns
+                and (message.left_ns if message.sent_ns is None else message.sent_ns) <= end_ns
+            ),
         )
 
     def _around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:

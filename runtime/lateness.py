@@ -86,9 +86,9 @@ class Lateness:
         self.evidence.sample_in_slack(now_ns)
         return self.incidents.verdict(now_ns)
 
-    def last_words(self, now_ns: int) -> dict[str, Any] | None:
-        """Return the verdict on the incident that the end of the run cuts short."""
-        return self.incidents.verdict(now_ns, final=True)
+    def last_words(self, now_ns: int) -> list[dict[str, Any]]:
+        """Return the verdicts on what the end of the run cuts short."""
+        return list(iter(lambda: self.incidents.verdict(now_ns, final=True), None))
 
     def _wrote(self, begin_ns: int, end_ns: int) -> None:
         self.evidence.worked(DISK, begin_ns, end_ns)

@@ -149,7 +149,8 @@ class LiveRun:
             self.ended = self.ended or "interrupted"
         self.settle(self.core.end())
         self.gates.finish(session)
-        self._judge_late(self.lateness.last_words(self.now_ns()))
+        for verdict in self.lateness.last_words(self.now_ns()):
+            self.journal.event(verdict)
         self.lateness.close()
         self.journal.clock(self.connection)
 

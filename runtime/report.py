@@ -17,6 +17,8 @@ from .loop import RunResult
 from .run_flow import flow_faults, flow_rows
 from .tally import RunTally
 
+MAX_VERDICTS = 20  # of a summary; the recording has them all
+
 
 def summarise(
     result: RunResult, *, illumination: float, expected_decisions: int, flow: Mapping[str, Any] | None = None
@@ -36,6 +38,7 @@ def summarise(
         "late_blame": timing.blame,
         "late_cause": result.late_cause,
         "lost_cause": result.lost_cause,
+        "blame": [event for event in result.events if event["kind"] == "blame"][:MAX_VERDICTS],
         "lost": result.stream["lost_exposures"],
         "latency_us": timing.total.summary(),
         "stage_latency_us": {name: histogram.summary() for name, histogram in timing.stages.items()},
@@ -97,7 +100,17 @@ def write_markdown(
     if summary["simulated"]:
         lines += ["> **SIMULATED**: the clicks come from a simulated instrument, not from light.", ""]
     lines += [f"**{summary['verdict']}**" + "".join(f"\n- {fault}" for fault in summary["faults"]), ""]
-    lines += [*_figures(summary), "", *_timing(summary), "", *_confusion(tally, classes), "", "## What was run", ""]
+    lines += [
+        *_figures(summary),
+        "",
+        *_timing(summary),
+        "",
+        *_blame(summary),
+        *_confusion(tally, classes),
+        "",
+        "## What was run",
+        "",
+    ]
     lines += [f"- {name}: {text}" for name, text in facts.items()]
     replace_file(path, ("\n".join(lines) + "\n").encode())
 
@@ -147,6 +160,24 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
         f"- real-time set-up: {granted}",
     ]
     return head + table + tail
+
+
+def _blame(summary: Mapping[str, Any]) -> list[str]:
+    """Who is to blame for late and missing work, with the first verdicts in words."""
+    if not summary["blame"]:
+        return []
+    sums = [(what, summary[key]) for what, key in (("late decisions", "late_cause"), ("lost exposures", "lost_cause"))]
+    lines = ["## Late and missing work", ""]
+    for what, causes in sums:
+        if causes:
+            named = ", ".join(f"{cause} {count}" for cause, count in sorted(causes.items(), key=lambda item: -item[1]))
+            lines.append(f"- {what} by cause: {named}")
+    lines += ["", "| what | cause | sure | why |", "| --- | --- | --- | --- |"]
+    for event in summary["blame"]:
+        late = event["what"] == "late"
+        what = f"{event['decisions']} late" if late else f"{event['exposures']} exposures missing"
+        lines.append(f"| {what} | {event['cause']} | {'yes' if event['sure'] else 'no'} | {event['why']} |")
+    return [*lines, ""]
 
 
 def _confusion(tally: RunTally, classes: Sequence[str]) -> list[str]:

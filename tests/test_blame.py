@@ -5,14 +5,19 @@ from __future__ import annotations
 import gc
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pans.firmware_sim.gridrun import grid_setup
+from pans.firmware_sim.serve import open_sim
 from pans.runtime.blame import CAUSES, QUIET_NS, Incidents, LateWork, judge, judge_gap
 from pans.runtime.bundle import make_bundle
+from pans.runtime.core import Core
+from pans.runtime.decide import make_decider
 from pans.runtime.evidence import (
     DISK,
     GC,
@@ -25,8 +30,10 @@ from pans.runtime.evidence import (
     Stamped,
     longest_pause_ns,
 )
+from pans.runtime.loop import RunConfig, run_live
 from pans.runtime.plan import build_plan
 from pans.runtime.profile import load_profile
+from pans.runtime.record import Recorder, read_recording
 
 MS = 1_000_000
 
@@ -145,15 +152,23 @@ def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
     assert incidents.verdict(0) is None
     for number, begin in enumerate(range(101, 131, 10)):
         incidents.late(LateWork(number, begin * MS, begin * MS + 1000, 151 * MS, 0))
-    assert incidents.open
     assert incidents.verdict(152 * MS) is None  # not quiet yet
     event = incidents.verdict(151 * MS + QUIET_NS)
     assert event is not None
     assert (event["cause"], event["decisions"], event["first_decision"], event["last_decision"]) == ("disk", 3, 0, 2)
     assert event["worst_us"] == 50_000
     assert incidents.causes == {"disk": 3}
-    assert not incidents.open
     assert incidents.verdict(10**12) is None
+
+
+def test_late_work_that_does_not_overlap_is_judged_apart() -> None:
+    evidence = Evidence(lambda: 0, 10 * MS, virtual=True)
+    evidence.worked(DISK, 100 * MS, 120 * MS)
+    evidence.worked(INFERENCE, 121 * MS, 161 * MS)
+    incidents = Incidents(evidence)
+    incidents.late(LateWork(0, 101 * MS, 101 * MS, 120 * MS, 0))
+    incidents.late(LateWork(1, 121 * MS, 121 * MS, 161 * MS, 0))
+    assert [incidents.verdict(10**12)["cause"] for _ in range(2)] == ["disk", "inference"]  # type: ignore[index]
 
 
 def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
@@ -219,6 +234,36 @@ def test_memory_is_bounded() -> None:
     known = evidence.facts(0, 0, 10**13, 0)
     assert len(known.spans) == 1024
     assert len(known.stamped) == 64
+
+
+@pytest.mark.parametrize(
+    ("faults", "causes"),
+    [
+        ("", set()),
+        ("stall:60ms/300ms", {"link"}),
+        ("late:60ms/300ms", {"device"}),
+        ("pause:60ms/300ms", {"host"}),
+        ("loss:0.02", {"link"}),
+    ],
+)
+def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, causes: set[str], tmp_path: Path) -> None:
+    profile, bundle, plan = grid_setup("sequential")
+    config = RunConfig(n_cycles=8000, deadline_us=10_000.0, realtime=False)
+    core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
+    path = tmp_path / "run.pansrec"
+    with Recorder(path, {}) as recorder:
+        link = open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}")
+        result = run_live(link, profile, bundle, plan, core, config, recorder)
+        recorder.close({})
+    assert result.ended == "completed"
+    assert set(result.late_cause) | set(result.lost_cause) == causes
+    assert sum(result.late_cause.values()) == result.timing.late
+    assert sum(result.lost_cause.values()) == result.stream["lost_exposures"]
+    verdicts = [event for event in read_recording(path).events() if event["kind"] == "blame"]
+    assert sum(event.get("decisions", 0) for event in verdicts) == result.timing.late
+    if faults and "loss" not in faults:
+        assert len(verdicts) > 1
+        assert all(event["sure"] for event in verdicts), [event["why"] for event in verdicts]
 
 
 @pytest.mark.parametrize(("shots", "dark"), [(1, 0), (3, 1), (5, 2)])
