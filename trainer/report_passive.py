@@ -81,7 +81,8 @@ def _balanced(done: Done) -> list[str]:
 _OUR_IMAGES = (
     "The paper's images are not public: these are drawn by our generators (docs/TASKS.md). The paper's figures stand beside ours for "
     "orientation, not as a comparison. A passive W is unconstrained, as in the paper: it may amplify what it passes on, so that "
-    "`photons` are those detected, not those that reach the instrument. `illumination` is 0 where nothing is lit. Data seed 0, training seed 0; "
+    "`photons` are those detected, not those that reach the instrument. `illumination` is 0 where nothing is lit. Data seed "
+    "0, training seed 0; "
     "recipes were chosen with these held-out accuracies in view.",
 )
 _NOTES = {
