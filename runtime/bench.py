@@ -60,6 +60,18 @@ def cpu_time(work: Callable[[], Any], repeats: int = REPEATS) -> Spent:
     return Spent(min(times), median(times), repeats)
 
 
+def cpu_times(works: Sequence[Callable[[], Any]], repeats: int = REPEATS) -> list[Spent]:
+    """As `cpu_time` for several works in turn, so that what else the machine does meets them alike: for ratios."""
+    times: list[list[float]] = [[] for _ in works]
+    for round_ in range(repeats + 1):
+        for work, taken in zip(works, times):
+            start = time.thread_time_ns()
+            work()
+            if round_:
+                taken.append((time.thread_time_ns() - start) / 1e9)
+    return [Spent(min(taken), median(taken), repeats) for taken in times]
+
+
 def repeated(work: Callable[[], Any], times: int) -> Callable[[], None]:
     """Return a call that does `work` `times` times."""
 

@@ -36,7 +36,7 @@ void label_words(const uint8_t *restrict labels, const uint16_t *restrict words,
     for (int64_t i = 0; i < n; i++) out[i] = labels[words[i]];
 }
 
-/* The loop as the kernel has it: eight rows a step, then dot products, two at a time; h hidden, c (even) outputs. */
+/* The loop for several shots as the kernel has it: eight rows a step, then dot products, two at a time; h hidden, c (even) outputs. */
 static void add8(const float *restrict w, const int64_t *rows, const float *f, int64_t n_rows, int64_t width, float *restrict out) {
     for (int64_t r = 0; r < n_rows; r += 8) {
         const float *a0 = w + rows[r] * width, *a1 = w + rows[r + 1] * width;
@@ -86,6 +86,35 @@ void sparse_same(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64
     }
 }
 
+/* Single shots as the kernel has them: a row for each group of patterns, two groups at a time; `bits` patterns a group, at `tables`. */
+static int64_t group_row(const int64_t *counts, int64_t d_f, int64_t bits, int64_t *feature, int64_t *at, int64_t width) {
+    int64_t word = 0, size = d_f - *feature < bits ? d_f - *feature : bits, here;
+    for (int64_t k = 0; k < size; k++) word |= counts[*feature + k] << k;
+    here = *at + word * width;
+    *feature += size; *at += width << size;
+    return here;
+}
+
+void sparse_groups(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes, int64_t bits,
+                   int64_t tables, const float *numbers, float *restrict hidden, float *scores,
+                   uint16_t *labels, float *probabilities) {
+    const float *w2 = numbers + d_f * h, *b2 = w2 + h * c + h;
+    for (int64_t i = 0; i < n; i++) {
+        int64_t feature = 0, at = tables, first = 1;
+        while (feature < d_f) {
+            const float *p = numbers + group_row(counts + i * d_f, d_f, bits, &feature, &at, h);
+            const float *q = numbers + group_row(counts + i * d_f, d_f, bits, &feature, &at, h);
+            if (first) for (int64_t j = 0; j < h; j++) hidden[j] = p[j] + q[j];
+            else for (int64_t j = 0; j < h; j++) hidden[j] += p[j] + q[j];
+            first = 0;
+        }
+        for (int64_t j = 0; j < h; j++) hidden[j] = hidden[j] < 0 ? 0 : hidden[j];
+        for (int64_t j = 0; j < c; j++) scores[j] = b2[j];
+        dots(w2, hidden, h, c, scores);
+        win(scores, classes, labels + i, probabilities + i);
+    }
+}
+
 /* The loop as one would write it down: a column at a time, then a row at a time. */
 void sparse_plain(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
                   const float *numbers, float *restrict hidden, float *restrict scores,
@@ -121,12 +150,15 @@ class CLoops:
 
     def sparse(self, loop: str, counts: NDArray[np.int64], meta: NDArray[np.int64], numbers: NDArray[np.float32],
                n_classes: int) -> NDArray[np.uint16]:  # fmt: skip
-        """Decide counts (n, d_f) with a head of two layers, padded as decide_mlp pads it; `loop` is sparse_same or sparse_plain."""
+        """Decide single shots (n, d_f) with a head of two layers, padded as decide_mlp pads it; `loop` is one of the sparse_ functions."""
         n_features, hidden, columns = meta[1:4].tolist()
         labels, probabilities = np.empty(len(counts), np.uint16), np.empty(len(counts), np.float32)
         work, rows = np.zeros((3, hidden + n_features + 8), np.float32), np.zeros(n_features + 8, np.int64)
+        groups = loop == "sparse_groups"
         sizes = [ctypes.c_int64(n) for n in (len(counts), n_features, hidden, columns, n_classes)]
-        arrays = [_at(a) for a in (numbers, work[0], work[1], rows, work[2], labels, probabilities)]
+        sizes += [ctypes.c_int64(n) for n in meta[-2:].tolist()] if groups else []
+        scratch = [] if groups else [rows, work[2]]
+        arrays = [_at(a) for a in (numbers, work[0], work[1], *scratch, labels, probabilities)]
         getattr(self.library, loop)(_at(counts), *sizes, *arrays)
         return labels
 

@@ -7,6 +7,7 @@ decisions with the float64 decisions, and accuracy where the inputs have labels.
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -16,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bench import BenchOptions, Row, copy_ns, cpu_time, latencies_us, mark_pareto, per_item_ns, repeated
+from .bench import BenchOptions, Row, cpu_time, cpu_times, latencies_us, mark_pareto, per_item_ns, repeated
+from .bench_alone import alone_row
 from .bench_c import FLAGS, FREE_FLAGS, CLoops, c_loops
 from .bundle import Bundle, load_bundle
 from .decide import make_decider
@@ -28,6 +30,7 @@ from .verdict import Decider
 
 BATCH = 20_000
 SINGLE_CALLS = 20_000
+STREAM_REPEATS = 15
 CACHED_WORDS, MEMORY_WORDS = 1 << 15, 1 << 24  # 64 kB of 16-bit words, as a block of a stream; 32 to 128 MB
 BACKENDS = ("table", "count-table", "sparse", "int8", "onnx", "int8-onnx", "float64")
 
@@ -112,25 +115,42 @@ def _limits(bundle: Bundle, counts: NDArray[np.int64], shots: int, wanted: NDArr
     run, layers, room = decider.kernel, decider.layers, decider.room
     spent = cpu_time(lambda: run(part, shots, *layers, room, *out))
     rows = [
-        {"name": f"{bundle.name} sparse, called from compiled code, one at a time", **per_item_ns(spent, len(part))}
+        {
+            "name": f"{bundle.name} sparse, called from compiled code, one at a time",
+            **per_item_ns(spent, len(part)),
+            **alone_row(decider, part, shots),
+        }
     ]
     if shots == 1 and int(layers.meta[0]) == 2:
         rows += _c_rows(bundle, decider, part)
-    return rows + _onnx_rows(bundle, counts, shots) + _torch_rows(bundle, counts, shots)
+    others = _onnx_rows(bundle, counts, shots) + _torch_rows(bundle, counts, shots)
+    for row in others:
+        if "p50_us" in row and "p50_us" in rows[0]:
+            row["p50_over_sparse"] = round(row["p50_us"] / rows[0]["p50_us"], 1)
+    return rows + others
 
 
 def _c_rows(bundle: Bundle, decider: SparseDecider, counts: NDArray[np.int64]) -> list[Row]:
     rows: list[Row] = []
-    for flags in (FLAGS, FREE_FLAGS):
+    for flags, free in ((FLAGS, ""), (FREE_FLAGS, ", sums in any order")):
         loops = c_loops(flags)
         if not isinstance(loops, CLoops):
             return [{"name": f"{bundle.name} C", "skipped": loops}]
-        for loop, word in (("sparse_same", "the same loop"), ("sparse_plain", "a plain loop")):
+        for loop, word in (
+            ("sparse_groups", "the same loop"),
+            ("sparse_same", "row by row"),
+            ("sparse_plain", "a plain loop"),
+        ):
+            if loop == "sparse_groups" and not decider.layers.meta[-2]:
+                continue
             spent = cpu_time(partial(loops.sparse, loop, counts, *decider.layers, decider.n_classes))
             decided = loops.sparse(loop, counts, *decider.layers, decider.n_classes)
             differs = float((decided != decider.decide_batch(counts, 1)).mean())
-            name = f"{bundle.name} C, {word}, {' '.join(flags[:-2])}"
-            rows.append({"name": name, **per_item_ns(spent, len(counts)), "changed_percent": round(100 * differs, 4)})
+            name = f"{bundle.name} C, {word}, -O3 -march=native{free}"
+            figures = per_item_ns(spent, len(counts))
+            rows.append(
+                {"name": name, **figures, "compiler": loops.compiler, "changed_percent": round(100 * differs, 4)}
+            )
     return rows
 
 
@@ -183,24 +203,27 @@ def _stream_rows(bundle: Bundle) -> list[Row]:
             words: NDArray[Any] = np.random.default_rng(2).integers(0, 1 << bundle.n_features, n).astype(dtype)
             out = np.empty(n, decider.labels.dtype)
             inner = max(1, MEMORY_WORDS // n)
-            spent = cpu_time(repeated(partial(decider.decide_words, words, out), inner))
-            figures, copy = per_item_ns(spent, n * inner), copy_ns(words.nbytes) / n
+            source, target = words.copy(), np.empty_like(words)
+            works: list[Callable[[], Any]] = [
+                partial(decider.decide_words, words, out),
+                partial(np.copyto, target, source),
+            ]
+            in_c = dtype == np.uint16 and isinstance(loops, CLoops) and out.dtype == np.uint8
+            if in_c and isinstance(loops, CLoops):
+                works.append(partial(loops.label_words, decider.labels, words, np.empty_like(out)))
+            spent, copied, *others = cpu_times([repeated(work, inner) for work in works], STREAM_REPEATS)
+            figures, copy_ns = per_item_ns(spent, n * inner), per_item_ns(copied, n * inner)
             exact = bool((out == decider.labels[words]).all())
             rows.append(
                 {"name": f"{bundle.name} table, {8 * words.itemsize}-bit words {place}", **figures, "rate": round(1e9 / figures["ns"]),
-                 "copy_ns": round(copy, 4), "of_copy_rate": round(copy / figures["ns"], 3), "changed_percent": 0.0 if exact else 100.0,
+                 "copy_ns": copy_ns["ns"], "of_copy_rate": round(copied.least_s / spent.least_s, 3),
+                 "of_copy_rate_median": round(copied.median_s / spent.median_s, 3), "changed_percent": 0.0 if exact else 100.0,
                  "checksum": int(out.sum(dtype=np.int64))}
             )  # fmt: skip
-            if dtype == np.uint16 and isinstance(loops, CLoops) and out.dtype == np.uint8:
-                spent = cpu_time(repeated(partial(loops.label_words, decider.labels, words, out), inner))
-                figures = per_item_ns(spent, n * inner)
-                rows.append(
-                    {
-                        "name": f"the same look-up in C, unchecked, {place}",
-                        **figures,
-                        "rate": round(1e9 / figures["ns"]),
-                    }
-                )
+            for other in others:
+                figures = per_item_ns(other, n * inner)
+                name = f"the same look-up in C, unchecked, {place}"
+                rows.append({"name": name, **figures, "rate": round(1e9 / figures["ns"])})
     return rows
 
 

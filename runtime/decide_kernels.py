@@ -60,11 +60,13 @@ def warm_up(label_dtype: Any = np.uint8, word_dtype: Any = np.uint64) -> None:
     label_checked_words(np.zeros(2, dtype=label_dtype), np.zeros(1, dtype=word_dtype), np.zeros(1, dtype=label_dtype))
 
 
-# A chain of layers is two arrays: `meta` int64: number of layers L, then L + 1 sizes (d_f, then padded widths), then L flags "rectified";
-# and `numbers` float32: the first matrix row by row (n_in, n_out), the others column by column, then all biases. For int8 the matrices are
-# an array of their own and `affine` float32 (2, sum of widths) holds scales and biases. Padding is zero, so that it changes no sum. Few
-# arrays, because each one costs a call from Python a tenth of a microsecond. Room for one decision: `work` (3, widest), whose last row
-# holds the clicks that fired, `rows` int64, and for int8 `hidden` int16.
+# A chain of layers is two arrays. `meta` int64: number of layers L, then L + 1 sizes (d_f, then padded widths), then L flags
+# "rectified", and for float32 two more: patterns per group (0: no groups) and where in `numbers` the groups stand. `numbers` float32:
+# the first matrix row by row (n_in, n_out), the others column by column, then all biases, then the groups: the first layer's sums for
+# every click word of a few neighbouring patterns, an even number of groups, the bias within the first; single shots are decided from
+# them. For int8 the matrices are an array of their own and `affine` float32 (2, sum of widths) holds scales and biases. Padding is
+# zero, so that it changes no sum. Few arrays, because each one costs a call from Python a tenth of a microsecond. Room for one
+# decision: `work` (3, widest), whose last row holds the clicks that fired, `rows` int64, and for int8 `hidden` int16.
 
 
 # ------------------------------------------------------------------------------------------------------------ float32 heads
@@ -86,25 +88,55 @@ def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-
             ) + ((f4 * weights[a4 + j] + f5 * weights[a5 + j]) + (f6 * weights[a6 + j] + f7 * weights[a7 + j]))
 
 
+@njit(cache=True, nogil=True)
+def _add_groups(counts, i, n_features, bits, tables, start, width, out):  # type: ignore[no-untyped-def]
+    """out[0, :width] = the first layer of the single shot counts[i]: one row for each group of `bits` patterns, two groups at a time.
+
+    Sums run over pairs of groups: ((g0 + g1) + (g2 + g3)) + ..., each group's row being its exact sum, rounded once.
+    """
+    columns = _U(width)
+    at, feature = _U(start), 0
+    first = True
+    while feature < n_features:
+        a, feature, at = _group_row(counts, i, n_features, bits, feature, at, columns)
+        b, feature, at = _group_row(counts, i, n_features, bits, feature, at, columns)
+        if first:
+            for j in range(columns):
+                out[0, j] = tables[a + j] + tables[b + j]
+        else:
+            for j in range(columns):
+                out[0, j] += tables[a + j] + tables[b + j]
+        first = False
+
+
+@njit(cache=True, nogil=True)
+def _group_row(counts, i, n_features, bits, feature, at, columns):  # type: ignore[no-untyped-def]
+    """Where the row of the group that begins at `feature` stands, then the next group's first pattern and place; no branch on a click."""
+    word, size = _U(0), min(bits, n_features - feature)
+    for k in range(size):
+        word |= _U(counts[i, feature + k]) << _U(k)
+    return at + word * columns, feature + size, at + (columns << _U(size))
+
+
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _dots(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
     """out[k] += x . weights[start + k * n_in:][:n_in], two rows at a time; n_out is even, n_in a multiple of LANES."""
+    length = _U(n_in)
     for k in range(0, n_out, 2):
-        w = weights[start + k * n_in : start + (k + 1) * n_in]
-        v = weights[start + (k + 1) * n_in : start + (k + 2) * n_in]
+        p = _U(start) + _U(k) * length
+        q = p + length
         a, b = np.float32(0), np.float32(0)
-        for j in range(n_in):
-            a += x[j] * w[j]
-            b += x[j] * v[j]
+        for j in range(length):
+            a += x[j] * weights[p + j]
+            b += x[j] * weights[q + j]
         out[k] += a
         out[k + 1] += b
 
 
 @njit(cache=True, nogil=True)
-def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[no-untyped-def]
-    """Scores of the object whose clicks are counts[i], integers (n, d_f); they stand in the row of `work` that is returned."""
-    n_layers, n_features, width, n_fired = meta[0], meta[1], meta[2], 0
-    factors = work[2]
+def _fired(counts, i, n_features, shots, rows, factors):  # type: ignore[no-untyped-def]
+    """Write down which patterns clicked and how often per shot, padded to STEP; return how many."""
+    n_fired = 0
     for feature in range(n_features):
         count = counts[i, feature]
         if count:
@@ -114,13 +146,24 @@ def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[n
     for r in range(n_fired, -(-n_fired // STEP) * STEP):
         rows[r] = 0
         factors[r] = 0
-    bias = 0
+    return n_fired
+
+
+@njit(cache=True, nogil=True)
+def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[no-untyped-def]
+    """Scores of the object whose clicks are counts[i], integers (n, d_f); they stand in the row of `work` that is returned."""
+    n_layers, n_features, width = meta[0], meta[1], meta[2]
+    bias, bits = 0, meta[2 * n_layers + 2]
     for layer in range(n_layers):
         bias += meta[layer + 1] * meta[layer + 2]
-    first, constants = work[0], numbers[bias : bias + width]
-    for j in range(width):
-        first[j] = constants[j]
-    _add_rows(numbers, width, n_fired, rows, factors, work)
+    if shots == 1 and bits > 0:
+        _add_groups(counts, i, n_features, bits, numbers, meta[2 * n_layers + 3], width, work)
+    else:
+        n_fired = _fired(counts, i, n_features, shots, rows, work[2])
+        first, constants = work[0], numbers[bias : bias + width]
+        for j in range(width):
+            first[j] = constants[j]
+        _add_rows(numbers, width, n_fired, rows, work[2], work)
     start, source = n_features * width, 0
     bias += width
     for layer in range(1, n_layers + 1):

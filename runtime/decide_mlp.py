@@ -21,6 +21,8 @@ from .int8_head import Int8Head
 from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winner, softmax_winners
 
 SHOTS_MAX = 16  # of golden vectors
+GROUP_BITS = (5, 4, 3)  # fewer save nothing: few patterns click
+GROUP_BYTES_MAX = 1 << 18  # a part of a level-2 cache
 Room = tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.float32]]  # scores, labels, probabilities
 
 
@@ -158,8 +160,34 @@ def pad_float(chain: tuple[Layer, ...]) -> Padded:
     sizes = _padded_sizes([chain[0].weights.shape[0], *(layer.weights.shape[1] for layer in chain)])
     weights = _laid_out([_pad(layer.weights, size) for size, layer in zip(pairwise(sizes), chain)])
     biases = [_pad(layer.bias, (n_out,)) for n_out, layer in zip(sizes[1:], chain)]
-    meta = np.array([len(chain), *sizes, *(layer.relu for layer in chain)], np.int64)
-    return Padded(meta, np.concatenate([*weights, *biases]))
+    numbers = np.concatenate([*weights, *biases])
+    bits, groups = _groups(chain[0], sizes[1])
+    meta = np.array([len(chain), *sizes, *(layer.relu for layer in chain), bits, len(numbers)], np.int64)
+    return Padded(meta, np.concatenate([numbers, groups]))
+
+
+def _groups(layer: Layer, width: int) -> tuple[int, NDArray[np.float32]]:
+    """Return bits per group and the first layer's sums for every word of each group, padded to `width`, an even number of groups.
+
+    The larger the groups, the fewer rows are added for a decision; GROUP_BYTES_MAX keeps them all in a cache. 0 bits where that cannot be.
+    Sums are taken in float64 and rounded once; one that is no float32 is infinite, and what it leads to abstains.
+    """
+    n_features = layer.weights.shape[0]
+    for bits in GROUP_BITS:
+        sizes = [min(bits, n_features - first) for first in range(0, n_features, bits)]
+        sizes += [0] * (len(sizes) % 2)
+        if sum(1 << size for size in sizes) * width * 4 > GROUP_BYTES_MAX:
+            continue
+        tables, first = [], 0
+        for number, size in enumerate(sizes):
+            clicked = np.arange(1 << size)[:, None] >> np.arange(size) & 1
+            sums = clicked @ layer.weights[first : first + size].astype(np.float64)
+            with np.errstate(over="ignore"):
+                rounded = (sums + layer.bias * (number == 0)).astype(np.float32)
+            tables.append(_pad(rounded, (1 << size, width)).ravel())
+            first += size
+        return bits, np.concatenate(tables)
+    return 0, np.zeros(0, np.float32)
 
 
 def pad_int8(head: Int8Head) -> Padded:

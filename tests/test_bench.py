@@ -10,6 +10,7 @@ from heads import head_bundle, random_layers
 
 from pans.runtime import bench_decide, bench_ingest
 from pans.runtime.bench import BenchOptions, Spent, machine_facts, mark_pareto, percentiles_us, repeated, table_text
+from pans.runtime.bench_alone import alone_row
 from pans.runtime.bench_c import FREE_FLAGS, CLoops, c_loops
 from pans.runtime.bench_decide import _bundle_rows
 from pans.runtime.cli import main
@@ -59,11 +60,21 @@ def test_c_decides_as_our_kernel_does() -> None:
     decider = SparseDecider(head_bundle(random_layers([10, 32, 7])))
     counts = np.random.default_rng(0).integers(0, 2, (200, 10))
     wanted = decider.decide_batch(counts, 1)
-    for loop in ("sparse_same", "sparse_plain"):
+    for loop in ("sparse_groups", "sparse_same", "sparse_plain"):
         assert (loops.sparse(loop, counts, *decider.layers, 7) == wanted).all()
     words, out = np.arange(256, dtype=np.uint16), np.zeros(256, np.uint8)
     loops.label_words(np.arange(256, dtype=np.uint8)[::-1].copy(), words, out)
     assert (out == 255 - words).all()
+
+
+def test_single_decisions_are_timed_and_right() -> None:
+    decider = SparseDecider(head_bundle(random_layers([10, 32, 7])))
+    counts = np.random.default_rng(0).integers(0, 2, (200, 10))
+    row = alone_row(decider, counts, 1)
+    if "skipped" not in row:
+        assert row["checksum"] == decider.decide_batch(counts, 1).sum()
+        assert 0 <= row["clock_us"] <= row["p50_us"] <= row["max_us"]
+        assert row["calls"] == 200
 
 
 def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:

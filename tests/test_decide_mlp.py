@@ -78,7 +78,9 @@ def test_ties_and_scores_that_are_not_finite() -> None:
     large = SparseDecider(head_bundle((Layer(steep[0].weights * 0, steep[0].bias * 0, False),)))
     numbers = np.zeros(4, np.float32)
     numbers[[0, 1, 2]] = 3e38, 1, 3e38  # one row of weights, then the biases: their sum is no float32
-    large.layers = large.layers._replace(numbers=numbers)
+    meta = large.layers.meta.copy()
+    meta[-2] = 0  # no groups: the rows are added as they are
+    large.layers = large.layers._replace(meta=meta, numbers=numbers)
     verdict = large.decide(np.ones(1, np.int64), 1)
     assert verdict.probability == 0.0
 
@@ -253,3 +255,23 @@ def test_kernels_without_the_compiler() -> None:
         text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(("d_f", "bits"), [(1, 5), (10, 5), (11, 5), (32, 4), (64, 0)])
+def test_single_shots_from_groups_of_patterns(d_f: int, bits: int) -> None:
+    """Fewer sums than row by row, each rounded once: no further from float64, give or take a half."""
+    layers = random_layers([d_f, 512, 10], seed=d_f)
+    decider = SparseDecider(head_bundle(layers))
+    assert int(decider.layers.meta[-2]) == bits
+    counts = np.random.default_rng(d_f).integers(0, 2, (300, d_f))
+    found = decider.scores_batch(counts, 1)
+    wanted = reference_scores(layers, counts.astype(np.float64))
+    meta = decider.layers.meta.copy()
+    meta[-2] = 0
+    grouped, decider.layers = decider.layers, decider.layers._replace(meta=meta)
+    plain = decider.scores_batch(counts, 1)
+    decider.layers = grouped
+    assert (found != plain).any() == (bits > 0 and d_f > 5)
+    assert np.abs(found - wanted).max() <= 1.5 * np.abs(plain - wanted).max() + 1e-7
+    alone = [decider.decide(row, 1).label for row in counts]
+    assert alone == decider.decide_batch(counts, 1).tolist()
