@@ -27,6 +27,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
     parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark, a .npz or a .toml file")
     parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
+    parser.add_argument(
+        "--changes", default="", help="like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (SIMULATOR.md)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
     parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
@@ -54,6 +57,7 @@ def _run(args: argparse.Namespace) -> int:
             faults=args.faults,
             buffer=args.buffer,
             optics=args.optics,
+            changes=args.changes,
         )
     )
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)

@@ -63,8 +63,31 @@ _CHANGE_RULES: dict[str, dict[str, Key]] = {
 _AMOUNTS = {"dark": "factor", "burst": "rate_hz", "hot": "rate_hz", "drift": "percent_per_s"}
 
 
-def open_scene(name_or_path: str | Path) -> SceneFile:
-    """Open what a device URL names: a scene file in TOML (shipped ones by name), or whatever `load_scene` knows."""
+def open_scene(name_or_path: str | Path, changes: str = "") -> SceneFile:
+    """Open what a device URL names: a scene file in TOML (shipped ones by name), or whatever `load_scene` knows.
+
+    `changes` adds to those of the file: like `dark:at_s=30:factor=2,dead:at_s=40:channel=3`, the keys of [[change]].
+    """
+    scene = _open(name_or_path)
+    if not changes:
+        return scene
+    tables = [dict(_pair(word) for word in f"kind={one}".split(":")) for one in changes.split(",")]
+    added = _Check({"change": tables}, {}, Path(f"changes={changes}")).changes()
+    return replace(scene, changes=scene.changes + added)
+
+
+def _pair(word: str) -> tuple[str, Any]:
+    """`key=value` as a key of a TOML file would be read: a number where it is one, else text."""
+    key, _, value = word.partition("=")
+    for read in (int, float):
+        try:
+            return key, read(value)
+        except ValueError:
+            continue
+    return key, value
+
+
+def _open(name_or_path: str | Path) -> SceneFile:
     name = str(name_or_path)
     shipped = SCENE_FOLDER / f"{name}.toml"
     if "/" not in name and "\\" not in name and shipped.is_file():

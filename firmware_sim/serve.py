@@ -46,10 +46,11 @@ class SimOptions:
     faults: str = ""
     buffer: int = BUFFER_MESSAGES
     optics: str = ""  # a bundle whose passive optics the instrument looks through
+    changes: str = ""  # what changes meanwhile, beside what the scene file says
 
 
 def parse_sim_url(url: str) -> SimOptions:
-    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&optics=BUNDLE&offset=TICKS&drift_ppm=X]`, or raise UsageError."""
+    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&changes=...&optics=BUNDLE&...]`, or raise UsageError."""
     scheme, _, rest = url.partition(":")
     profile, _, query = rest.partition("?")
     if scheme != "sim" or not profile:
@@ -90,7 +91,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     """
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
-    scene = open_scene(options.scene)
+    scene = open_scene(options.scene, options.changes)
     faults = parse_faults(options.faults)
     optics = _optics(options.optics)
 
@@ -125,7 +126,7 @@ def open_sim(url: str) -> Link:
     options = parse_sim_url(url)
     if options.pace == "real":
         load_profile(options.profile)  # a mistake in either is better told here than by the child
-        open_scene(options.scene)
+        open_scene(options.scene, options.changes)
         _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)
@@ -192,6 +193,7 @@ def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
     words += ["--listen", listen, "--until-stdin-closes"]
     words += ["--faults", options.faults] if options.faults else []
     words += ["--optics", options.optics] if options.optics else []
+    words += ["--changes", options.changes] if options.changes else []
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
     # for the host, which then leaves the instrument in a safe state.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

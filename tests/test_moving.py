@@ -25,6 +25,7 @@ from pans.firmware_sim.measurement import Measurement
 from pans.firmware_sim.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.optics import expected_photoelectrons, photons_per_level
 from pans.firmware_sim.scene import Scene, scene_from_arrays
+from pans.firmware_sim.scene_file import open_scene
 from pans.firmware_sim.shifts import shift_table
 from pans.firmware_sim.tape import BarTable, TapeFlow
 from pans.firmware_sim.upload import Program
@@ -461,3 +462,21 @@ def test_clicks_follow_the_light_that_the_scene_passes() -> None:
     assert 0.01 < probability.mean() < 0.9
     spread = np.sqrt((probability * (1 - probability)).sum(axis=0))
     assert (np.abs(clicks.sum(axis=0) - probability.sum(axis=0)) < 5 * spread).all()
+
+
+def test_a_still_scene_changes_too_pattern_after_pattern() -> None:
+    """The paper's way of measuring: 40 000 exposures in the dark, the dark rate ten times as high in the second half."""
+    profile = load_profile("ideal")
+    profile = replace(profile, detector=replace(profile.detector, dark_rate_hz=1e4))
+    scene = open_scene("dark", "dark:at_s=0.05:factor=10")
+    slots = 2 * np.arange(100, dtype=np.int64)
+    plan = Program(
+        0, 1, 2, 2, 200, 1, slots, np.zeros(100, np.uint16), ((0, 100),)
+    )  # 2 us at 1 MHz, one after the other
+    exposures, changes = Exposures(plan, None, 1_000_000), Changes(scene.changes, 1)
+    light = begin(scene, prepare(profile, scene, np.ones((1, 4), np.uint16), 2.0), plan, exposures, changes, 1, 0)
+    run = Measurement(plan, Arm(10, 0, 1), light, exposures, detector_model(profile, 2.0), changes, 1, 0)
+    bits = np.concatenate([block.bits for block in emitted(run, 1100) if isinstance(block, wire.ClickBlock)])[:50_000]
+    for part, mean in ((bits[:25_000], 0.02), (bits[25_000:], 0.2)):
+        wanted = -np.expm1(-mean)
+        assert abs(part.mean() - wanted) < 5 * np.sqrt(wanted / len(part))

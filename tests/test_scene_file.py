@@ -119,6 +119,23 @@ def test_other_names_are_still_scenes() -> None:
     assert "bar-tape" in caught.value.remedy
 
 
+def test_changes_may_come_with_the_url(folder: Path) -> None:
+    text = "dark:at_s=1.5:factor=2,dead:at_s=40:for_s=1e3:channel=3"
+    first = Change("dead", 0.0, math.inf, 0, 0.0)
+    path = written(folder, TAPE + '[[change]]\nkind = "dead"\nat_s = 0\nchannel = 0\n')
+    wanted = (first, Change("dark", 1.5, math.inf, ALL_CHANNELS, 2.0), Change("dead", 40.0, 1000.0, 3, 0.0))
+    assert open_scene(path, text).changes == wanted
+    assert open_scene("fashion200", text).changes == wanted[1:]
+    for wrong, message in [
+        ("dark", "change.at_s is missing in a change of kind dark"),
+        ("dim:at_s=1", 'change.kind must be "dark" or'),
+        ("hot:at_s=x:channel=1:rate_hz=1", "change.at_s must be a number from 0 to 10000000"),
+        ("dark:at_s=1:factor=2,", 'change.kind must be "dark" or'),
+    ]:
+        with pytest.raises(ConfigError, match=message):
+            open_scene("fashion200", wrong)
+
+
 WRONG = [
     ("", r":1:1: kind is missing"),
     ('kind = "cell"', r':1:1: kind must be "still" or "cells" or "tape", found the text "cell"'),
