@@ -1,0 +1,113 @@
+"""Draw docs/pictures/flow.png from a recording of `pans run --flow cells`: click sums, posteriors, marks, decisions, pulses (extra `plot`).
+
+python docs/pictures/flow.py pans-run/run.pansrec [first exposure] [exposures]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from pans.runtime.cmd_replay import sent_plan
+from pans.runtime.connection import plan_from_chunks
+from pans.runtime.decide import make_decider
+from pans.runtime.passages import abort_reason
+from pans.runtime.record import read_recording
+from pans.runtime.record_format import NO_LABEL
+from pans.runtime.run_flow import replayed_core
+from pans.runtime.wire import MessageType, decode_frames, decode_mark, unpack_body
+
+recording = read_recording(Path(sys.argv[1]))
+first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
+count = int(sys.argv[3]) if len(sys.argv) > 3 else 2400
+config, bundle = recording.header["config"], recording.bundle()
+chunks, arms = sent_plan(recording)
+plan = plan_from_chunks(chunks, int(config["tick_hz"]))
+decider = make_decider(bundle)
+arm = arms[0][1]
+core = replayed_core(config["flow"], plan, decider, bundle, 1, arm.n_cycles)
+core.begin(arm.start_tick, arm.n_cycles)
+stop = first + count
+words, marks, rows, gates = np.zeros(count, np.int64), [], [], {}
+for _, body in recording.messages():
+    frame = unpack_body(body)
+    if frame.type == MessageType.MARK:
+        mark = decode_mark(frame.payload)
+        if first <= mark.exposure_index < stop:
+            marks.append(mark)
+    output = core.step(frame)
+    rows += [(d, p) for d, p in zip(output.decisions, output.passages) if p.last > first and p.first < stop]
+    gates |= {action.number: action.tick for action in output.actions}
+    if frame.type == MessageType.FRAMES:
+        block = decode_frames(frame.payload)
+        at = np.arange(block.exposure_index, block.exposure_index + len(block.words))
+        here = (at >= first) & (at < stop)
+        packed = block.words[here].astype(np.int64)
+        words[at[here] - first] = packed @ (1 << (8 * np.arange(packed.shape[1])))
+        if block.exposure_index > stop + 1000:
+            break
+
+period_us = plan.slot_period_ticks * plan.tick_us
+time_us = (first + np.arange(count)) * period_us
+clicks = np.array([word.bit_count() for word in words.tolist()])
+width = core.limits.onset_frames
+sums = np.convolve(clicks, np.ones(width), "full")[:count]
+bits = (words[:, None] >> np.arange(bundle.n_features)) & 1
+scores = decider.scores_batch(bits, 1).astype(np.float64)
+posterior = np.exp(scores - scores.max(axis=1, keepdims=True))
+posterior /= posterior.sum(axis=1, keepdims=True)
+smooth = np.stack([np.convolve(p, np.ones(5) / 5, "same") for p in posterior.T], axis=1)
+smooth[sums <= core.limits.release_clicks] = np.nan
+
+colours = plt.cm.tab10.colors
+fig, (top, middle, bottom) = plt.subplots(
+    3, 1, figsize=(11, 6.2), sharex=True, height_ratios=(3, 2.2, 1.6), layout="constrained"
+)
+top.plot(time_us, sums, color="0.25", lw=0.9)
+top.axhline(
+    core.limits.onset_clicks,
+    color="tab:green",
+    lw=0.8,
+    ls="--",
+    label=f"onset: {core.limits.onset_clicks} clicks",
+)
+for decision, passage in rows:
+    top.axvspan(passage.first * period_us, passage.last * period_us, color="tab:blue", alpha=0.10)
+    at = (decision.exposure_index + 0.5) * period_us
+    named = decision.label != NO_LABEL
+    text = f"{bundle.classes[decision.label]}\n{decision.probability:.0%}" if named else abort_reason(decision.flags)
+    top.axvline(at, color="tab:red", lw=1.0)
+    top.text(at, sums.max() * 1.30, text, ha="center", va="top", fontsize=8, color="tab:red")
+top.set_ylim(0, sums.max() * 1.34)
+top.set_ylabel(f"clicks in {width} frames")
+top.legend(loc="center left", fontsize=8)
+for label, name in enumerate(bundle.classes):
+    middle.plot(time_us, smooth[:, label], color=colours[label], lw=1.1, label=name)
+middle.set_ylabel("posterior per frame\n(mean of 5)")
+middle.legend(loc="center left", fontsize=8)
+for number, mark in enumerate(marks):
+    span = (
+        (mark.exposure_index - mark.half_exposures) * period_us,
+        (mark.exposure_index + mark.half_exposures) * period_us,
+    )
+    bottom.plot(span, (2, 2), color=colours[mark.truth], lw=5, solid_capstyle="butt")
+    bottom.text(sum(span) / 2, 2.25 + 0.4 * (number % 2), bundle.classes[mark.truth], ha="center", fontsize=8)
+for decision, passage in rows:
+    leave = passage.last * period_us
+    bottom.plot((leave, leave), (0.8, 1.2), color="tab:blue")
+    if decision.number in gates:
+        gate_us = (gates[decision.number] - arm.start_tick) * plan.tick_us
+        bottom.annotate("", (gate_us, 1), (leave, 1), arrowprops={"arrowstyle": "->", "color": "tab:red"})
+        bottom.text(gate_us, 0.35, "gate", color="tab:red", fontsize=8, ha="center")
+bottom.set_ylim(0, 3.2)
+bottom.set_yticks((1, 2), ("release, pulse", "MARK: truth"))
+bottom.set_xlabel("time, us")
+bottom.set_xlim(time_us[0], time_us[-1])
+fig.suptitle(f"SIMULATED: {bundle.name}, a frame every {period_us:.3g} us", fontsize=10)
+fig.savefig(Path(__file__).with_name("flow.png"), dpi=110)
