@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, Command, emit
@@ -40,6 +41,9 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--eta", type=float, default=1.0, metavar="E", help="all light times E (default 1)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trials (default 0)")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="draw confusion, a map of the clicks, patterns (extra plot)"
+    )
     parser.add_argument(
         "--data-seed", type=int, metavar="N", help="of a drawn task (default: that of the bundle's training)"
     )
@@ -86,8 +90,26 @@ def _evaluate(args: argparse.Namespace) -> int:
         "seconds": time.perf_counter() - started,
         "simulated": True,
     }
+    if args.pictures:
+        payload["pictures"] = _draw(args, bundle, profile, first(objects, args.objects))
     emit(args, payload, lines(measured))
     return EXIT_FINE
+
+
+def _draw(args: argparse.Namespace, bundle: Bundle, profile: Profile, objects: Objects) -> list[str]:
+    from .evaluate import light_of
+
+    try:
+        from .bundle_pictures import write_pictures
+
+        light = light_of(bundle, profile, objects.images, eta=args.eta, dark=args.dark)
+        written = write_pictures(args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed)
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"--pictures needs the package {error.name}, which is not installed",
+            remedy="pip install 'pans-runtime[plot]'",
+        ) from error
+    return [str(path) for path in written]
 
 
 def measure(
