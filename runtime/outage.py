@@ -6,6 +6,7 @@ the core's. `why_ended` returns the reason for an end, "" for none, and raises L
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,7 @@ def come_back(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Calla
         run.lose_link(failure)
         return
     run.reconnects += 1
+    gc.collect()  # it is off while armed, and an old connection's objects name each other: here nobody waits
     outage_ms = (run.now_ns() - run.outage_ns) / NS_PER_MS
     run.journal.event({"kind": "reconnected", "attempts": attempts, "outage_ms": outage_ms})
     run.settle(run.core.end())
