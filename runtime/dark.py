@@ -46,7 +46,7 @@ class DarkMonitor:
         alarm = ""
         if exposures and binomial_tail(clicks, exposures, self.expected) < ALARM_PROBABILITY:
             alarm = (
-                f"{clicks} clicks in {exposures} dark exposures, the profile expects {self.expected * exposures:.3g}: "
+                f"{clicks} clicks in {exposures} dark exposures, expected are {self.expected * exposures:.3g}: "
                 "look for stray light, a warm detector or a wrong threshold"
             )
         return DarkReport(exposures, clicks, rate, low, high, self.expected, alarm)

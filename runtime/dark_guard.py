@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from .bundle import Bundle
 from .channels import LEVELS, ChannelHealth, Finding
-from .dark import DarkReport, wilson_interval
+from .dark import DarkMonitor, DarkReport, wilson_interval
 from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
-from .dark_watch import Alarm, ChannelWatch
+from .dark_watch import FLOOR_RATE, Alarm, ChannelWatch
 from .decide import Decider
 from .errors import UsageError
 from .plan import Plan
@@ -147,7 +147,14 @@ class DarkGuard:
             self._seen[int(counts @ (1 << np.arange(len(counts))))] += 1
 
     def report(self, report: DarkReport) -> DarkReport:
-        """Return `report` with the findings, what lasts, and every channel's rate with its interval."""
+        """Return `report` with the findings, what lasts, and every channel's rate with its interval.
+
+        Its alarm is judged anew: from the exposures that were watched (behind no click, where the detector afterpulses), and against the
+        end of the interval where the expected rate is an estimate.
+        """
+        watch = self.watch
+        monitor = DarkMonitor(float(watch.high.mean()) if watch.high.max() > FLOOR_RATE else 0.0)
+        judged = monitor.report(watch.exposures * watch.n_channels, int(watch.clicks.sum()))
         n = self.watch.exposures
         rows = []
         for clicks, expected in zip(self.watch.clicks.tolist(), self.watch.expected.tolist()):
@@ -158,6 +165,7 @@ class DarkGuard:
             )
         return replace(
             report,
+            alarm=judged.alarm,
             policy=self.policy,
             findings=tuple(finding.event() for finding in self.findings),
             present=tuple(f"{finding.level}: {finding.words}" for finding in self.health.present),

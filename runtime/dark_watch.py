@@ -98,6 +98,7 @@ class ChannelWatch:
         self.dropped_alarms = 0
         high = self.expected if guard_high is None else np.clip(guard_high, self.expected, RATE_MAX)
         low = self.expected if guard_low is None else np.clip(guard_low, FLOOR_RATE, self.expected)
+        self.high = high  # up to here a rate is what was expected
         self.designs = _designs(self.expected, low, high, self.settings)
         self._tests = [name for name, _, _ in self.designs]
         self._channel_of = np.array([channel for _, channel, _ in self.designs], np.int64)

@@ -8,11 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from plans import parallel, shot_major
 
 from pans.runtime.channels import ChannelHealth, Finding
 from pans.runtime.cli import main
+from pans.runtime.dark import DarkMonitor
+from pans.runtime.dark_guard import DarkGuard
 from pans.runtime.dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
 from pans.runtime.dark_watch import ChannelWatch, WatchSettings
+from pans.runtime.errors import UsageError
+from pans.runtime.wire import ClickBlock
 
 N = 8
 
@@ -156,6 +161,54 @@ def test_prior_is_a_distribution_also_without_words() -> None:
     seen[3] = 1_000_000
     assert word_prior(seen).sum() == pytest.approx(1.0)
     assert word_prior(seen)[3] > 0.999
+
+
+# ---- what the guard takes in ----
+
+
+def test_an_afterpulse_is_no_dark_count() -> None:
+    plan = shot_major(3, 1)  # a dark slot before three patterns: right behind the last of them
+    rng = np.random.default_rng(6)
+    bits = np.zeros(4 * 20_000, np.uint8)
+    for slot in range(len(bits)):
+        p = 0.01 if slot % 4 == 0 else 0.5
+        bits[slot] = rng.random() < 1 - (1 - p) * (1 - 0.02 * bits[slot - 1])
+    found = {}
+    for afterpulses in (True, False):
+        watch = ChannelWatch(1, np.array([0.01]), WatchSettings(arl_exposures=1e7))
+        guard = DarkGuard(plan, watch, afterpulses=afterpulses)
+        events = []
+        for first in range(0, len(bits), 40):
+            if first == 4000:
+                continue  # a gap: what was before the next block is not known
+            shown = np.resize(plan.slot_pattern, 40)
+            events += guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 40]))
+        found[afterpulses] = [event["state"] for event in events]
+        report = guard.report(DarkMonitor(0.01).report(20_000, int(bits[::4].sum())))
+        assert bool(report.alarm) != afterpulses
+        behind_silence = bits[4::4][bits[3:-1:4] == 0]
+        if afterpulses:
+            assert watch.exposures == pytest.approx(len(behind_silence), abs=12)
+    assert found[True] == []
+    assert found[False]
+
+
+def test_empty_fields_as_counts() -> None:
+    watch = ChannelWatch(3, np.full(3, 0.01), WatchSettings(arl_exposures=1e7))
+    guard = DarkGuard(parallel(3, 4), watch, "warn")
+    events = []
+    for _ in range(200):
+        events += guard.take_empty(256, np.array([2, 3, 12], np.int64))
+    assert [(event["state"], event["channels"]) for event in events] == [("hot", [2])]
+    assert "channel 2" in guard.words()
+
+
+def test_tables_and_masks_need_a_table() -> None:
+    watch = ChannelWatch(1, np.array([0.01]))
+    with pytest.raises(UsageError, match="needs a bundle with a table"):
+        DarkGuard(shot_major(3, 1), watch, "tables")
+    with pytest.raises(UsageError, match="allowed: warn"):
+        DarkGuard(shot_major(3, 1), watch, "panic")
 
 
 # ---- whole runs ----
