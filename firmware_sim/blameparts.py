@@ -249,9 +249,9 @@ def hog(script_path: str) -> None:
 # ---- the canary ----
 
 
-def canary(seconds: str) -> None:
-    """Note when this core ran nothing of ours although somebody above the host was ready: the machine disturbed the experiment."""
-    os.sched_setaffinity(0, {HOST_CORE})
+def canary(seconds: str, core: str) -> None:
+    """Note when a process above the host's priority was kept from a core: the machine disturbed the experiment."""
+    os.sched_setaffinity(0, {int(core)})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(CANARY_PRIORITY))
     start_ns = _ready()
     late: list[tuple[int, int]] = []
