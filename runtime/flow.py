@@ -95,7 +95,7 @@ class FlowCore(Follower):
 
     @property
     def empty_frames(self) -> int:
-        """Light frames in which no object was found; their clicks per channel are `empty_channels`."""
+        """Light frames far from every object; their clicks per channel are `empty_channels`."""
         return int(self._state[kernels.EMPTY_FRAMES])
 
     @property

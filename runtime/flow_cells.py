@@ -43,7 +43,7 @@ class CellCore(FlowCore):
         kernels.has_two_maxima(self._counts, 0, -1, 1, 1)
 
     def _kept_frames(self) -> int:
-        return self.limits.onset_frames
+        return 2 * self.limits.longest
 
     def _settle(self, stop: int, end_tick: int) -> Output:
         rows = Rows()

@@ -23,7 +23,7 @@ import numba
     WHOLE_SINCE,
     EMPTY_FRAMES,
     DARK_FRAMES,
-    LIT_UNTIL,
+    BUSY,
     N_STATE,
 ) = range(14)
 IDLE, OPEN, BLIND = 0, 1, 2
@@ -108,12 +108,13 @@ def scan(stop, words, counts, limits, state, empty_channels, out):  # type: igno
     """Follow the click sums over exposures state[NEXT]..stop - 1, which are in the ring; return the number of passages in `out`.
 
     An onset is a sum of `W` frames of at least `ON` clicks; the release is the first sum of at most `OFF`. A passage holds its frames from
-    the first of the onset's to the last of the release's; `last` is the last frame before the quiet ones. Frames that leave
-    a window without an object are tallied in `empty_channels` int64 (d_f,). Stops early when `out` is full.
+    the first of the onset's to the last of the release's; `last` is the last frame before the quiet ones. Frames further than half the
+    longest passage from any object or gap are empty, and tallied in `empty_channels` int64 (d_f,): nearer ones see the faint edges
+    of cells. Stops early when `out` is full.
     """
     mask = len(words) - 1
     n = 0
-    width = limits[W]
+    width, guard = limits[W], max(limits[W], limits[LONGEST] // 2)
     for exposure in range(state[NEXT], stop):
         clicks = counts[exposure & mask]
         clicks = clicks if clicks > 0 else 0
@@ -121,10 +122,6 @@ def scan(stop, words, counts, limits, state, empty_channels, out):  # type: igno
         if state[SEEN] == width:
             oldest = counts[(exposure - width) & mask]
             state[SUM] -= oldest if oldest > 0 else 0
-            if state[STATE] == IDLE and oldest >= 0:
-                state[EMPTY_FRAMES] += 1
-                if oldest > 0:
-                    _tally(words[(exposure - width) & mask], empty_channels)
         else:
             state[SEEN] += 1
         if state[STATE] == OPEN:
@@ -148,6 +145,13 @@ def scan(stop, words, counts, limits, state, empty_channels, out):  # type: igno
             for back in range(width):
                 earlier = counts[(first + back) & mask]
                 state[MOMENT] += back * (earlier if earlier > 0 else 0)
+        if state[STATE] != IDLE:
+            state[BUSY] = exposure
+        empty = exposure - guard
+        if state[BUSY] < empty - guard and state[WHOLE_SINCE] <= empty - guard and counts[empty & mask] >= 0:
+            state[EMPTY_FRAMES] += 1
+            if counts[empty & mask] > 0:
+                _tally(words[empty & mask], empty_channels)
         state[NEXT] = exposure + 1
         if n == len(out):
             break

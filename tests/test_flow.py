@@ -306,11 +306,14 @@ def test_dark_frames_are_tallied_and_never_decided_on() -> None:
 
 def test_frames_without_an_object_are_tallied_per_channel() -> None:
     words = scene((500, 60, 1))
-    words[50:450:40] |= 1 << 8
+    words[20] = words[450] = words[600] = 1 << 8  # too near to the start, to the cell's light, and after it
+    words[120:440:32] |= 1 << 8
     core = make()
     feed(core, words)
     assert core.empty_channels.tolist() == [0] * 8 + [10, 0]
-    assert 900 <= core.empty_frames < 1000 - 60
+    assert core.empty_frames == (445 - 56 + 1) + (
+        944 - 620 + 1
+    )  # the onset is at 501, the release at 565, 55 frames are kept off
 
 
 def test_pulses_are_asked_for_at_a_tick_after_leaving() -> None:
