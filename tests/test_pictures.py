@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from functools import partial
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.trainer.tsne import divergence, gradient, joint_neighbours, tsne
 
@@ -58,3 +63,69 @@ def test_equal_clicks_do_not_break_the_map():
 def test_too_few_or_too_many_points_are_refused(n):
     with pytest.raises(UsageError, match="allowed for a map"):
         tsne(np.zeros((n, 2)))
+
+
+@pytest.fixture
+def short_fits(monkeypatch):
+    """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
+    pytest.importorskip("torch")
+    pytest.importorskip("matplotlib")
+    from pans.trainer import head_fit
+
+    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+
+
+def own_images(path):
+    rng = np.random.default_rng(1)
+    labels = np.arange(150) % 2
+    images = rng.integers(0, 60, (150, 5, 6), dtype=np.uint8)
+    images[labels == 1, :, 2] += 150
+    np.savez(path, images=images, labels=labels)
+    return str(path)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_a_training_leaves_its_history(tmp_path, capsys):
+    task = own_images(tmp_path / "own.npz")
+    words = ["--features", "2", "--epochs", "6", "--hidden", "8", "-o", str(tmp_path / "own.pans"), "--json"]
+    assert main(["train", task, *words, "--history", str(tmp_path / "course")]) == 0
+    course = json.loads((tmp_path / "course" / "history.json").read_text())
+    assert [(epoch["restart"], epoch["epoch"]) for epoch in course["epochs"][-6:]] == [(0, i) for i in range(1, 7)]
+    assert course["patterns_at"][-1] == 6
+    assert len(course["patterns_at"]) >= 3
+    for name in ("curves.png", "evolution.png"):
+        assert (tmp_path / "course" / name).read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "own.pans.checkpoint").exists()
+    capsys.readouterr()
+    assert (
+        main(["evaluate", str(tmp_path / "own.pans"), "--task", task, "--pictures", str(tmp_path / "seen"), "--json"])
+        == 0
+    )
+    drawn = json.loads(capsys.readouterr().out)["pictures"]
+    assert {path.name for path in map(Path, drawn)} == {"patterns.png", "confusion.png"}  # too few objects for a map
+    assert all(Path(path).read_bytes().startswith(b"\x89PNG") for path in drawn)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_more_weight_on_light_means_less_light(tmp_path):
+    from pans.trainer.alpha_sweep import main as sweep
+
+    task = own_images(tmp_path / "own.npz")
+    words = [
+        task,
+        "--features",
+        "2",
+        "--epochs",
+        "15",
+        "--hidden",
+        "8",
+        "--alphas",
+        "1e-4",
+        "0.3",
+        "-o",
+        str(tmp_path / "sweep"),
+    ]
+    assert sweep(words) == 0
+    rows = json.loads((tmp_path / "sweep" / "alpha.json").read_text())["rows"]
+    assert rows[1]["illumination"] < rows[0]["illumination"]
+    assert {"alpha.png", "curves.png", "alpha-0.0001.pans"} <= {path.name for path in (tmp_path / "sweep").iterdir()}

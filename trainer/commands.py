@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pans.runtime.profile import Profile
 
     from .evaluate import Measured, MeasuredPictures
+    from .history import History
     from .options import Options
     from .tasks import Task
     from .train import EpochReport, Trained
@@ -116,6 +117,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         "--dark", type=float, metavar="R", help="dark photoelectrons per exposure in training, instead of the profile's"
     )
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
+    parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
     parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
@@ -141,14 +143,25 @@ def _train(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     started = time.perf_counter()
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
+    history = _history(args, options, checkpoint, task)
     try:
-        with _progress(options) as report:
+        with _progress(options) as show:
+
+            def report(epoch: EpochReport) -> None:
+                show(epoch)
+                if history is not None:
+                    history.take(epoch)
+
             trained = train(task, profile, options, checkpoint=checkpoint, resume=args.resume, report=report)
     except KeyboardInterrupt:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
     exported, measured = _export_andmeasure(args, task, profile, trained, time.perf_counter() - started)
     checkpoint.unlink(missing_ok=True)
+    if history is not None:
+        shown = trained.quantised.patterns() if trained.quantised else None
+        for path in history.write(args.history, shown, task.image_shape):
+            say(f"wrote {path}")
     seconds = time.perf_counter() - started
     payload = {
         "bundle": str(args.out),
@@ -166,6 +179,21 @@ def _train(args: argparse.Namespace) -> int:
     }
     emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{lines(measured)}")
     return EXIT_FINE
+
+
+def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task: Task) -> History | None:
+    """What keeps the course of the training, if it is wanted; matplotlib is asked for before the training, not after it."""
+    if args.history is None:
+        return None
+    try:
+        import matplotlib  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            "--history needs the package matplotlib, which is not installed", remedy="pip install 'pans-runtime[plot]'"
+        ) from error
+    from .history import History
+
+    return History(checkpoint, options, task.sha256)
 
 
 def _options(args: argparse.Namespace, task: Task) -> Options:
