@@ -23,12 +23,15 @@ from .bench_c import FLAGS, FREE_FLAGS, CLoops, c_loops
 from .bundle import Bundle, load_bundle
 from .decide import make_decider
 from .decide_mlp import ReferenceDecider, SparseDecider
+from .decide_picture import PictureDecider
 from .decide_table import CountTableDecider, TableDecider
 from .errors import UsageError
+from .head_layers import read_layers, reference_scores
 from .sliding import SlidingCounts, SlidingScores, SlidingTable, log_evidence
 from .verdict import Decider
 
 BATCH = 20_000
+PICTURES = 2_000
 SINGLE_CALLS = 20_000
 STREAM_REPEATS = 15
 CACHED_WORDS, MEMORY_WORDS = 1 << 15, 1 << 24  # 64 kB of 16-bit words, as a block of a stream; 32 to 128 MB
@@ -42,6 +45,9 @@ def bench_decide(options: BenchOptions) -> list[Row]:
     for number, path in enumerate(paths):
         bundle, _ = load_bundle(path)
         inputs = options.inputs[number] if number < len(options.inputs) else None
+        if bundle.picture_shape is not None:
+            rows.append(_picture_row(bundle, PICTURES // 10 if options.quick else PICTURES))
+            continue
         rows += _bundle_rows(bundle, inputs, BATCH // 10 if options.quick else BATCH)
         if bundle.table is not None:
             rows += _stream_rows(bundle) + _window_rows(bundle)
@@ -64,6 +70,23 @@ def _bundle_rows(bundle: Bundle, inputs: Path | None, n: int) -> list[Row]:
         rows += _limits(bundle, counts, shots, wanted)
     mark_pareto(rows, "ns", "score_error")
     return rows
+
+
+def _picture_row(bundle: Bundle, n: int) -> Row:
+    """A head that gives back pictures: time for one, alone and in a batch, and the largest error of a pixel against float64."""
+    decider = PictureDecider(bundle)
+    counts = np.random.default_rng(1).integers(0, 2, (n, bundle.n_features))
+    pixels = decider.scores_batch(counts, 1)
+    row: Row = {
+        "name": f"{bundle.name} picture of {pixels.shape[1]} pixels, {decider.name}",
+        **per_item_ns(cpu_time(lambda: decider.scores_batch(counts, 1)), n),
+        **latencies_us(lambda one: decider.decide(one, 1), list(counts)),
+        "checksum": round(float(pixels.sum(dtype=np.float64)), 3),
+    }
+    chain = read_layers(bundle.head_onnx or b"", bundle.n_features, bundle.n_outputs)
+    if chain is None:
+        return row | {"score_error": "no float64 reference: the head is no plain chain of layers"}
+    return row | {"score_error": float(np.abs(pixels - reference_scores(chain, counts.astype(np.float64))).max())}
 
 
 def _inputs(bundle: Bundle, path: Path | None, n: int) -> tuple[NDArray[np.int64], int, NDArray[np.int64] | None]:

@@ -29,12 +29,14 @@ from .loop import Onlookers, RunConfig, run_live
 from .plan import build_plan
 from .profile import Profile, load_profile, parse_profile
 from .record import Recorder
+from .recovery import Recovery
 
 SLOTS_US = (1000.0, 100.0)
 DEADLINE_US = 10_000.0
 BUSY_PROCESSES = 2
 BUSY = "while True: sum(range(10000))"
 SAMPLE_EVERY_S = 0.5
+RECOVER_S = 30.0
 
 
 def bench_loop(options: BenchOptions) -> list[Row]:
@@ -66,7 +68,10 @@ def _run(bundle: Bundle, slot_us: float, realtime: bool, seconds: float, load: b
         started, load_before = time.process_time(), os.getloadavg()[0]
         waits = _Waits(_children() - others)
         with Recorder(Path(folder) / "loop.pansrec", {"simulated": True}) as recorder:
-            result = run_live(link, profile, bundle, plan, core, config, recorder, onlookers=Onlookers(waits.watch))
+            recovery = Recovery.of(
+                link, link.name, RECOVER_S
+            )  # starved for a whole lease, the host finds its instrument dark
+            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, Onlookers(waits.watch))
             recorder.close({})
         cpu_s = time.process_time() - started
     latency = result.timing.total.summary()
@@ -79,7 +84,9 @@ def _run(bundle: Bundle, slot_us: float, realtime: bool, seconds: float, load: b
         "decisions": result.tally.decisions,
         "late": result.timing.late,
         "blame": dict(result.timing.blame),
+        "late_cause": dict(result.late_cause),
         "lost": result.stream["lost_exposures"],
+        "reconnects": result.reconnects,
         "seconds": round(result.seconds, 1),
         "cpu_s": round(cpu_s, 2),
         **waits.figures(),

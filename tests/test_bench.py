@@ -6,13 +6,14 @@ import json
 
 import numpy as np
 import pytest
-from heads import head_bundle, random_layers
+from heads import head_bundle, onnx_chain, random_layers
 
 from pans.runtime import bench_decide, bench_ingest
 from pans.runtime.bench import BenchOptions, Spent, machine_facts, mark_pareto, percentiles_us, repeated, table_text
 from pans.runtime.bench_alone import alone_row
 from pans.runtime.bench_c import FREE_FLAGS, CLoops, c_loops
 from pans.runtime.bench_decide import _bundle_rows
+from pans.runtime.bundle import make_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
 from pans.runtime.decide_mlp import SparseDecider
@@ -87,6 +88,26 @@ def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch
     assert 0 < rows["chain int8"]["score_error"] < 0.2
     assert rows["chain float64"]["score_error"] < 1e-5
     assert any(row.get("pareto") for row in rows.values())
+
+
+def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
+    layers = random_layers([6, 16, 12])
+    bundle = make_bundle(
+        name="chain",
+        task="pictures",
+        classes=(),
+        image_shape=(1, 6),
+        levels=2,
+        pattern_levels=np.eye(6, dtype=np.uint16),
+        photons_per_level=1.0,
+        head_onnx=onnx_chain(layers),
+        provenance={},
+        picture_shape=(3, 4),
+    )
+    row = bench_decide._picture_row(bundle, 50)
+    assert row["name"] == "chain picture of 12 pixels, onnx"
+    assert 0 < row["score_error"] < 1e-5
 
 
 def test_streams_have_the_frames_and_zeros_they_promise() -> None:
