@@ -12,6 +12,7 @@ from typing import Any
 from .calibrate import CountModel, Counts, fit_light, fit_spread
 from .calibration import now_utc
 from .calibration_run import Design, joined_counts, plan_facts, profile_level
+from .errors import UsageError
 from .intervals import jeffreys_interval
 from .profile import Profile
 
@@ -22,6 +23,11 @@ def calibration_values(parts: Sequence[Counts], model: CountModel, design: Desig
     """Return what a calibration file says of the counts `parts` (one for each channel), but for device, seed and command."""
     together = joined_counts(parts)
     fit = fit_light(together, model)
+    if not 0 < fit.level.value < math.inf:
+        raise UsageError(
+            f"{'no' if fit.level.value <= 0 else 'every'} exposure with light clicked: nothing bounds the photon level on both sides",
+            remedy="check the light path; the brightness may have changed since the first stage",
+        )
     spread = fit_spread(together, model, fit.level.value, fit.dark.value)
     uniform = spread.p_value >= PATTERNS_DIFFER or spread.patterns < 3
     scale = (1.0, fit.level.low / fit.level.value, fit.level.high / fit.level.value) if uniform else spread.mean

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from .cmd_run import profile_of
 from .errors import LinkError, UsageError
 from .profile import Profile, load_profile
 
@@ -51,7 +52,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 
     if not 0.5 <= args.seconds <= 86_400:
         raise UsageError(f"--seconds must be from 0.5 to 86400, found {args.seconds:g}")
-    profile = load_profile(args.profile or _profile_of(args.device))
+    profile = load_profile(args.profile or profile_of(args.device))
     exposure_us = calibration_exposure_us(profile)
     model, guess = count_model(profile, exposure_us), profile_level(profile, exposure_us)
     first = design_run(profile, LADDER, guess, FIRST_STAGE_SHARE * args.seconds, args.seed)
@@ -92,12 +93,6 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
     keep = ("serial", "firmware", "name", "simulated")
     return core, {key: result.device[key] for key in keep if key in result.device}
-
-
-def _profile_of(device: str) -> str:
-    if device.startswith("sim:"):
-        return device[4:].partition("?")[0]
-    raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
 
 
 def _words(path: Path, values: dict[str, Any]) -> str:

@@ -122,7 +122,7 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    profile = args.profile or _profile_of(args.device)
+    profile = args.profile or profile_of(args.device)
     out = args.out or (args.record.parent if args.record else Path("pans-run"))
     return _execute(args, _job(args, args.bundle, args.device, profile, out, args.decisions, args.record))
 
@@ -171,7 +171,7 @@ def _job(
     )
 
 
-def _profile_of(device: str) -> str:
+def profile_of(device: str) -> str:
     """A `sim:PROFILE?...` URL names its profile; a real instrument's must be given."""
     if device.startswith("sim:"):
         return device[4:].partition("?")[0]
