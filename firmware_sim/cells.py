@@ -94,7 +94,7 @@ class CellFlow:
         self._forget(float(begins[0]) - self._longest_half)
         row_of = np.empty(count, np.int64)
         rows = np.empty((count + 2, self._table.sums.shape[3]))
-        used = _fill(begins, lit, float(self._exposures.exposure_ticks), *self._known, *self._table, row_of, rows)
+        used = _fill(begins, lit, float(self._exposures.exposure_ticks), self._known, self._table, row_of, rows)
         return rows[:used], row_of
 
     def _forget(self, before_ticks: float) -> None:
@@ -133,7 +133,7 @@ class CellFlow:
         half = np.clip(gone - centred, 1, MAX_HALF_EXPOSURES)
         begins = exposures.begins_of(centred)
         photons = np.empty(len(begins))
-        _alone(begins, float(exposures.exposure_ticks), *arrivals, *self._table, photons)
+        _alone(begins, float(exposures.exposure_ticks), arrivals, self._table, photons)
         if self._changes:
             photons *= self._changes.efficiency(exposures.seconds(begins))
         truths = self._cells.objects.labels[arrivals.images]
@@ -147,10 +147,10 @@ class CellFlow:
 def warm_up() -> None:
     """Compile or load the kernels of this module."""
     ints, floats, rows = np.zeros(1, np.int64), np.ones(1), np.zeros((3, 1))
-    cell = (floats, floats, ints, ints)
-    table = (np.zeros((1, 1, 3, 1), np.uint32), np.zeros((1, 3, 1)), 1.0, 1.0, floats, floats)
-    _fill(ints, np.ones(1, np.bool_), 1.0, *cell, *table, ints.copy(), rows)
-    _alone(ints, 1.0, *cell, *table, floats.copy())
+    one = Arrivals(floats, floats, ints, ints)
+    table = ShiftTable(np.zeros((1, 1, 3, 1), np.uint32), np.zeros((1, 3, 1)), 1.0, 1.0, floats, floats)
+    _fill(ints, np.ones(1, np.bool_), 1.0, one, table, ints.copy(), rows)
+    _alone(ints, 1.0, one, table, floats.copy())
 
 
 @njit(cache=True, nogil=True)
@@ -184,64 +184,54 @@ def _add(begin, exposure, centre, speed, sums, behind, scale_step, scale_open, r
 
 
 @njit(cache=True, nogil=True)
-def _fill(  # type: ignore[no-untyped-def]
-    begins,
-    lit,
-    exposure,
-    centres,
-    speeds,
-    images,
-    offsets,
-    sums,
-    behind,
-    scale_step,
-    scale_open,
-    empty,
-    full,
-    row_of,
-    rows,
-):
+def _fill(begins, lit, exposure, arrivals, table, row_of, rows):  # type: ignore[no-untyped-def]
     """Rows of light: 0 is a dark exposure, 1 the empty field, then one for each exposure with a cell in the field; return how many."""
     rows[0, :] = 0.0
-    rows[1, :] = empty
+    rows[1, :] = table.empty
     used = 2
     for t in range(begins.size):
         row_of[t] = 1 if lit[t] else 0
-    width = sums.shape[2] // 2
-    for n in range(centres.size):
-        half = width / speeds[n]
-        first = np.searchsorted(begins, centres[n] - half - exposure)
-        t = first
-        while t < begins.size and begins[t] < centres[n] + half:
+    width = table.sums.shape[2] // 2
+    for n in range(arrivals.centre_ticks.size):
+        centre, speed = arrivals.centre_ticks[n], arrivals.speed_px[n]
+        sums, behind = table.sums[arrivals.images[n], arrivals.offsets[n]], table.open_levels[arrivals.offsets[n]]
+        half = width / speed
+        t = np.searchsorted(begins, centre - half - exposure)
+        while t < begins.size and begins[t] < centre + half:
             if lit[t]:
                 if row_of[t] == 1:
                     row_of[t] = used
-                    rows[used, :] = empty
+                    rows[used, :] = table.empty
                     used += 1
+                row = rows[row_of[t]]
                 _add(
-                    np.float64(begins[t]), exposure, centres[n], speeds[n], sums[images[n], offsets[n]], behind[offsets[n]],
-                    scale_step, scale_open, rows[row_of[t]],
-                )  # fmt: skip
+                    np.float64(begins[t]),
+                    exposure,
+                    centre,
+                    speed,
+                    sums,
+                    behind,
+                    table.scale_step,
+                    table.scale_open,
+                    row,
+                )
             t += 1
     for k in range(2, used):
-        for c in range(full.size):
-            rows[k, c] = min(max(rows[k, c], 0.0), full[c])
+        for c in range(table.full.size):
+            rows[k, c] = min(max(rows[k, c], 0.0), table.full[c])
     return used
 
 
 @njit(cache=True, nogil=True)
-def _alone(  # type: ignore[no-untyped-def]
-    begins, exposure, centres, speeds, images, offsets, sums, behind, scale_step, scale_open, empty, full, out
-):
+def _alone(begins, exposure, arrivals, table, out):  # type: ignore[no-untyped-def]
     """Photoelectrons of all channels in exposure n with arrival n alone in the field: out float64 (n,)."""
-    row = np.empty(empty.size)
-    for n in range(centres.size):
-        row[:] = empty
-        _add(
-            np.float64(begins[n]), exposure, centres[n], speeds[n], sums[images[n], offsets[n]], behind[offsets[n]],
-            scale_step, scale_open, row,
-        )  # fmt: skip
+    row = np.empty(table.empty.size)
+    for n in range(arrivals.centre_ticks.size):
+        row[:] = table.empty
+        centre, speed = arrivals.centre_ticks[n], arrivals.speed_px[n]
+        sums, behind = table.sums[arrivals.images[n], arrivals.offsets[n]], table.open_levels[arrivals.offsets[n]]
+        _add(np.float64(begins[n]), exposure, centre, speed, sums, behind, table.scale_step, table.scale_open, row)
         total = 0.0
         for c in range(row.size):
-            total += min(max(row[c], 0.0), full[c])
+            total += min(max(row[c], 0.0), table.full[c])
         out[n] = total
