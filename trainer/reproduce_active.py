@@ -51,7 +51,7 @@ def recipe(name: str, row: ActiveRow) -> Options:
         return local
     if row.features == 36:
         return replace(local, epochs=44, alpha=1e-5)
-    return replace(local, epochs=60, alpha=1e-5)
+    return replace(local, epochs=36, hidden=128, alpha=1e-5)
 
 
 def row_files(cache: Path, name: str, features: int) -> tuple[Path, Path]:
