@@ -11,25 +11,25 @@ from typing import Any
 from .figures import new_figure, save_figure
 from .paper_tables import FIRST_OBJECTS
 
-AXES = {
-    "K": ("shots K", "log"),
-    "eta": ("light, times the trained", "log"),
-    "dark": ("dark counts of an exposure", "log"),
+AXES = {  # sweep: label, where the legend leaves the curves free
+    "K": ("shots K", "lower right"),
+    "eta": ("light, times the trained", "lower center"),
+    "dark": ("dark counts of an exposure", "lower left"),
 }
 
 
 def sweeps(path: Path, rows: list[dict[str, Any]]) -> None:
     """Draw accuracy over shots, light and dark counts, of the first 200 and of all test images."""
     figure, panels = new_figure(width=13.0, panels=3)
-    for axis, (sweep, (label, scale)) in zip(panels, AXES.items()):
+    for axis, (sweep, (label, free)) in zip(panels, AXES.items()):
         mine = [row for row in rows if row["sweep"] == sweep]
         x = [row["setting"] for row in mine]
         for part, words in ((f"first_{FIRST_OBJECTS}", f"first {FIRST_OBJECTS}"), ("all", "all 10 000")):
             y = [100 * row[part]["accuracy_mean"] for row in mine]
             axis.errorbar(x, y, [100 * row[part]["accuracy_std"] for row in mine], fmt="o-", ms=3, label=words)
-        axis.set(xlabel=label, xscale=scale, ylabel="accuracy, %")
+        axis.set(xlabel=label, xscale="log", ylabel="accuracy, %")
         axis.grid(alpha=0.3)
-        axis.legend()
+        axis.legend(loc=free)
     figure.suptitle("shipped bundle, FashionMNIST, d_f = 10; bars: spread of one trial (SIMULATED)", fontsize=10)
     save_figure(figure, path)
 
