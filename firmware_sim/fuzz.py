@@ -98,24 +98,31 @@ class Fuzzer:
         self._profile = load_profile("ideal")
         self._scene: Scene = load_scene("uniform")
         self._command_id = 0
+        self._decoder, self._compiled = wire.FrameDecoder(), wire.FrameDecoder()
+        self._compiled.use_kernels()
         self._fresh_device()
         self._fresh_host()
 
     def random_bytes(self, size: int) -> None:
         """Throw `size` bytes at the decoder, the instrument and the host, in pieces of all sizes."""
         data = self._strange_bytes(size)
-        decoder = wire.FrameDecoder()
+        decoder, compiled = self._decoder, self._compiled
         position = 0
         while position < len(data):
             piece = data[position : position + self._dice.choice((1, 3, 64, 1000, 1 << 16))]
             position += len(piece)
-            self.counts.frames_decoded += len(decoder.feed(piece))
+            found = decoder.feed(piece)
+            if compiled.feed(piece) != found:
+                raise LimitBroken("the compiled decoder and the plain one disagree")
+            self.counts.frames_decoded += len(found)
             self._device_takes(piece)
             self._host_takes(piece)
-        if decoder.counters.bytes_in != len(data):
-            raise LimitBroken(f"the decoder counted {decoder.counters.bytes_in} of {len(data)} bytes")
         self.counts.bytes += len(data)
+        if decoder.counters.bytes_in != self.counts.bytes:
+            raise LimitBroken(f"the decoder counted {decoder.counters.bytes_in} of {self.counts.bytes} bytes")
         self._check_limits(decoder)
+        if (compiled.counters, compiled.held_bytes) != (decoder.counters, decoder.held_bytes):
+            raise LimitBroken(f"the decoders counted {decoder.counters} and, compiled, {compiled.counters}")
 
     def structured_frames(self, count: int) -> None:
         """Throw `count` frames with a right CRC at the instrument and at the host, and what the instrument answers at the host."""
@@ -144,6 +151,7 @@ class Fuzzer:
         self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
         self._core.begin(0, 0)
         self._host_decoder = wire.FrameDecoder()
+        self._host_decoder.use_kernels()
         self._host_ns = 0
 
     def _device_takes(self, data: bytes) -> None:
@@ -184,8 +192,8 @@ class Fuzzer:
 
     def _check_limits(self, decoder: wire.FrameDecoder) -> None:
         for name, one in (("decoder", decoder), ("instrument", self._device.decoder), ("host", self._host_decoder)):
-            if len(one._buffer) > wire.MAX_FRAME_BYTES:
-                raise LimitBroken(f"the {name} holds {len(one._buffer)} bytes, allowed {wire.MAX_FRAME_BYTES}")
+            if one.held_bytes > wire.MAX_FRAME_BYTES:
+                raise LimitBroken(f"the {name} holds {one.held_bytes} bytes, allowed {wire.MAX_FRAME_BYTES}")
         device = self._device
         if len(device.gates.pulses) > MAX_KEPT_PULSES or len(device.stream._held) > device.stream.capacity:
             raise LimitBroken("the instrument remembers more than its limits allow")

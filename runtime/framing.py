@@ -119,6 +119,11 @@ class FrameDecoder:
         """What has been seen since the decoder was made."""
         return self._counters if self._bulk is None else self._bulk.counters
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of a frame whose delimiter has not come yet."""
+        return len(self._buffer) if self._bulk is None else self._bulk.held_bytes
+
     def use_kernels(self) -> None:
         """Decode in compiled kernels from here on: before arming, since loading them takes time and Python's loops would show."""
         if self._bulk is None:

@@ -46,6 +46,11 @@ class BulkDecoder:
             bytes_discarded=tally[kernels.DISCARDED],
         )
 
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of a frame whose delimiter has not come yet."""
+        return int(self._tally[kernels.HELD])
+
     def bodies(self, data: bytes | bytearray | memoryview | U8) -> Iterator[I64]:
         """Yield, chunk by chunk, the spans (n, 2) of header + payload in `buffer`, valid until the next chunk.
 

@@ -122,7 +122,7 @@ class AnyHost(RuleBasedStateMachine):
     @invariant()
     def memory_is_bounded(self) -> None:
         assert len(self.device.stream._held) <= 4
-        assert len(self.device.decoder._buffer) <= wire.MAX_FRAME_BYTES
+        assert self.device.decoder.held_bytes <= wire.MAX_FRAME_BYTES
 
 
 AnyHost.TestCase.settings = settings(max_examples=40, stateful_step_count=30, deadline=None)
