@@ -55,10 +55,11 @@ def main() -> None:
         begin += n
     for finding in found:
         where = "" if len(finding.channels) == CHANNELS else f" {finding.channels[0]}"
-        axes.annotate(
-            f"{finding.kind}{where}", (finding.exposure, 1.0), (finding.exposure + (700 if finding.kind == "over" else -300), 1.1), ha="center", fontsize=9,
-            color="tab:green" if finding.kind == "over" else "tab:red", arrowprops={"arrowstyle": "-"},
-        )  # fmt: skip
+        over = finding.kind == "over"
+        words, colour = f"{finding.kind}{where}", "tab:green" if over else "tab:red"
+        beside = (finding.exposure + (700 if over else -300), 1.1)
+        arrow = {"arrowstyle": "-"}
+        axes.annotate(words, (finding.exposure, 1.0), beside, ha="center", fontsize=9, color=colour, arrowprops=arrow)
     axes.set(xlabel="dark exposures", ylabel="sum / threshold", ylim=(0, 1.42), xlim=(0, begin))
     axes.set_title(
         f"SIMULATED: {CHANNELS} channels at {RATE} clicks per dark exposure; grey: the other tests", fontsize=10
