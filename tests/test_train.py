@@ -17,6 +17,7 @@ from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import load_profile
 from pans.trainer.detection import click_probability as torch_probability
 from pans.trainer.detection import sample_clicks
+from pans.trainer.device import computing_on
 from pans.trainer.estimators import cross_entropy, decision_loss
 from pans.trainer.evaluate import evaluate_exactly, light_of
 from pans.trainer.head_fit import fit_head_exactly, joint_distribution
@@ -295,6 +296,29 @@ def test_commands_say_what_is_wrong(tmp_path, capsys, monkeypatch):
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {row["state"] for row in rows} == {"missing"}
     assert main(["data", "fetch", "nonsense", "--data-dir", str(tmp_path)]) == 2
+
+
+def test_a_device_that_is_not_there_is_refused_by_name(task, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    images, labels = bars(60)
+    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
+    words = ["train", str(tmp_path / "bars.npz"), "--features", "4", "-o", str(tmp_path / "x.pans"), "--device", "cuda"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "no CUDA device" in said
+    assert "--device cpu" in said
+    assert not (tmp_path / "x.pans").exists()
+
+
+@pytest.mark.parametrize("name", ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
+def test_the_same_seed_gives_the_same_patterns_on_one_device(task, name):
+    options = replace(SMALL, epochs=2)
+    with computing_on(name):
+        first, second = (train(task, PROFILE, options) for _ in range(2))
+    assert np.array_equal(first.quantised.levels, second.quantised.levels)
+    assert torch.equal(first.head.hidden.weight, second.head.hidden.weight)
+    assert first.head.hidden.weight.device.type == "cpu"
+    assert torch.get_default_device().type == "cpu"
 
 
 def vars_of(options):

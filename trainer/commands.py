@@ -118,6 +118,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
     parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="where to compute (default cpu); changes the random numbers",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
@@ -128,6 +134,7 @@ def _train(args: argparse.Namespace) -> int:
     torch = _torch()
     from pans.runtime.profile import load_profile
 
+    from .device import computing_on
     from .options import check_options
     from .tasks import load_task
     from .train import train
@@ -145,7 +152,7 @@ def _train(args: argparse.Namespace) -> int:
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
     history = _history(args, options, checkpoint, task)
     try:
-        with _progress(options) as show:
+        with _progress(options) as show, computing_on(args.device):
 
             def report(epoch: EpochReport) -> None:
                 show(epoch)
@@ -156,7 +163,7 @@ def _train(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
-    exported, measured = _export_andmeasure(args, task, profile, trained, time.perf_counter() - started)
+    exported, measured = _export_and_measure(args, task, profile, trained, time.perf_counter() - started)
     checkpoint.unlink(missing_ok=True)
     if history is not None:
         shown = trained.quantised.patterns() if trained.quantised else None
@@ -227,13 +234,13 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     )
 
 
-def _export_andmeasure(
+def _export_and_measure(
     args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float
 ) -> tuple[Any, Measured | MeasuredPictures]:
     from .export import export_trained
     from .tasks import task_names
 
-    known = asdict(trained.options) | {"threads": args.threads}
+    known = asdict(trained.options) | {"threads": args.threads, "device": args.device}
     provenance = {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,
         "data_seed": args.data_seed,

@@ -28,6 +28,7 @@ from pans.runtime.profile import Profile
 from . import schedule
 from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
+from .device import new_generator
 from .encoders import ActiveIllumination, Encoder, new_encoder
 from .estimators import ESTIMATORS, LossOf, cross_entropy, squared_error
 from .field_basis import in_pixels
@@ -134,7 +135,7 @@ class Run:
     ) -> None:
         self.own_law = law
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
-        self.random = torch.Generator().manual_seed(options.seed + restart)
+        self.random = new_generator(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
         self.head = new_head(options, data.n_outputs, data.image_shape, self.random)
         self.epoch = 0
@@ -233,7 +234,7 @@ class Run:
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
         target = self.data.target[self.data.n_fit :]
         loss_of = schedule.loss_at(self.options, self.epoch, is_image=self.data.is_image)
-        random = torch.Generator().manual_seed(self.options.seed)
+        random = new_generator(self.options.seed)
         self.head.eval()
         with torch.no_grad():
             if self.options.features <= EXACT_FEATURES_MAX and not self.data.is_image:
@@ -248,7 +249,7 @@ class Run:
         if isinstance(self.encoder, ActiveIllumination):
             self.encoder.lower_top()
             with torch.no_grad():
-                floats = (self.encoder.weight**2).numpy().copy()
+                floats = (self.encoder.weight**2).cpu().numpy().copy()
             quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
         p = self.probabilities(0, len(self.data.labels))
         fit_head(
@@ -263,7 +264,9 @@ class Run:
             batch=self.options.batch,
             rate=self.options.head_rate,
         )
-        mean, law = p.mean(dim=0), self.law()
+        mean, law = p.mean(dim=0).cpu(), self.law()
+        self.encoder.cpu()  # what follows is export and judgement
+        self.head.cpu()
         return Trained(quantised, floats, self.encoder, self.head, mean, law, min(losses), losses, self.options)
 
     # ---- checkpoints ----

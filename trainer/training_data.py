@@ -15,6 +15,7 @@ from pans.runtime.clicks import object_transmission
 from pans.runtime.incident import incident_field, incident_intensity
 from pans.runtime.profile import Profile
 
+from .device import here
 from .options import Options
 from .shifts import shifted
 from .tasks import Objects, Task
@@ -44,6 +45,7 @@ class TrainingData:
             self.target, self.n_outputs = torch.from_numpy(flat.astype("float32") / 255), flat.shape[1]
         else:
             self.target, self.n_outputs = self.labels, len(task.classes)
+        self.shown, self.labels, self.target = here(self.shown), here(self.labels), here(self.target)
         self.n_fit = len(self.labels) - max(1, len(self.labels) // VALIDATION_PART)
 
 

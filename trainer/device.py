@@ -1,0 +1,47 @@
+"""Where a training computes: on the processor, or on a CUDA device, by the same code.
+
+Owns the choice and its check; never moves data by itself: whatever torch makes while a device is chosen, is made there. The same seed
+gives the same result on one device and one version of torch; devices draw other random numbers, so that results differ between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from pans.runtime.errors import UsageError
+
+DEVICES = ("cpu", "cuda")
+
+
+@contextmanager
+def computing_on(name: str) -> Iterator[None]:
+    """Let torch make its tensors on `name` (cpu or cuda) meanwhile; UsageError for a device that is not there."""
+    if name not in DEVICES:
+        raise UsageError(f"--device is {name!r}, allowed: {', '.join(DEVICES)}")
+    if name == "cuda" and not torch.cuda.is_available():
+        built = torch.version.cuda
+        raise UsageError(
+            "--device cuda: no CUDA device can be used here"
+            + (" (this torch was built without CUDA)" if built is None else f" (torch was built for CUDA {built})"),
+            remedy="use --device cpu, or install a torch with CUDA on a machine with such a device",
+        )
+    before = torch.get_default_device()
+    torch.set_default_device(name)
+    try:
+        yield
+    finally:
+        torch.set_default_device(before)
+
+
+def here(tensor: Tensor) -> Tensor:
+    """Return `tensor` on the chosen device: what comes from numpy never is."""
+    return tensor.to(torch.get_default_device())
+
+
+def new_generator(seed: int) -> torch.Generator:
+    """Return a generator of random numbers on the chosen device."""
+    return torch.Generator(device=torch.get_default_device()).manual_seed(seed)
