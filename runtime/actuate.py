@@ -71,10 +71,10 @@ class GateDesk:
         while len(self._waiting) > MAX_WAITING:
             self._expire(self._waiting.popleft(), "too many pulses wait")
 
-    def turn(self, session: HostSession, clock: ClockModel, now_ns: int) -> None:
-        """Note what the device has answered and send what there is room for."""
+    def turn(self, session: HostSession, clock: ClockModel, now_ns: int) -> bool:
+        """Note what the device has answered and submit what there is room for; return whether there is something to send at once."""
         if not self._waiting and not self._sent:
-            return
+            return False
         self._collect(session)
         now_tick = clock.to_tick(now_ns)
         first = True
@@ -85,11 +85,12 @@ class GateDesk:
                 self._expire(self._waiting.popleft(), f"its time passed {late_us:.0f} us before it could be sent")
                 continue
             if self.actuator is None and session.in_flight >= COMMAND_WINDOW - FREE_COMMANDS:
-                return
+                break
             if first and self._recorder is not None:
                 self._recorder.flush()
             first = False
             self._do(self._waiting.popleft(), session, clock)
+        return not first
 
     def finish(self, session: HostSession) -> None:
         """The run is over: what was answered counts, what waits expires, what has no answer was refused as far as is known."""

@@ -186,7 +186,9 @@ class LiveRun:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
         outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
-        self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns)
+        if self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns):
+            self.connection.session.poll(now_ns)
+            self.connection.flush()  # a pulse does not wait for the rest of the turn
         self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
         self.journal.refusals(self.connection)
         if watch is not None:
