@@ -98,7 +98,7 @@ def click_list(recording: Recording, plan: Plan) -> ClickList:
         for column, values in zip(
             columns, (item.start_tick[row], item.first + row, same[0], channels, item.pattern[row], same[1])
         ):
-            column.append(values.astype(np.int64))
+            column.append(np.asarray(values, np.int64))
         first_tick = first_tick if exposures else int(item.start_tick[0])
         last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
         exposures += len(item.clicks)
