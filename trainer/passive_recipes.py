@@ -56,7 +56,11 @@ def recipe(name: str, row: PassiveRow, dark: float, *, conserving: bool = False)
         )
         if name != "fiber":
             return field
-        return replace(field, clicks=CLICKS_AIM_FIBER * row.clicks, epochs=60 if row.features <= 3 else 30)
+        fiber = replace(field, clicks=CLICKS_AIM_FIBER * row.clicks)
+        if row.features > 3:
+            return fiber
+        # few detectors: many starts end where one does it all, and saturated ones cannot be dimmed by their clicks
+        return replace(fiber, epochs=60, restarts=3, front_rate=5e-3, photons=15 * row.clicks)
     exact = row.features <= EXACT_FEATURES_MAX
     aim = CLICKS_AIM_MMF if name == "mmf-mnist" else CLICKS_AIM
     return replace(

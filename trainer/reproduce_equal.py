@@ -134,11 +134,15 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         "",
         *_says(rows),
         "",
-        "The images are drawn by our generators (docs/TASKS.md), which were set with the paper's accuracies in view. A passive W "
-        "is unconstrained, as in the paper: it may dim a "
-        "bright background by interference before anything is detected, and amplify what is left. Counted by the light that "
-        "*reaches* the instrument, a passive PANS would "
-        "stand worse, and an energy-conserving one needs more of it. The network is small and trained for minutes: a lower bound.",
+        "The images are drawn by our generators (docs/TASKS.md), which were set with the paper's accuracies in view. **Equal "
+        "photons are equal photons detected, "
+        "not equal light.** A passive W is unconstrained, as in the paper: it dims a bright background by interference before "
+        "anything is detected, and may amplify "
+        "what is left. An event changes the power of a transient frame by 1 % (median), so that for each photon of it that is "
+        "detected some hundred must reach "
+        "the instrument: at equal light PANS stands against direct imaging of hundreds of photons or more, which is not measured "
+        "here. The network is small and "
+        "trained for minutes: a lower bound.",
         "",
     ]
     return "\n".join(lines)
