@@ -46,7 +46,7 @@ def information(path: Path, rows: list[dict[str, Any]]) -> None:
         right.plot(x, [row["fisher"]["discriminant"] for row in mine], "o-", color=f"C{i}", label=way)
     left.axhline(3.3219, color="grey", lw=0.8, ls=":")
     left.set(ylabel="bits of the label, at least", ylim=(0, 3.5))
-    middle.set(ylabel="Fisher: tr(S_b) / tr(S_w)", yscale="log")
+    middle.set(ylabel="Fisher: tr(S_b) / tr(S_w)", yscale="log", ylim=(1e-4, 3))
     right.set(ylabel="Fisher: tr(S_w^-1 S_b)")
     for axis in (left, middle, right):
         axis.set(xlabel="photons per decision", xscale="log")

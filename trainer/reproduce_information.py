@@ -98,7 +98,8 @@ def markdown(rows: list[dict[str, Any]], bundle: str) -> str:
         f"60 000 training objects (floor {FLOOR:g}), {FRAMES} test images (the first ones); Fisher's ratios of {FISHER_OBJECTS} "
         "training objects. "
         "Click words: the ten patterns of "
-        f"`{bundle}`, all light scaled to the photons of the row, all 10 000 test images, posterior table of the training objects. "
+        f"`{bundle}`, all light scaled to the photons of the row (the modulator's imperfect black included), all 10 000 test "
+        "images, posterior table of the training objects. "
         "Bits of 3.32. Neither way has a spread over trials: frames are read out once (error from the objects: 0.03 bits at "
         "most), click words enumerated.",
         "",
