@@ -61,6 +61,24 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     budget.add_argument("--photons", type=float, metavar="B", help="photoelectrons per decision to aim for")
     parser.add_argument("--clicks", type=float, metavar="C", help="clicks per decision to aim for, beside either")
+    _configure_schedule(parser)
+    _configure_details(parser)
+    parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
+    parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="where to compute (default cpu); changes the random numbers",
+    )
+    parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
+    parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
+    add_data_dir(parser)
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
+
+
+def _configure_schedule(parser: argparse.ArgumentParser) -> None:
+    """Options of how long and in which stages to train, and within which budget."""
     parser.add_argument(
         "--epochs", type=int, default=60, metavar="E", help="passes over the training objects (default 60)"
     )
@@ -89,6 +107,10 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="share of the loss of 2 to K shots, for patterns too (default 0)",
     )
+
+
+def _configure_details(parser: argparse.ArgumentParser) -> None:
+    """Options of the head, the detection in training and the machine."""
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="fit the head to 1 to K shots (default 1)")
     parser.add_argument(
         "--shift-px",
@@ -116,18 +138,6 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dark", type=float, metavar="R", help="dark photoelectrons per exposure in training, instead of the profile's"
     )
-    parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
-    parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
-    parser.add_argument(
-        "--device",
-        choices=("cpu", "cuda"),
-        default="cpu",
-        help="where to compute (default cpu); changes the random numbers",
-    )
-    parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
-    parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
-    add_data_dir(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
 
 
 def _train(args: argparse.Namespace) -> int:
