@@ -80,6 +80,11 @@ class FlowCore(Follower):
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
         self._period_ticks = plan.slot_period_ticks
         self._max_block = plan.block_exposures
+        self._prepare(plan)
+
+    def _prepare(self, plan: Plan) -> None:
+        """Make what this kind of flow needs besides, once, before arming."""
+        raise NotImplementedError
 
     def _lag(self) -> int:
         """Exposures after which a passage can no longer be decided."""

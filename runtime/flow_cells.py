@@ -8,9 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import flow_kernels as kernels
-from .decide import Decider
 from .flow import I64, NO_FLAGS, FlowCore, Rows
-from .flow_settings import FlowLimits, FlowSettings
 from .follower import Output, Passage
 from .plan import Plan
 from .record_format import DecisionFlag
@@ -21,18 +19,8 @@ MAX_PASSAGES = 64  # of one call of the kernel; it is called again
 class CellCore(FlowCore):
     """Cells: found by the sum of clicks over a few frames, decided in the window nearest to the centroid of their clicks."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        decider: Decider,
-        settings: FlowSettings,
-        limits: FlowLimits,
-        gated: frozenset[int],
-        shots: int,
-        n_cycles: int,
-    ) -> None:
-        super().__init__(plan, decider, settings, limits, gated, shots, n_cycles)
-        self._limits: I64 = np.array([*limits[:8], self._dark_cycle], np.int64)
+    def _prepare(self, plan: Plan) -> None:
+        self._limits: I64 = np.array([*self.limits[:8], self._dark_cycle], np.int64)
         self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
 
     def warm_up(self) -> None:

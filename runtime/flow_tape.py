@@ -8,10 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 from . import flow_kernels as kernels
-from .decide import Decider
 from .errors import UsageError
 from .flow import NO_FLAGS, FlowCore, Rows
-from .flow_settings import FlowLimits, FlowSettings
 from .follower import Output, Passage
 from .plan import Plan
 from .record_format import DecisionFlag
@@ -22,17 +20,8 @@ Q = 32  # bits after the point of a bar's alignment, in exposures
 class TapeCore(FlowCore):
     """A tape of bars: its speed says when a window of bars is aligned; one decision for each bar position."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        decider: Decider,
-        settings: FlowSettings,
-        limits: FlowLimits,
-        gated: frozenset[int],
-        shots: int,
-        n_cycles: int,
-    ) -> None:
-        super().__init__(plan, decider, settings, limits, gated, shots, n_cycles)
+    def _prepare(self, plan: Plan) -> None:
+        settings = self.settings
         period_us = plan.slot_period_ticks * plan.tick_us
         self._pitch = round((1 << Q) * 1e6 / settings.bars_per_s / period_us)
         self._origin = round(
