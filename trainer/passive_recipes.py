@@ -32,48 +32,77 @@ CELLS_RATE = 5e-3  # 10 000 pixels: one step moves the sum over all of them
 
 def recipe(name: str, row: PassiveRow, dark: float, *, conserving: bool = False) -> Options:
     """Return what one model is trained with."""
-    encoder = ENCODERS.get(name, "coherent")
     shared = Options(
-        features=row.features, alpha=0.0, clicks=CLICKS_AIM * row.clicks, encoder=encoder, dark=dark, head_rate=3e-3
+        features=row.features,
+        alpha=0.0,
+        clicks=CLICKS_AIM * row.clicks,
+        encoder=ENCODERS.get(name, "coherent"),
+        dark=dark,
+        head_rate=3e-3,
+        conserving=conserving,
     )
-    if name == "barcode":  # barcode_search.py: searches, not epochs
-        return replace(
-            shared, clicks=0.995 * CLICKS_TOLERANCE * row.clicks, restarts=3 if row.features < 10 else 2, hidden=128
-        )
-    if name == "mmf-mnist-image":
-        return replace(shared, estimator="ste", epochs=30, hidden=512)
+    if name == "barcode":
+        return _barcode(shared, row)
+    if name == "fiber":
+        return _fiber(shared, row)
     if name in FIELD_RATES:
-        field = replace(
-            shared,
-            epochs=30,
-            warm=0.3,
-            polish=0.4,
-            hidden=64,
-            batch=256,
-            restarts=2,
-            front_rate=FIELD_RATES[name],
-            estimator="exact" if row.features <= EXACT_FEATURES_MAX else "local",
-        )
-        if name != "fiber":
-            return field
-        fiber = replace(field, clicks=CLICKS_AIM_FIBER * row.clicks)
-        if row.features > 3:
-            return fiber
-        # few detectors: many starts end where one does it all, and saturated ones cannot be dimmed by their clicks
-        return replace(fiber, epochs=60, restarts=3, front_rate=5e-3, photons=15 * row.clicks)
-    exact = row.features <= EXACT_FEATURES_MAX
-    aim = CLICKS_AIM_MMF if name == "mmf-mnist" else CLICKS_AIM
+        return _field(name, shared)
+    if name == "mmf-mnist-image":
+        return _picture(shared)
+    return _digits(shared, row) if name == "mmf-mnist" else _cells(shared)
+
+
+def _barcode(shared: Options, row: PassiveRow) -> Options:
+    """barcode_search.py: searches, not epochs."""
+    clicks = 0.995 * CLICKS_TOLERANCE * row.clicks
+    return replace(shared, clicks=clicks, restarts=3 if row.features < 10 else 2, hidden=128)
+
+
+def _field(name: str, shared: Options) -> Options:
+    """Scenes with a bright background."""
     return replace(
         shared,
-        clicks=aim * row.clicks,
-        front_rate=CELLS_RATE if encoder == "active" else shared.front_rate,
+        epochs=30,
+        warm=0.3,
+        polish=0.4,
+        hidden=64,
+        batch=256,
+        restarts=2,
+        front_rate=FIELD_RATES[name],
+        estimator="exact" if shared.features <= EXACT_FEATURES_MAX else "local",
+    )
+
+
+def _fiber(shared: Options, row: PassiveRow) -> Options:
+    fiber = replace(_field("fiber", shared), clicks=CLICKS_AIM_FIBER * row.clicks)
+    if row.features > 3:
+        return fiber
+    # few detectors: many starts end where one does it all, and saturated ones cannot be dimmed by their clicks
+    return replace(fiber, epochs=60, restarts=3, front_rate=5e-3, photons=15 * row.clicks)
+
+
+def _picture(shared: Options) -> Options:
+    return replace(shared, estimator="ste", epochs=30, hidden=512)
+
+
+def _digits(shared: Options, row: PassiveRow) -> Options:
+    return replace(_plain(shared), clicks=CLICKS_AIM_MMF * row.clicks)
+
+
+def _cells(shared: Options) -> Options:
+    return replace(_plain(shared), front_rate=CELLS_RATE)
+
+
+def _plain(shared: Options) -> Options:
+    exact = shared.features <= EXACT_FEATURES_MAX
+    return replace(
+        shared,
         estimator="exact" if exact else "local",
         epochs=30 if exact else 44,
         warm=0.4,
-        starts=2 if row.features <= 6 else 1,
+        starts=2 if shared.features <= 6 else 1,
         polish=0.4 if exact else 0.0,
         hidden=128 if exact else 256,
-        conserving=conserving,
     )
 
 
