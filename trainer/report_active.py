@@ -54,6 +54,7 @@ def markdown(name: str, done: Done) -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
         *(_whole_row(row, figures) for row, figures in done),
         _WEAK_POINTS,
+        *_seeds_say(done),
         *_direct_says(done),
         "",
     ]
@@ -96,6 +97,25 @@ def _whole_row(row: ActiveRow, figures: dict[str, Any]) -> str:
         f"| {one['clicks_mean']:.2f} | {one['photons_mean']:.1f} | {100 * figures['direct']['accuracy_mean']:.1f} | {how} "
         f"| {figures['cpu_seconds'] / 60:.1f} |"
     )
+
+
+def _seeds_say(done: Done) -> list[str]:
+    """Say how far another seed moves a row, first 200 and all images."""
+    lines = []
+    for row, figures in done:
+        for other in figures.get("other_seeds", []):
+            moved = [
+                f"{100 * (other[part][shots]['accuracy_mean'] - figures[part][shots]['accuracy_mean']):+.2f}"
+                for part in ("first_200", "all")
+                for shots in ("1", "5")
+            ]
+            lines += [
+                f"**Another seed** ({other['options']['seed']}) at d_f = {row.features}: {_accuracies(other['first_200'])} on the "
+                f"first 200, {_accuracies(other['all'])} on all images, {other['first_200']['1']['clicks_mean']:.2f} clicks: "
+                f"{moved[0]} (K = 1) and {moved[1]} (K = 5) points on the first 200, {moved[2]} and {moved[3]} on all.",
+                "",
+            ]
+    return lines
 
 
 def _direct_says(done: Done) -> list[str]:

@@ -27,6 +27,13 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=(*NAMES, "all", "list"), help="which table or figure")
     parser.add_argument("--rows", type=int, nargs="+", metavar="D", help="only the rows with that many patterns")
     parser.add_argument("--dark", type=float, nargs="+", metavar="R", help="only these dark counts (not of all tables)")
+    parser.add_argument(
+        "--data-seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="another draw of a drawn task (default 0); the page of draw 0 names the finished cells of others beside its own",
+    )
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and NAME.png there")
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
@@ -69,9 +76,7 @@ def _active(name: str, args: argparse.Namespace) -> dict[str, Any]:
         )
     done = []
     for row in wanted:
-        figures = active.finished_row(args.cache, name, row)
-        if figures is None and not args.collect:
-            figures = active.make_row(args.cache, name, row, args.data_dir, say)
+        figures = active.row_with_seeds(args.cache, name, row, args.data_dir, say, collect=args.collect)
         if figures is None:
             say(f"{name} d_f={row.features}: not trained yet")
             continue
@@ -92,24 +97,33 @@ def _facts(row: Any) -> dict[str, Any]:
 def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from . import reproduce_passive as passive
     from .figures import measure_over_patterns
+    from .generators import GENERATORS
     from .report_passive import markdown, table_of
 
+    drawn = passive.TASKS.get(name, name) in GENERATORS and name != "barcode"  # all its strings are judged
+    if args.data_seed and (args.out or not drawn):
+        remedy = (
+            "leave out -o; the page is of draw 0 and names others" if drawn else f"{name} is not drawn: leave it out"
+        )
+        raise UsageError(f"--data-seed {args.data_seed}", remedy=remedy)
     table = table_of(name)
     wanted = [row for row in table.rows if args.rows is None or row.features in args.rows]
     levels = [dark for dark in table.dark if args.dark is None or dark in args.dark]
     if not (wanted and levels):
         known = f"rows {', '.join(str(row.features) for row in table.rows)}, dark {', '.join(map(str, table.dark))}"
         raise UsageError(f"--rows {args.rows} --dark {args.dark}", remedy=f"{name} has {known}")
-    done = []
+    done, others = [], []
     for row in wanted:
         for dark in levels:
-            figures = passive.finished_cell(args.cache, name, row, dark)
+            figures = passive.finished_cell(args.cache, name, row, dark, args.data_seed)
             if figures is None and not args.collect:
-                figures = passive.make_cell(args.cache, name, row, dark, args.data_dir, say)
+                figures = passive.make_cell(args.cache, name, row, dark, args.data_dir, say, args.data_seed)
             if figures is not None:
                 done.append((row, figures))
-    text = markdown(name, done)
-    result = {"rows": [figures for _, figures in done], "markdown": text}
+            if not args.data_seed:
+                others += [(row, other) for other in passive.other_draws(args.cache, name, row, dark)]
+    text = markdown(name, done, others)
+    result = {"rows": [figures for _, figures in done + others], "markdown": text}
     if args.out:
         _write(args.out, name, result, lambda path: measure_over_patterns(path, name, done))
     return result

@@ -1,0 +1,59 @@
+"""Reproduction of the active tables: other seeds of a row, restarts chosen by what they shall be good at, a fair race."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.trainer import reproduce_active as active
+from pans.trainer.options import Options, plain_options
+from pans.trainer.paper_tables import ACTIVE, ActiveRow
+from pans.trainer.report_active import markdown
+from pans.trainer.tasks import Objects, Task
+
+ROW = ActiveRow(3, (40.0,) * 4, (40.0,) * 4, 1.5, 9.0)
+
+
+@pytest.fixture
+def bars(monkeypatch):
+    """A table of one row with a second seed: bright columns name the class."""
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 3, 500)
+    images = rng.integers(0, 60, (500, 4, 4), dtype=np.uint8)
+    images[np.arange(500), :, labels] = 255
+    task = Task(
+        "mnist", ("a", "b", "c"), Objects(images[:280], labels[:280]), Objects(images[280:], labels[280:]), "0" * 64, ""
+    )
+    small = Options(features=3, clicks=1.5, epochs=4, hidden=8, batch=50, front_rate=5e-2, head_rate=2e-2, shots=2)
+    monkeypatch.setattr(active, "load_task", lambda *_: task)
+    monkeypatch.setattr(active, "TRIALS", {200: 3, 220: 3})
+    monkeypatch.setattr(active, "recipe", lambda *_: small)
+    monkeypatch.setattr(active, "OTHER_SEEDS", {("mnist", 3): (1000,)})
+
+
+def test_a_row_is_trained_from_another_seed_too_and_both_are_kept(bars, tmp_path):
+    def said(_line):
+        pass
+
+    assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) is None
+    found = active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=False)
+    (other,) = found["other_seeds"]
+    assert found["options"]["seed"] == 0 and other["options"]["seed"] == 1000
+    assert found["sha256"] != other["sha256"]
+    assert active.finished_row(tmp_path, "mnist", ROW, 1000) == json.loads(json.dumps(other))
+    assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) == json.loads(json.dumps(found))
+    page = markdown("mnist", [(ROW, found)])
+    moved = 100 * (other["all"]["5"]["accuracy_mean"] - found["all"]["5"]["accuracy_mean"])
+    assert "**Another seed** (1000) at d_f = 3" in page
+    assert f"and {moved:+.2f} on all" in page
+
+
+def test_the_seeds_of_the_tables_are_not_restarts_of_one_another():
+    for (name, features), seeds in active.OTHER_SEEDS.items():
+        (row,) = [row for row in ACTIVE[name] if row.features == features]
+        options = active.recipe(name, row)
+        assert plain_options(options)["seed"] == 0
+        assert min(seeds) > (options.restarts + 1) * options.starts
