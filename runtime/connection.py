@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from .bundle import Bundle
 from .clock import ClockModel, ClockStep
 from .errors import DeviceError, LinkError
 from .evidence import Evidence, Stamped
+from .framing import Messages
 from .link import Link
-from .link_reader import LinkReader
+from .link_reader import Chunk, LinkReader
 from .plan import Plan
 from .session import HostSession
 from .wire import DARK_PATTERN, SLOT_DTYPE, Frame, FrameDecoder, MalformedMessage, Opcode, Welcome
@@ -32,6 +33,9 @@ from .wire_commands import (
     pack_plan,
 )
 
+if TYPE_CHECKING:
+    from .wire_bulk import BulkDecoder
+
 NS_PER_S = 1_000_000_000
 SETUP_POLL_S = 0.02
 CLOCK_BURST = 16
@@ -40,10 +44,10 @@ REQUIRED_FACTS = ("tick_hz", "mode", "channels", "levels", "pattern_memory", "pa
 
 
 class Arrived(NamedTuple):
-    """A stream frame and the host time at which its bytes were read."""
+    """A frame for the core, or many stream messages of one read (valid until the next `pump`), and when their bytes were read."""
 
     arrival_ns: int
-    frame: Frame
+    what: Frame | Messages
 
 
 class Connection:
@@ -60,7 +64,7 @@ class Connection:
         self.on_sent = on_sent
 
     def pump(self, timeout_s: float) -> list[Arrived]:
-        """Send what is due, wait at most `timeout_s` for bytes, digest them; return the stream frames among them."""
+        """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
         self.session.poll(self.link.now_ns())
         asked = self.flush()
         stream: list[Arrived] = []
@@ -70,10 +74,14 @@ class Connection:
             self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
             for chunk in chunks:
                 self.evidence.arrived(chunk.arrival_ns)
-        for chunk in chunks:
-            for frame in self.decoder.feed(chunk.data):
-                if self.session.on_frame(frame, chunk.arrival_ns):
-                    stream.append(Arrived(chunk.arrival_ns, frame))
+        bulk = self.decoder.bulk
+        for place, chunk in enumerate(chunks):
+            if bulk is None:
+                for frame in self.decoder.feed(chunk.data):
+                    if self.session.on_frame(frame, chunk.arrival_ns):
+                        stream.append(Arrived(chunk.arrival_ns, frame))
+            else:
+                self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
         if self.clock is not None:
             while self.session.pongs:
                 pong, arrival_ns = self.session.pongs.popleft()
@@ -84,6 +92,25 @@ class Connection:
                     reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
                     self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
         return stream
+
+    def _digest(self, bulk: BulkDecoder, chunk: Chunk, stream: list[Arrived], *, last: bool) -> None:
+        """Decode a chunk and sort its messages: runs of stream messages stay together; unless they are the `last`, as a copy."""
+        session, arrival_ns = self.session, chunk.arrival_ns
+        parts = bulk.pieces(chunk.data)
+        for number, part in enumerate(parts):
+            spans = bulk.take(part)
+            place, stays = 0, last and number + 1 == len(parts)
+            while place < len(spans):
+                stop = bulk.stream_stop(spans, place, session.nonce)
+                if stop > place:
+                    session.heard_ns = arrival_ns
+                    messages = Messages(bulk.buffer, spans[place:stop])
+                    stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
+                if stop < len(spans):
+                    frame = bulk.frame(*spans[stop].tolist())
+                    if session.on_frame(frame, arrival_ns):
+                        stream.append(Arrived(arrival_ns, frame))
+                place = stop + 1
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""

@@ -17,11 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from . import flow_kernels as kernels
+from . import flow_walk as walking
 from .dark_guard import DarkGuard
 from .decide import Decider
 from .errors import UsageError
 from .flow_settings import FlowLimits, FlowSettings
 from .follower import Action, Decision, Follower, Output, Passage, joined
+from .framing import Messages
 from .passages import PassageMatcher
 from .plan import Plan
 from .record_format import NO_LABEL, DecisionFlag
@@ -32,6 +34,7 @@ from .wire import DARK_PATTERN, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Sta
 
 MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of the kernel; it is called again
+MAX_MARKS_AT_ONCE = 64
 NO_FLAGS = DecisionFlag(0)
 WATCHED_FRAMES = 256  # empty frames that the guard is told of at once
 Q = 32  # bits after the point of a bar's alignment, in exposures
@@ -80,6 +83,12 @@ class FlowCore(Follower):
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
         self._period_ticks = plan.slot_period_ticks
         self._max_block = plan.block_exposures
+        self._facts: I64 = np.zeros(walking.N_FACTS, np.int64)
+        self._slot_offsets = plan.slot_offset_ticks.astype(np.int64)
+        self._new_marks: I64 = np.zeros((MAX_MARKS_AT_ONCE, walking.N_MARK), np.int64)
+        self._new_photons = np.zeros(MAX_MARKS_AT_ONCE, np.float32)
+        self._limits: I64 = np.zeros(0, np.int64)  # of what looks for passages; none where their times are known
+        self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
         self._prepare(plan)
 
     def _prepare(self, plan: Plan) -> None:
@@ -121,6 +130,7 @@ class FlowCore(Follower):
         kernels.skip_frames(2, 3, words, counts, state)
         kernels.window_clicks(words, counts, 0, 1, spare)
         self._decider.decide(np.zeros(len(spare), np.int64), self.shots)
+        self._walk(Messages(np.zeros(8, np.uint8), np.zeros((0, 2), np.int64)), 0)
         if self.guard is not None:
             self.guard.warm_up()
 
@@ -140,13 +150,54 @@ class FlowCore(Follower):
             block.words, block.exposure_index, self._words, self._counts, self._dark_cycle, self._state, self.dark_channels,
             self._channel_mask,
         )  # fmt: skip
-        stop = block.exposure_index + n_exposures
         events = [] if self.guard is None or not self._dark_cycle else self.guard.take(block)
-        output = joined(Output([], events, None), self._settle(stop, end_tick))
+        came = self._came(block.exposure_index + n_exposures, end_tick, 0)
+        return joined(Output([], events, None), came) if events else came
+
+    def _came(self, stop: int, end_tick: int, found: int) -> Output:
+        """Decide on what exposures up to `stop` - 1, now in the ring, settle; `found` passages stand in `_passages` already."""
+        output = self._settle(stop, end_tick, found)
         if self.guard is not None and not self._dark_cycle:
-            output = joined(output, Output([], self._watch_empty(self.guard), None))
+            news = self._watch_empty(self.guard)
+            output = joined(output, Output([], news, None)) if news else output
         self.matcher.settle(stop)
         return output
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
+        """See Follower: ordinary messages are taken in one call of a kernel, up to the first block of which something comes."""
+        by_block = self.guard is not None and self._dark_cycle  # it wants to see every block
+        taken = 0 if by_block or not self.tracker.open else self._walk(messages, place)
+        if not taken:
+            return super().step_messages(messages, place)
+        facts = self._facts.tolist()
+        n_marks, n_blocks = facts[walking.MARKS], facts[walking.BLOCKS]
+        position = facts[walking.NEXT_SEQ], facts[walking.NEXT_EXPOSURE]
+        self.tracker.advance(position, n_marks + n_blocks, facts[walking.EXPOSURES])
+        if n_marks:
+            for mark, photons in zip(self._new_marks[:n_marks].tolist(), self._new_photons[:n_marks].tolist()):
+                self._remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
+        if not n_blocks:
+            return taken, Output([], [], None)
+        self.last_tick, self.jitter_ticks = facts[walking.END_TICK], facts[walking.JITTER_TICKS]
+        came = self._came(position[1], self.last_tick, facts[walking.PASSAGES])
+        return taken, Output(came.decisions, came.events, self.last_tick, came.passages, came.actions)
+
+    def _walk(self, messages: Messages, place: int) -> int:
+        """Bring the kernel's facts up to date and let it take messages; return how many it took."""
+        facts = self._facts
+        watch_at = 1 << 62 if self.guard is None else self._watched[0] + WATCHED_FRAMES
+        facts[: walking.BLOCKS] = (
+            *self.tracker.position, min(self.end_exposure, 1 << 62), self.start_tick, self._exposure_ticks, self._period_ticks,
+            self._max_block, self._plan.cycle_ticks, self._dark_cycle, watch_at,
+        )  # fmt: skip
+        facts[walking.JITTER_TICKS] = self.jitter_ticks
+        return int(
+            walking.walk(
+                messages.buffer, messages.spans, place, facts, self._slot_offsets, (self._words, self._counts), self._limits,
+                self._state, self.dark_channels, self.empty_channels, self._channel_mask, self._new_marks, self._new_photons,
+                self._passages,
+            )
+        )  # fmt: skip
 
     def _watch_empty(self, guard: DarkGuard) -> list[dict[str, Any]]:
         """Without dark slots, the frames in which no object was found tell the dark rates."""
@@ -213,8 +264,11 @@ class FlowCore(Follower):
 
     # -- what cells and tape do each in their way ----------------------------------------------------------------------
 
-    def _settle(self, stop: int, end_tick: int) -> Output:
-        """Decide on what is settled by exposures up to `stop` - 1, the last of which ended at `end_tick`."""
+    def _settle(self, stop: int, end_tick: int, found: int) -> Output:
+        """Decide on what is settled by exposures up to `stop` - 1, the last of which ended at `end_tick`.
+
+        `found` rows of `_passages` are there already.
+        """
         raise NotImplementedError
 
     def _kept_frames(self) -> int:

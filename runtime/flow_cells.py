@@ -8,20 +8,17 @@ from __future__ import annotations
 import numpy as np
 
 from . import flow_kernels as kernels
-from .flow import I64, NO_FLAGS, FlowCore, Rows
+from .flow import NO_FLAGS, FlowCore, Rows
 from .follower import Output, Passage
 from .plan import Plan
 from .record_format import DecisionFlag
-
-MAX_PASSAGES = 64  # of one call of the kernel; it is called again
 
 
 class CellCore(FlowCore):
     """Cells: found by the sum of clicks over a few frames, decided in the window nearest to the centroid of their clicks."""
 
     def _prepare(self, plan: Plan) -> None:
-        self._limits: I64 = np.array([*self.limits[:8], self._dark_cycle], np.int64)
-        self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
+        self._limits = np.array([*self.limits[:8], self._dark_cycle], np.int64)
 
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming, on state of its own."""
@@ -33,15 +30,16 @@ class CellCore(FlowCore):
     def _kept_frames(self) -> int:
         return 2 * self.limits.longest
 
-    def _settle(self, stop: int, end_tick: int) -> Output:
-        rows = Rows()
-        while self._state[kernels.NEXT] < stop:
-            n = kernels.scan(
+    def _settle(self, stop: int, end_tick: int, found: int) -> Output:
+        rows, origin_tick = Rows(), end_tick - (stop - 1) * self._period_ticks
+        while True:
+            for row in self._passages[:found].tolist():
+                self._passed(row, origin_tick, rows)
+            if self._state[kernels.NEXT] >= stop:
+                return rows.output()
+            found = kernels.scan(
                 stop, self._words, self._counts, self._limits, self._state, self.empty_channels, self._passages
             )
-            for row in self._passages[:n].tolist():
-                self._passed(row, end_tick - (stop - 1) * self._period_ticks, rows)
-        return rows.output()
 
     def _passed(self, row: list[int], origin_tick: int, rows: Rows) -> None:
         """Turn one row of the kernel into a decision; exposure e ended at `origin_tick` + e periods."""

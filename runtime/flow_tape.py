@@ -56,7 +56,7 @@ class TapeCore(FlowCore):
     def _kept_frames(self) -> int:
         return max(self.frames, self._pitch >> Q)
 
-    def _settle(self, stop: int, end_tick: int) -> Output:
+    def _settle(self, stop: int, end_tick: int, found: int) -> Output:
         rows = self._decided(stop, end_tick - (stop - 1) * self._period_ticks, NO_FLAGS)
         self._state[kernels.NEXT] = stop
         return rows.output()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from .framing import Messages
 from .ingest import Gap, StreamTracker
 from .plan import Plan
 from .wire import (
@@ -93,6 +94,8 @@ class Follower:
         self.n_decisions = 0
         self.n_abstained = 0
         self.last_tick = 0
+        self.jitter_ticks = 0  # most that a block's end differed from the plan
+        self._plan = plan
         self._exposure_ticks = plan.exposure_ticks
         self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
         self.end_exposure = self._exposures_of(n_cycles)
@@ -196,6 +199,13 @@ class Follower:
     def _exposures_of(self, n_cycles: int) -> int:
         return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
 
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
+        """Take stream messages from `place` on, at least one, up to the first of which something came; return how many, and that.
+
+        The outputs together are those of `step` on each of them. Subclasses may take many at once.
+        """
+        return 1, self.step(messages.frame(place))
+
     def step(self, frame: Frame) -> Output:
         """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
         if frame.type == MessageType.STATUS:
@@ -213,9 +223,17 @@ class Follower:
             return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
         self.last_tick = end_tick
+        self._check_slot(message.exposure_index + n_exposures - 1, end_tick)
         skipped = self._skip_to(message.exposure_index, message.tick)
         taken = self._take(message, n_exposures, end_tick)
         return joined(Output(skipped.decisions, events, None, skipped.passages, skipped.actions), taken, end_tick)
+
+    def _check_slot(self, exposure_index: int, end_tick: int) -> None:
+        """Compare when an exposure ended with when the plan says that it should."""
+        plan = self._plan
+        cycle, slot = divmod(exposure_index, plan.slots_per_cycle)
+        planned = self.start_tick + cycle * plan.cycle_ticks + int(plan.slot_offset_ticks[slot])
+        self.jitter_ticks = max(self.jitter_ticks, abs(end_tick - planned - plan.exposure_ticks))
 
     def _on_status(self, frame: Frame) -> Output:
         """When the device says that the plan is done, settle what will never be complete.

@@ -10,6 +10,9 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from .wire_schema import HEADER, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, UNSEEDED, MalformedMessage
 
 if TYPE_CHECKING:
@@ -82,6 +85,26 @@ def unpack_body(body: bytes) -> Frame:
     return Frame(message_type, flags, session, body[HEADER.size :])
 
 
+class Messages(NamedTuple):
+    """Stream messages of one read, decoded: bodies (header and payload) at the spans int64 (n, 2) of `buffer` uint8.
+
+    Both belong to the decoder and are valid until it is given the next bytes.
+    """
+
+    buffer: npt.NDArray[np.uint8]
+    spans: npt.NDArray[np.int64]
+
+    def frame(self, place: int) -> Frame:
+        """Return message `place` as a frame of its own."""
+        first, stop = self.spans[place].tolist()
+        return unpack_body(self.buffer[first:stop].tobytes())
+
+    def kept(self) -> Messages:
+        """Return a copy that the decoder's next bytes do not touch."""
+        end = int(self.spans[-1, 1]) if len(self.spans) else 0
+        return Messages(self.buffer[:end].copy(), self.spans.copy())
+
+
 def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0) -> bytes:
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
@@ -123,6 +146,11 @@ class FrameDecoder:
     def held_bytes(self) -> int:
         """Bytes of a frame whose delimiter has not come yet."""
         return len(self._buffer) if self._bulk is None else self._bulk.held_bytes
+
+    @property
+    def bulk(self) -> BulkDecoder | None:
+        """The compiled decoder that does the work since `use_kernels`; None before it."""
+        return self._bulk
 
     def use_kernels(self) -> None:
         """Decode in compiled kernels from here on: before arming, since loading them takes time and Python's loops would show."""

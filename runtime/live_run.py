@@ -18,6 +18,7 @@ from .actuate import GateDesk
 from .connection import Arrived, Connection
 from .core import Output
 from .errors import LinkError
+from .framing import Messages
 from .ingest import StreamTracker
 from .journal import Journal
 from .lateness import Lateness
@@ -51,6 +52,7 @@ class LiveCore(Protocol):
     start_tick: int
     completed: bool
     n_decisions: int
+    jitter_ticks: int
     tracker: StreamTracker
 
     @property
@@ -64,6 +66,8 @@ class LiveCore(Protocol):
     def begin(self, start_tick: int, n_cycles: int) -> Output: ...
 
     def step(self, frame: Frame) -> Output: ...
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]: ...
 
     def end(self) -> Output: ...
 
@@ -101,7 +105,6 @@ class LiveRun:
         self.outage_ns: int | None = None  # since when there has been no block
         self.decoded: Counter[str] = Counter()  # what the decoders of connections that are gone have counted
         self.armed_after_s = 0.0
-        self.jitter_ticks = 0
         self.start_ns = self.last_data_ns = 0
         self._counted: Connection | None = None
         self._recorder = recorder
@@ -207,23 +210,42 @@ class LiveRun:
         self.ended = why_ended(self, now_ns)
 
     def take(self, arrived: list[Arrived]) -> list[Output]:
-        """Decide on stream frames and account for what came of it."""
-        outputs = []
-        for arrival_ns, frame in arrived:
+        """Decide on what came for the core and account for what came of it."""
+        outputs: list[Output] = []
+        for arrival_ns, what in arrived:
+            if isinstance(what, Messages):
+                self._take_messages(arrival_ns, what, outputs)
+                continue
             decoded_ns = self.now_ns()
-            output = self.core.step(frame)
+            output = self.core.step(what)
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
-                self._recorder.add_message(arrival_ns, pack_body(frame))
-            self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
-            if output.block_end_tick is not None:
-                self.last_data_ns = arrival_ns
-                self.outage_ns = None
-                self.lateness.block_came(arrival_ns)
-            elif frame.type == MessageType.STATUS and self.connection.session.status is not None:
+                self._recorder.add_message(arrival_ns, pack_body(what))
+            self._book(output, arrival_ns, decoded_ns, outputs)
+            if what.type == MessageType.STATUS and self.connection.session.status is not None:
                 self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
-            outputs.append(output)
         return outputs
+
+    def _take_messages(self, arrival_ns: int, messages: Messages, outputs: list[Output]) -> None:
+        """Give the core many stream messages at once: it stops at each of which something came, which must not wait for the rest."""
+        place, n = 0, len(messages.spans)
+        while place < n:
+            decoded_ns = self.now_ns()
+            taken, output = self.core.step_messages(messages, place)
+            self.lateness.stepped(decoded_ns, self.now_ns())
+            if self._recorder is not None:
+                self._recorder.add_messages(arrival_ns, messages, place, taken)
+            self._book(output, arrival_ns, decoded_ns, outputs)
+            place += taken
+
+    def _book(self, output: Output, arrival_ns: int, decoded_ns: int, outputs: list[Output]) -> None:
+        """Account for what a step brought."""
+        self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
+        if output.block_end_tick is not None:
+            self.last_data_ns = arrival_ns
+            self.outage_ns = None
+            self.lateness.block_came(arrival_ns)
+        outputs.append(output)
 
     def settle(self, output: Output) -> None:
         """Account for what the core settled without a message."""
@@ -236,8 +258,6 @@ class LiveRun:
             self.journal.event(event)
             if event["kind"] == "gap":
                 self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()))
-        if output.block_end_tick is not None:
-            self._check_slot(output.block_end_tick)
         if not output.decisions:
             return
         self.gates.take(output.actions)
@@ -281,13 +301,6 @@ class LiveRun:
     def _judge_late(self, verdict: dict[str, Any] | None) -> None:
         if verdict is not None:
             self.journal.event(verdict)
-
-    def _check_slot(self, block_end_tick: int) -> None:
-        """Compare when the block's last exposure ended with when the plan says that it should."""
-        exposure = self.core.tracker.next_exposure - 1
-        cycle, slot = divmod(exposure, self.plan.slots_per_cycle)
-        planned = self.core.start_tick + cycle * self.plan.cycle_ticks + int(self.plan.slot_offset_ticks[slot])
-        self.jitter_ticks = max(self.jitter_ticks, abs(block_end_tick - planned - self.plan.exposure_ticks))
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW

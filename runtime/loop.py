@@ -192,7 +192,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         clock={} if fit is None else {"drift_ppm": fit.drift_ppm, "uncertainty_us": fit.uncertainty_ns / 1000},
         realtime=run.realtime,
         device=device,
-        slot_jitter_us=run.jitter_ticks * run.plan.tick_us,
+        slot_jitter_us=run.core.jitter_ticks * run.plan.tick_us,
         wrong_patterns=int(tallies[WRONG_PATTERNS]),
         armed_after_s=run.armed_after_s,
         seconds=(run.now_ns() - run.start_ns) / NS_PER_S,

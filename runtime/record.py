@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from .clock import CLOCK_DTYPE
 from .container import MIB, block_ends, canonical_json, file_prologue, sync_folder
 from .errors import PansError, RecordingError, UsageError
+from .framing import Messages
 from .record_format import (
     DECISION_DTYPE,
     FORMAT_VERSION,
@@ -79,6 +80,7 @@ class _Bytes:
     def __init__(self, kind: Kind, size: int) -> None:
         self.kind = kind
         self.data = bytearray(size)
+        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
         self.used = 0
 
     def room(self) -> int:
@@ -115,6 +117,10 @@ class Recorder:
         self._decisions = _Rows(Kind.DECISIONS, DECISION_DTYPE)
         self._timings = _Rows(Kind.TIMINGS, TIMING_DTYPE)
         self._log = LogEncoder()
+        from .record_kernels import pack_messages  # numba is loaded only by who records
+
+        self._pack = pack_messages
+        pack_messages(self._messages.array, np.zeros((0, 2), np.int64), 0, 0, 0, self._messages.array, 0)
         self._n_decisions = 0
         self._n_blocks = 0
         facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
@@ -166,6 +172,19 @@ class Recorder:
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
         self._add_bytes(self._messages, host_ns, data)
+
+    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None:
+        """Keep `count` of `messages` from place `first` on, which arrived together."""
+        buffer, stop = self._messages, first + count
+        while True:
+            first, buffer.used = self._pack(
+                messages.buffer, messages.spans, first, stop, host_ns, buffer.array, buffer.used
+            )
+            if first == stop:
+                return
+            begin, end = messages.spans[first].tolist()
+            self._add_bytes(buffer, host_ns, messages.buffer[begin:end].tobytes())  # makes room
+            first += 1
 
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""

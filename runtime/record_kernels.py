@@ -1,6 +1,6 @@
-"""The compiled kernel of the compact decision log: rows in, runs, verdicts and codes out.
+"""The compiled kernels of a recording: rows to runs, verdicts and codes of the compact decision log; messages to a block.
 
-Owns the loop over rows; what its output means is told in record_log.py, which also owns the arrays. Never allocates.
+Owns the loops over rows and bytes; what its output means is told in record_log.py, which also owns the arrays. Never allocates.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from .record_format import LONG_VERDICT, RUN_ROWS_MAX
+from .record_format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
 # state, uint64 (N_STATE,): the run that is open, as its next row would have to be, and the verdicts known so far
 RUN_ROWS, NEXT_INDEX, NEXT_TICK, NEXT_EXPOSURE, NEXT_SHOT, OBJECT, TRUTH = range(7)
 TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_STATE = range(7, 13)
 
+_MESSAGE_HEAD = MESSAGE.size
 _U = np.uint64
 SLOTS_PER_VERDICT = _U(
     8
@@ -138,3 +139,25 @@ def _keep(row, verdict):  # type: ignore[no-untyped-def]
     verdict["flags"] = row["flags"]
     verdict["probability_bits"] = row["probability_bits"]
     verdict["counts_crc"] = row["counts_crc"]
+
+
+@njit(cache=True, nogil=True)
+def pack_messages(buffer, spans, first, stop, host_ns, out, used):  # type: ignore[no-untyped-def]
+    """Put the bodies at spans[first:stop] of `buffer` behind out[:used], each with `host_ns` and its length (record_format.MESSAGE).
+
+    Ends at the first that does not fit; return its place, or `stop`, and the bytes used.
+    """
+    while first < stop:
+        begin, end = spans[first, 0], spans[first, 1]
+        if used + _MESSAGE_HEAD + end - begin > out.size:
+            break
+        for i in range(8):
+            out[used + i] = np.uint8(host_ns >> 8 * i & 0xFF)
+        for i in range(4):
+            out[used + 8 + i] = np.uint8(end - begin >> 8 * i & 0xFF)
+        used += _MESSAGE_HEAD
+        for i in range(end - begin):
+            out[used + i] = buffer[begin + i]
+        used += end - begin
+        first += 1
+    return first, used

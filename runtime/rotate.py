@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from .connection import plan_chunks
 from .container import canonical_json, replace_file
 from .errors import PansError, UsageError
+from .framing import Messages
 from .plan import Plan
 from .record import Recorder
 from .wire import Opcode, encode_command
@@ -137,6 +138,10 @@ class PartedRecorder:
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """See `Recorder`."""
         self._now.add_message(host_ns, data)
+
+    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None:
+        """See `Recorder`."""
+        self._now.add_messages(host_ns, messages, first, count)
 
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """See `Recorder`."""

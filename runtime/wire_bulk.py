@@ -73,13 +73,30 @@ class BulkDecoder:
     def feed(self, data: bytes | bytearray | memoryview) -> list[Frame]:
         """Return the frames that `data` completes, in order; damaged ones are counted and dropped."""
         if len(data) > CHUNK_BYTES:
-            return [self._frame(first, stop) for spans in self.bodies(data) for first, stop in spans.tolist()]
-        # One call of one kernel: what a small message costs is Python's way there and back.
-        taken = bytes(data)
-        count = kernels.take_in(taken, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
-        return [self._frame(first, stop) for first, stop in self._bodies[:count].tolist()] if count else []
+            return [self.frame(first, stop) for spans in self.bodies(data) for first, stop in spans.tolist()]
+        return [self.frame(first, stop) for first, stop in self.take(bytes(data)).tolist()]
 
-    def _frame(self, first: int, stop: int) -> Frame:
+    @staticmethod
+    def pieces(data: bytes) -> list[bytes]:
+        """Return `data` in pieces that `take` takes; all but very long reads are one."""
+        if len(data) <= CHUNK_BYTES:
+            return [data]
+        return [data[first : first + CHUNK_BYTES] for first in range(0, len(data), CHUNK_BYTES)]
+
+    def take(self, data: bytes) -> I64:
+        """Return the spans (n, 2) in `buffer` of what at most CHUNK_BYTES of `data` complete, valid until the next bytes.
+
+        One call of one kernel: what a small message costs is Python's way there and back.
+        """
+        count = kernels.take_in(data, self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, self._tally)
+        return self._bodies[:count]
+
+    def stream_stop(self, spans: I64, first: int, session: int) -> int:
+        """Return the place of the first of `spans` from `first` on that is no stream message of `session`."""
+        return int(kernels.stream_stop(self.buffer, spans, first, session))
+
+    def frame(self, first: int, stop: int) -> Frame:
+        """Return what lies between `first` and `stop` in `buffer` as a frame of its own."""
         kind, flags, _, session = HEADER.unpack_from(self._raw, first)
         return Frame(kind, flags, session, bytes(self._view[first + HEADER.size : stop]))
 
@@ -99,3 +116,4 @@ class BulkDecoder:
         tally = np.zeros(kernels.N_TALLIES, np.int64)
         kernels.unstuff_frames(self.buffer, 0, MAX_FRAME_BYTES, SCHEMA, self._bodies, tally)
         kernels.take_in(b"", self.buffer, MAX_FRAME_BYTES, SCHEMA, self._bodies, tally)
+        kernels.stream_stop(self.buffer, self._bodies[:0], 0, 1)

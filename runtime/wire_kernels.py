@@ -11,10 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from .wire_schema import MessageType
+
 FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = (
     range(11)
 )
 SMALLEST_BODY = 12  # header and CRC
+_CLICKS, _FRAMES, _MARK = (int(kind) for kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
 _U = np.uint64
 _ONE, _EIGHT, _SIXTEEN, _BYTE = _U(1), _U(8), _U(16), _U(0xFF)
 _S16, _S24, _S32, _S40, _S48, _S56 = _U(16), _U(24), _U(32), _U(40), _U(48), _U(56)
@@ -252,3 +255,14 @@ def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-unty
     tally[HELD] = used - tally[CONSUMED]
     tally[BYTES_IN] += len(data)
     return n_bodies
+
+
+@njit(cache=True, nogil=True)
+def stream_stop(buffer, spans, first, session):  # type: ignore[no-untyped-def]
+    """Return the place of the first body from `first` on that is no CLICKS, FRAMES or MARK of `session`; len(spans) without one."""
+    for place in range(first, spans.shape[0]):
+        start = _U(spans[place, 0])
+        kind = buffer[start]
+        if (kind != _CLICKS and kind != _FRAMES and kind != _MARK) or load4(buffer, start + _U(4)) != _U(session):
+            return place
+    return spans.shape[0]

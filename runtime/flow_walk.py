@@ -1,0 +1,122 @@
+"""The compiled way of a flow's messages: decoded FRAMES and MARK bodies into the ring, up to the first block of which something comes.
+
+Owns the ordinary case: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves untouched and stops there:
+`flow.FlowCore` then takes that one by itself, and both continue the same state. Never allocates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from .flow_kernels import EMPTY_FRAMES, NEXT, put_frames, scan
+from .wire_kernels import load4, load8
+from .wire_schema import MessageType
+
+# facts, int64 (N_FACTS,): where the stream stands, as ingest.StreamTracker and follower.Follower know it, ...
+NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, START_TICK = range(5)
+# ... what a block must be like, and when it should end, ...
+EXPOSURE_TICKS, PERIOD_TICKS, MAX_BLOCK, CYCLE_TICKS, DARK_CYCLE, WATCH_AT = range(5, 11)
+# ... and what came of the call
+BLOCKS, EXPOSURES, MARKS, PASSAGES, END_TICK, JITTER_TICKS, N_FACTS = range(11, 18)
+# a mark, int64 (N_MARK,); its photons stand beside it in an array of their own
+M_SEQ, M_OBJECT, M_TRUTH, M_EXPOSURE, M_TICK, M_HALF, N_MARK = range(7)
+
+_U = np.uint64
+_FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
+_HEADER, _BLOCK_HEADER, _MARK_BYTES = 8, 36, 32
+_LARGEST = _U(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
+
+
+@njit(cache=True, nogil=True)
+def walk(  # type: ignore[no-untyped-def]
+    buffer, spans, place, facts, slot_offsets, ring, limits, state, dark_channels, empty_channels, mask, marks, photons, out
+):  # fmt: skip
+    """Take messages from `place` on; return how many, 0 when that one is not ordinary.
+
+    buffer uint8, spans int64 (n, 2), facts int64 (N_FACTS,), slot_offsets int64 (slots of a cycle,) in ticks, ring (words, counts),
+    limits, state, dark_channels, empty_channels and out (passages) as in flow_kernels.py; `limits` is empty where no passages are looked
+    for: every block then ends the call. marks int64 (m, N_MARK) and photons float32 (m,) are filled; a full one ends the call too.
+    Ends behind the first block with passages (facts[PASSAGES] of them) and when facts[WATCH_AT] empty frames have been seen.
+    """
+    words, counts = ring
+    facts[BLOCKS] = facts[EXPOSURES] = facts[MARKS] = facts[PASSAGES] = 0
+    at = place
+    while at < spans.shape[0]:
+        start, stop = _U(spans[at, 0]), _U(spans[at, 1])
+        payload = start + _U(_HEADER)
+        if load4(buffer, payload) != _U(facts[NEXT_SEQ]):
+            break
+        if buffer[start] == _MARK:
+            if stop - payload != _U(_MARK_BYTES) or facts[MARKS] == marks.shape[0]:
+                break
+            if load8(buffer, payload + _U(12)) >= _LARGEST or load8(buffer, payload + _U(20)) >= _LARGEST:
+                break
+            _take_mark(buffer, payload, marks[facts[MARKS]], photons, facts[MARKS])
+            facts[MARKS] += 1
+            facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
+            at += 1
+            continue
+        count = _ordinary(buffer, start, payload, stop, facts, dark_channels.size) if buffer[start] == _FRAMES else 0
+        if not count:
+            break
+        first = facts[NEXT_EXPOSURE]
+        width = np.int64(load4(buffer, payload + _U(28)) >> _U(16))
+        frames_at = np.int64(payload) + _BLOCK_HEADER
+        frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
+        put_frames(frames, first, words, counts, facts[DARK_CYCLE], state, dark_channels, mask)
+        facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
+        facts[NEXT_EXPOSURE] = first + count
+        facts[BLOCKS] += 1
+        facts[EXPOSURES] += count
+        _note_end(buffer, payload, count, facts, slot_offsets)
+        at += 1
+        if not limits.size:
+            break
+        facts[PASSAGES] = scan(first + count, words, counts, limits, state, empty_channels, out)
+        if facts[PASSAGES] or state[NEXT] < first + count or state[EMPTY_FRAMES] >= facts[WATCH_AT]:
+            break
+    return at - place
+
+
+@njit(cache=True, nogil=True)
+def _take_mark(buffer, payload, row, photons, number):  # type: ignore[no-untyped-def]
+    row[M_SEQ], row[M_OBJECT] = np.int64(load4(buffer, payload)), np.int64(load4(buffer, payload + _U(4)))
+    packed = load4(buffer, payload + _U(8))
+    row[M_TRUTH], row[M_HALF] = np.int64(np.int16(np.uint16(packed & _U(0xFFFF)))), np.int64(packed >> _U(16))
+    row[M_EXPOSURE], row[M_TICK] = np.int64(load8(buffer, payload + _U(12))), np.int64(load8(buffer, payload + _U(20)))
+    photons[number : number + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
+
+
+@njit(cache=True, nogil=True)
+def _ordinary(buffer, start, payload, stop, facts, n_channels):  # type: ignore[no-untyped-def]
+    """Number of frames of a block that is the next one and fits the plan; 0 for any other."""
+    if stop - payload <= _U(_BLOCK_HEADER):
+        return 0
+    shape = load4(buffer, payload + _U(28))
+    count, width = np.int64(shape & _U(0xFFFF)), np.int64(shape >> _U(16))
+    first = load8(buffer, payload + _U(16))
+    if (
+        np.int64(stop - payload) != _BLOCK_HEADER + count * width
+        or count == 0
+        or count > facts[MAX_BLOCK]
+        or 8 * width < n_channels
+        or load4(buffer, payload + _U(4)) != _U(facts[DROPS])
+        or load8(buffer, payload + _U(8)) >= _LARGEST
+        or first != _U(facts[NEXT_EXPOSURE])
+        or np.int64(first) + count > facts[END_EXPOSURE]
+        or np.int64(load4(buffer, payload + _U(24))) != facts[PERIOD_TICKS]
+    ):
+        return 0
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _note_end(buffer, payload, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
+    """Note when the block's last exposure ended, and by how much that is not the plan's time."""
+    last = facts[NEXT_EXPOSURE] - 1
+    tick = np.int64(load8(buffer, payload + _U(8)))
+    facts[END_TICK] = tick + (count - 1) * facts[PERIOD_TICKS] + facts[EXPOSURE_TICKS]
+    cycle = last // slot_offsets.size
+    planned = facts[START_TICK] + cycle * facts[CYCLE_TICKS] + slot_offsets[last - cycle * slot_offsets.size]
+    facts[JITTER_TICKS] = max(facts[JITTER_TICKS], abs(facts[END_TICK] - planned - facts[EXPOSURE_TICKS]))
