@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from .detection import click_words, sample_clicks, word_probabilities
+from .ssim import ssim
 
 LOO_SAMPLES = 4
 SHARPNESS = 2.0  # of the soft decision in `decision_loss`
@@ -74,6 +75,23 @@ def decision_loss(weight: float) -> LossOf:
 def squared_error(scores: Tensor, images: Tensor) -> Tensor:
     """Return the mean squared difference over the last axis."""
     return (scores - images).square().mean(dim=-1)
+
+
+def similarity_loss(weight: float, image_shape: tuple[int, int]) -> LossOf:
+    """Return a loss between the squared error (`weight` 0) and 1 - SSIM (1) of pictures of `image_shape`, each as pixels in a row.
+
+    SSIM is of what is shown, cut to [0, 1]; the squared error is of what the head says, so that no pixel stays beyond black or white.
+    """
+
+    def loss_of(scores: Tensor, images: Tensor) -> Tensor:
+        error = squared_error(scores, images)
+        if weight == 0:
+            return error
+        shown, wanted = torch.broadcast_tensors(scores.clamp(0, 1), images)
+        alike = ssim(shown.unflatten(-1, image_shape), wanted.unflatten(-1, image_shape))
+        return (1 - weight) * error + weight * (1 - alike)
+
+    return loss_of
 
 
 def straight_through(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:

@@ -44,6 +44,7 @@ class Options:
     constant: bool = False  # learning rates as in the paper, instead of one cycle per estimator
     slope: float = 1.0  # of the light at the start; rises or falls to 1 within stage 1 (paper: slope annealing)
     clamp: float = math.inf  # most photoelectrons per exposure in stage 1 (paper: intensity clamping)
+    similarity: float = 0.0  # share of 1 - SSIM in the loss of pictures; the rest is the squared error
     polish: float = 0.0  # last part of the epochs, in which the loss turns from cross-entropy to wrong decisions
     encoder: str = "active"
     complex_field: bool = False  # of a coherent encoder: W complex; the paper's is real
@@ -75,6 +76,7 @@ def check_options(options: Options, profile: Profile) -> None:
         "shots": (1, 64),
         "warm": (0, 1),
         "polish": (0, 1),
+        "similarity": (0, 1),
         "mix": (0, 1),
         "shift_px": (0, 65536),
         "offset_px": (0, 65536),

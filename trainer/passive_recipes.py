@@ -118,9 +118,9 @@ def _fields(task: Task) -> Tensor:
 
 
 @functools.lru_cache(maxsize=1)
-def load(name: str, data_dir: str | None) -> Task:
+def load(name: str, data_dir: str | None, data_seed: int = 0) -> Task:
     """Return the task; MMF tasks with the release's input: normalised speckle intensity as a real field."""
-    task = load_task(TASKS.get(name, name), data_dir)
+    task = load_task(TASKS.get(name, name), data_dir, data_seed=data_seed)
     if task.optics != "mmf":
         return task
     return replace(task, light="field", optics="none", train=_speckle(task.train), test=_speckle(task.test))
@@ -128,4 +128,4 @@ def load(name: str, data_dir: str | None) -> Task:
 
 def _speckle(objects: Objects) -> Objects:
     speckle = task_mmf.release_intensity(objects.images)
-    return Objects(np.rint(255 * speckle).astype(np.uint8), objects.labels)
+    return Objects(np.rint(255 * speckle).astype(np.uint8), objects.labels, behind=objects.images)

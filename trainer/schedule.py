@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from .estimators import LossOf, decision_loss, squared_error
+from .estimators import LossOf, decision_loss, similarity_loss
 from .options import Options
 
 
@@ -59,10 +59,10 @@ def slope_and_clamp(options: Options, now: float) -> tuple[float, float]:
     return options.slope ** (1 - done), options.clamp
 
 
-def loss_at(options: Options, now: float, *, is_image: bool) -> LossOf:
-    """Return the cross-entropy, which turns to wrong decisions in the last part of the epochs; of images the squared error."""
-    if is_image:
-        return squared_error
+def loss_at(options: Options, now: float, picture_shape: tuple[int, int] | None) -> LossOf:
+    """Return the cross-entropy, which turns to wrong decisions in the last part of the epochs; of pictures error and similarity."""
+    if picture_shape is not None:
+        return similarity_loss(options.similarity, picture_shape)
     part = options.polish * options.epochs
     into = now - (options.epochs - part)
     return decision_loss(min(1.0, into / (0.3 * part)) if part > 0 and into > 0 else 0.0)

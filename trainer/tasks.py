@@ -32,13 +32,19 @@ HOLD_OUT_EVERY = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objects:
-    """Labelled images: uint8 (n, height, width) and int64 (n,)."""
+    """Labelled images: uint8 (n, height, width) and int64 (n,); `behind`: what gave rise to them, where it is asked for."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.int64]
+    behind: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @property
+    def pictures(self) -> NDArray[np.uint8]:
+        """What a task of pictures wants back: the images, or what lies behind them."""
+        return self.images if self.behind is None else self.behind
 
 
 @dataclass(frozen=True, slots=True, eq=False)

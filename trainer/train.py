@@ -30,7 +30,7 @@ from .checkpoint import read_checkpoint, write_checkpoint
 from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from .device import new_generator
 from .encoders import ActiveIllumination, Encoder, new_encoder
-from .estimators import ESTIMATORS, LossOf, cross_entropy, squared_error
+from .estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
 from .field_basis import in_pixels
 from .head_fit import fit_head
 from .heads import Heads, new_head
@@ -165,7 +165,7 @@ class Run:
             photons = light.sum(dim=1).mean()
             slope, clamp = schedule.slope_and_clamp(options, now)
             p = click_probability(light.clamp(max=clamp), law, slope)
-            loss_of = schedule.loss_at(options, now, is_image=data.is_image)
+            loss_of = schedule.loss_at(options, now, data.picture_shape)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
             if options.mix > 0 and self.epoch >= schedule.second_stage(options):
                 loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
@@ -233,7 +233,7 @@ class Run:
         """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples."""
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
         target = self.data.target[self.data.n_fit :]
-        loss_of = schedule.loss_at(self.options, self.epoch, is_image=self.data.is_image)
+        loss_of = schedule.loss_at(self.options, self.epoch, self.data.picture_shape)
         random = new_generator(self.options.seed)
         self.head.eval()
         with torch.no_grad():
@@ -251,12 +251,12 @@ class Run:
             with torch.no_grad():
                 floats = (self.encoder.weight**2).cpu().numpy().copy()
             quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
-        p = self.probabilities(0, len(self.data.labels))
+        p, shape = self.probabilities(0, len(self.data.labels)), self.data.picture_shape
         fit_head(
             self.head,
             p,
             self.data.target,
-            squared_error if self.data.is_image else cross_entropy,
+            cross_entropy if shape is None else similarity_loss(self.options.similarity, shape),
             self.random,
             exact=self.options.features <= EXACT_FEATURES_MAX,
             n_outputs=self.data.n_outputs,

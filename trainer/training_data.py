@@ -41,11 +41,12 @@ class TrainingData:
         self.image_shape = task.image_shape
         self.is_image = task.target == "image"
         if self.is_image:
-            flat = placed.images.reshape(len(placed), -1)
+            flat = placed.pictures.reshape(len(placed), -1)
             self.target, self.n_outputs = torch.from_numpy(flat.astype("float32") / 255), flat.shape[1]
         else:
             self.target, self.n_outputs = self.labels, len(task.classes)
         self.shown, self.labels, self.target = here(self.shown), here(self.labels), here(self.target)
+        self.picture_shape = self.image_shape if self.is_image else None  # of what is to be given back
         self.n_fit = len(self.labels) - max(1, len(self.labels) // VALIDATION_PART)
 
 
