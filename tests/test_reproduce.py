@@ -176,7 +176,6 @@ def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatc
     )
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "load", lambda *_: task)
-    monkeypatch.setattr(passive, "load_task", lambda *_: task)
     found = passive.make_cell(tmp_path, "mmf-mnist-image", row, 0.01, None, lambda _line: None)
     assert 0.2 < found["value"] < 1.0
     assert found["illumination"] == 0.0

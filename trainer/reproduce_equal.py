@@ -94,7 +94,7 @@ def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
 def _pans(task: Task, photons: float) -> dict[str, Any]:
     options, profile = recipe(task.name, photons), load_profile(PROFILE)
     trained = train(task, profile, options, basis=basis_of(task.name, task, options))
-    return measure(task.name, task, task, trained) | {"options": plain_options(options)}
+    return measure(task.name, task, trained) | {"options": plain_options(options)}
 
 
 def _direct(task: Task, way: str, photons: float) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from .options import EXACT_FEATURES_MAX, plain_options, same_options
 from .paper_tables import PassiveRow
 from .passive_recipes import TASKS, basis_of, load, recipe
 from .ssim import ssim
-from .tasks import Objects, Task, load_task
+from .tasks import Objects, Task
 from .train import Trained, train
 from .training_data import CHUNK, encoder_input
 
@@ -61,7 +61,6 @@ def make_cell(
     options = recipe(name, row, dark)
     path = _path(cache, name, row, dark)
     task, profile = load(name, data_dir), load_profile(PROFILE)
-    target = load_task(name, data_dir) if task.target == "image" else task  # what lies behind the speckle
     started = time.process_time()
     trained = (
         solve(options, profile)
@@ -75,7 +74,7 @@ def make_cell(
         "dark": dark,
         "options": plain_options(options),
         "cpu_seconds": seconds,
-        **measure(name, task, target, trained),
+        **measure(name, task, trained),
     }
     if name == "barcode" and dark == 0:
         best = solve_patterns(options, profile, "balanced")[0][0]
@@ -96,7 +95,7 @@ def make_cell(
     return figures
 
 
-def measure(name: str, task: Task, target: Task, trained: Trained) -> dict[str, Any]:
+def measure(name: str, task: Task, trained: Trained) -> dict[str, Any]:
     """Return accuracy in % (or SSIM), its spreads, clicks, photons and illumination over the held-out objects."""
     objects, weights = task.test, np.full(len(task.test), 1 / len(task.test))
     if name == "barcode":  # all strings there are
@@ -107,7 +106,7 @@ def measure(name: str, task: Task, target: Task, trained: Trained) -> dict[str, 
     share = torch.from_numpy(weights)
     with torch.no_grad():
         if task.target == "image":
-            value, over_trials, of_object = _similarity(trained, p, target.test.images)
+            value, over_trials, of_object = _similarity(trained, p, task.test.pictures)
         else:
             value, over_trials, of_object = _accuracy(trained, p, torch.from_numpy(objects.labels), share)
         return {
