@@ -41,7 +41,8 @@ def test_a_row_is_trained_from_another_seed_too_and_both_are_kept(bars, tmp_path
     assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) is None
     found = active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=False)
     (other,) = found["other_seeds"]
-    assert found["options"]["seed"] == 0 and other["options"]["seed"] == 1000
+    assert found["options"]["seed"] == 0
+    assert other["options"]["seed"] == 1000
     assert found["sha256"] != other["sha256"]
     assert active.finished_row(tmp_path, "mnist", ROW, 1000) == json.loads(json.dumps(other))
     assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) == json.loads(json.dumps(found))
