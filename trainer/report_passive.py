@@ -5,11 +5,12 @@ Owns words and columns; never measures. `markdown` takes what reproduce_passive.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from .paper_tables import CLICKS_TOLERANCE, PASSIVE, UNPRINTED, PassiveRow, PassiveTable
 
-Done = list[tuple[PassiveRow, dict[str, Any]]]
+Done = Sequence[tuple[PassiveRow, dict[str, Any]]]
 
 
 def table_of(name: str) -> PassiveTable:
@@ -17,8 +18,8 @@ def table_of(name: str) -> PassiveTable:
     return PASSIVE.get(name) or UNPRINTED[name]
 
 
-def markdown(name: str, done: Done) -> str:
-    """Return the page of one task."""
+def markdown(name: str, done: Done, others: Done = ()) -> str:
+    """Return the page of one task; `others` are cells of the same recipe on other draws of the generator."""
     table = table_of(name)
     lines = [
         f"# {name}: " + ("the paper's table" if name in PASSIVE else "no figures in the paper's tables"),
@@ -32,6 +33,7 @@ def markdown(name: str, done: Done) -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
         *(_line(table, row, figures) for row, figures in done),
         "",
+        *_other_draws(others),
         *_NOTES.get(name, _OUR_IMAGES),
         *(_balanced(done) if name == "barcode" else ()),
         "",
@@ -57,6 +59,17 @@ def _verdict(table: PassiveTable, done: Done) -> list[str]:
         + (f"not at d_f = {', '.join(over)}" if over else "all"),
         "",
     ]
+
+
+def _other_draws(others: Done) -> list[str]:
+    """One line: what the same recipe reaches where nothing was chosen."""
+    if not others:
+        return []
+    cells = [
+        f"d_f = {row.features}, dark {f['dark']:g}, seed {f['data_seed']}: {f['value']:.2f} @ {f['clicks']:.2f} clicks"
+        for row, f in others
+    ]
+    return [f"The same recipe on other draws of the generator (`--data-seed`): {'; '.join(cells)}.", ""]
 
 
 def _balanced(done: Done) -> list[str]:

@@ -98,9 +98,10 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from . import reproduce_passive as passive
     from .figures import measure_over_patterns
     from .generators import GENERATORS
+    from .passive_recipes import TASKS
     from .report_passive import markdown, table_of
 
-    drawn = passive.TASKS.get(name, name) in GENERATORS and name != "barcode"  # all its strings are judged
+    drawn = TASKS.get(name, name) in GENERATORS and name != "barcode"  # all its strings are judged
     if args.data_seed and (args.out or not drawn):
         remedy = (
             "leave out -o; the page is of draw 0 and names others" if drawn else f"{name} is not drawn: leave it out"

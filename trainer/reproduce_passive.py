@@ -28,7 +28,7 @@ from . import task_barcode
 from .barcode_search import solve, solve_patterns
 from .detection import click_probability, click_words, sample_clicks, word_probabilities
 from .export import export_trained
-from .options import EXACT_FEATURES_MAX, plain_options, same_options
+from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .paper_tables import PassiveRow
 from .passive_recipes import TASKS, basis_of, load, recipe
 from .ssim import ssim
@@ -41,26 +41,42 @@ TRIALS = 5
 SPECKLE = ("mmf-mnist", "mmf-mnist-image")  # in the release's way: images that no instrument sees
 
 
-def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float) -> dict[str, Any] | None:
+def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> dict[str, Any] | None:
     """Return the figures of a model that was trained by the present recipe, or None."""
-    path = _path(cache, name, row, dark)
+    return _finished(_path(cache, name, row, dark, data_seed), recipe(name, row, dark))
+
+
+def other_draws(cache: Path, name: str, row: PassiveRow, dark: float) -> list[dict[str, Any]]:
+    """Return the figures of the same recipe on other draws of the generator (`data_seed` above 0), in the order of their seeds."""
+    paths = cache.glob(f"{_path(cache, name, row, dark).stem}-data*.json")
+    found = [figures for path in paths if (figures := _finished(path, recipe(name, row, dark))) is not None]
+    return sorted(found, key=lambda figures: figures["data_seed"])
+
+
+def _finished(path: Path, options: Options) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     found: dict[str, Any] = json.loads(path.read_text())
-    return found if same_options(found["options"], recipe(name, row, dark)) else None
+    return found if same_options(found["options"], options) else None
 
 
-def _path(cache: Path, name: str, row: PassiveRow, dark: float) -> Path:
-    return cache / f"{name}-{row.features}-{dark:g}.json"
+def _path(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> Path:
+    return cache / (f"{name}-{row.features}-{dark:g}" + (f"-data{data_seed}" if data_seed else "") + ".json")
 
 
 def make_cell(
-    cache: Path, name: str, row: PassiveRow, dark: float, data_dir: str | None, report: Callable[[str], None]
+    cache: Path,
+    name: str,
+    row: PassiveRow,
+    dark: float,
+    data_dir: str | None,
+    report: Callable[[str], None],
+    data_seed: int = 0,
 ) -> dict[str, Any]:
-    """Train and measure one model; its figures go to the cache and are returned."""
+    """Train and measure one model, on the draw `data_seed` of a drawn task; its figures go to the cache and are returned."""
     options = recipe(name, row, dark)
-    path = _path(cache, name, row, dark)
-    task, profile = load(name, data_dir), load_profile(PROFILE)
+    path = _path(cache, name, row, dark, data_seed)
+    task, profile = load(name, data_dir, data_seed), load_profile(PROFILE)
     started = time.process_time()
     trained = (
         solve(options, profile)
@@ -72,6 +88,7 @@ def make_cell(
         "task": name,
         "features": row.features,
         "dark": dark,
+        "data_seed": data_seed,
         "options": plain_options(options),
         "cpu_seconds": seconds,
         **measure(name, task, trained),
@@ -82,7 +99,8 @@ def make_cell(
     if name not in SPECKLE:  # what a bundle looks at must be what the task shows
         provenance = {
             "task_argument": TASKS.get(name, name),
-            "command": f"pans reproduce {name} --rows {row.features} --dark {dark:g}",
+            "command": f"pans reproduce {name} --rows {row.features} --dark {dark:g}"
+            + (f" --data-seed {data_seed}" if data_seed else ""),
             "options": plain_options(options),
         }
         title = f"{name}-{row.features}-dark{dark:g}"
