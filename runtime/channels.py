@@ -107,6 +107,28 @@ class ChannelHealth:
             findings.append(finding)
         return findings
 
+    def note_dead(self, channels: tuple[int, ...], words: str) -> list[Finding]:
+        """Channels have been found dead by other means (lit_watch.py): return the finding, none where the state is known."""
+        known = [state.finding for held, state in self._states.items() if set(channels) <= set(held)]
+        if any(finding.kind == "dead" for finding in known):
+            return []
+        for held in [held for held in self._states if set(held) <= set(channels)]:
+            del self._states[held]
+        now, expected = self._watch.exposures, float(self._watch.expected[list(channels)].mean())
+        level = "alarm" if len(channels) == self._watch.n_channels else "warning"
+        finding = Finding("dead", level, channels, now, now, 0.0, expected, words)
+        self._states[channels] = _State(finding, 0, 0, self._watch.clicks.copy(), 0, now)
+        return [finding]
+
+    def note_returned(self, channel: int) -> list[Finding]:
+        """A channel clicks again: return that its being dead is over, nothing where it was not taken for dead."""
+        over = []
+        for channels, state in list(self._states.items()):
+            if channel in channels and state.finding.kind == "dead":
+                del self._states[channels]
+                over.append(self._over(state))
+        return over
+
     def _look_again(self) -> list[Finding]:
         """Add what came since to every state, and end those whose channels click as expected again."""
         over = []

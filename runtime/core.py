@@ -95,6 +95,8 @@ class Core(Follower):
             flags |= DecisionFlag.WRONG_PATTERN
         if flags:
             flags |= DecisionFlag.ABSTAINED
+        elif self.guard is not None:
+            self.guard.take_object(window.counts, window.object_index)
         decider = self._decider
         if self.guard is not None:
             flags |= self.guard.flags

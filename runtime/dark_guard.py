@@ -24,9 +24,10 @@ from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_p
 from .dark_watch import FLOOR_RATE, Alarm, ChannelWatch
 from .decide import Decider
 from .errors import UsageError
+from .lit_watch import LitWatch, Silence
 from .plan import Plan
 from .record_format import DecisionFlag
-from .wire import DARK_PATTERN, ClickBlock, FrameBlock
+from .wire import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 POLICIES = ("warn", "tables", "mask", "abstain")
 REMAKE = 2  # a table is made again when this many times the dark exposures are behind the rates
@@ -45,6 +46,7 @@ class DarkGuard:
         bundle: Bundle | None = None,
         shots: int = 1,
         afterpulses: bool = False,
+        lit: LitWatch | None = None,
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
@@ -55,6 +57,9 @@ class DarkGuard:
                 remedy="use --on-dark abstain",
             )
         self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
+        self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
+        self._any_click = np.zeros(1, np.int64)
+        self._news: list[dict[str, Any]] = []
         self.findings: list[Finding] = []
         self.dropped_findings = 0
         self._dark_slot = plan.slot_pattern == DARK_PATTERN
@@ -70,16 +75,61 @@ class DarkGuard:
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming."""
         self.watch.warm_up()
+        if self.lit is not None:
+            self.lit.warm_up()
 
     def restart(self) -> None:
         """Follow another stream: its exposures count from 0 again, the rates go on."""
+        if self.lit is not None:
+            self.lit.end_object()
         self._next, self._silent_before = 0, None
 
     def take(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
-        """Take the dark exposures of a block and return events.
+        """Take a block: its dark exposures, and what its lit ones say about dead channels; return events.
 
         With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
         """
+        if self.lit is not None:
+            words = block.words if isinstance(block, FrameBlock) else np.asarray(block.bits).reshape(-1, 1)
+            self.lit.take_exposures(words)
+            self._look_for_dead()
+        events = self._take_dark(block)
+        return self.news() + events
+
+    def take_object(self, counts: NDArray[np.int64], number: int) -> None:
+        """Take the clicks of a whole window, int64 (d_f,), of object `number` (NO_OBJECT: one of its own).
+
+        What it says holds from this decision on; `news` has the events.
+        """
+        if self.lit is None:
+            return
+        if not self._parallel:
+            self._any_click[0] = counts.sum()
+            counts = self._any_click
+        self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
+        self._look_for_dead()
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return the events of what was found with objects, once."""
+        news, self._news = self._news, []
+        return news
+
+    def _look_for_dead(self) -> None:
+        assert self.lit is not None
+        if not self.lit.has_news:
+            return
+        found = [one for channel in self.lit.returned() for one in self.health.note_returned(channel)]
+        dead = self.lit.look()
+        if len(dead) > 1 and len(dead) == self.lit.n_channels:
+            words = _silence_words("no channel", self._parallel, dead[0])
+            found += self.health.note_dead(tuple(range(len(dead))), words)
+        else:
+            for one in dead:
+                who = f"channel {one.channel} never" if self._parallel else "the detector never"
+                found += self.health.note_dead((one.channel,), _silence_words(who, self._parallel, one))
+        self._news += self._keep(found)
+
+    def _take_dark(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
         if isinstance(block, FrameBlock):
             if not self._any_dark:
                 return []
@@ -99,10 +149,17 @@ class DarkGuard:
 
     def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[dict[str, Any]]:
         """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return events."""
-        return self._found(self.watch.update(frames, clicks)) if frames else []
+        if not frames:
+            return []
+        if self.lit is not None:
+            self.lit.take_counts(frames, clicks)
+            self._look_for_dead()
+        return self.news() + self._found(self.watch.update(frames, clicks))
 
     def _found(self, alarms: list[Alarm]) -> list[dict[str, Any]]:
-        found = self.health.take(alarms)
+        return self._keep(self.health.take(alarms))
+
+    def _keep(self, found: list[Finding]) -> list[dict[str, Any]]:
         kept = found[: max(0, MAX_FINDINGS - len(self.findings))]
         self.findings += kept
         self.dropped_findings += len(found) - len(kept)
@@ -193,3 +250,16 @@ class DarkGuard:
             self._made = AdaptedTable(adapted_scores(self._table, word_prior(self._seen), extra, masked))
             self._made_for = key
         return self._made
+
+
+def _silence_words(who: str, has_others: bool, silence: Silence) -> str:
+    if silence.proved:
+        return (
+            f"{who} clicked in {silence.length} exposures, lit and dark, though dark counts alone would make it "
+            f"({silence.rate:.2g} per exposure at least): dead or disconnected, whatever the scene"
+        )
+    others = "; the other channels click as before" if has_others else ""
+    cause = (
+        "a dead or disconnected channel" if has_others else "dead or disconnected, or no light at all (lamp, shutter)"
+    )
+    return f"{who} clicked with {silence.length} objects in a row, of which {silence.rate:.3g} made it click before{others}: {cause}"

@@ -30,7 +30,7 @@ from .record_format import NO_LABEL, DecisionFlag
 from .sliding import log_evidence
 from .verdict import Verdict, softmax_winner
 from .window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
-from .wire import DARK_PATTERN, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
+from .wire import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
 
 MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of the kernel; it is called again
@@ -203,7 +203,7 @@ class FlowCore(Follower):
         """Without dark slots, the frames in which no object was found tell the dark rates."""
         frames, clicks = self.empty_frames - self._watched[0], self.empty_channels - self._watched[1]
         if frames < WATCHED_FRAMES:
-            return []
+            return guard.news()
         self._watched = (self.empty_frames, self.empty_channels.copy())
         return guard.take_empty(frames, np.minimum(clicks, frames))
 
@@ -294,6 +294,8 @@ class FlowCore(Follower):
                 flags |= DecisionFlag.GAP
             else:
                 clicks, crc = int(self._clicks.sum()), zlib.crc32(self._clicks.tobytes())
+                if self.guard is not None:
+                    self.guard.take_object(self._clicks.sum(axis=0), NO_OBJECT)
         if self.guard is not None:
             alarmed = self.guard.flags
             flags |= alarmed if alarmed & DecisionFlag.ABSTAINED else NO_FLAGS

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from .live_run import LiveRun
     from .plan import Plan
 
-FALSE_ALARM_H = 240.0  # hours between false alarms about the dark counts, in the mean
+FALSE_ALARM_H = (
+    240.0  # hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
+)
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
 NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
@@ -110,6 +112,10 @@ class DarkRun:
             "low": low.tolist(),
             "high": high.tolist(),
             "afterpulses": self.profile.detector.afterpulse_probability > 0,
+            "lit": {
+                "arl_exposures": max(LEAST_ARL, 2 * FALSE_ALARM_H * plan.slots_per_cycle * 3.6e9 / plan.cycle_us),
+                "arl_objects": max(LEAST_ARL, 2 * FALSE_ALARM_H * 3600 * plan.objects_hz),
+            },
         }
         return made_guard(self._header, plan, bundle, shots)
 
@@ -155,10 +161,14 @@ def made_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int
     """Return the guard that a header speaks of, None if of none; KeyError, TypeError or ValueError if it is damaged."""
     from .dark_guard import DarkGuard
     from .dark_watch import ChannelWatch, WatchSettings
+    from .lit_watch import LitWatch
 
     if not header:
         return None
     expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
     settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
     watch = ChannelWatch(len(expected), expected, settings, low, high)
-    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]))
+    lit = None
+    if "lit" in header:  # recordings made before have none
+        lit = LitWatch(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)
