@@ -28,6 +28,7 @@ from .evidence import DISK, GC, IDLE, INFERENCE, OVERSLEPT, Evidence, Facts, Spa
 NS_PER_MS = 1_000_000
 CAUSES = ("link", "device", "host", "gc", "disk", "inference", "decode")
 QUIET_NS = 50 * NS_PER_MS  # without late work: the incident is over, and the probes sent within it are back
+PATIENCE_NS = 4 * QUIET_NS  # with the counters' thread, for a reading after the incident; then the loop reads them
 LONGEST_INCIDENT_NS = 1_000 * NS_PER_MS  # a run that is late all the time gets a verdict per second
 LEG_NS = 500_000  # a way that takes longer than this and half the delay is no ordinary one
 
@@ -233,7 +234,7 @@ class Incidents:
     _waiting: deque[_Incident] = field(default_factory=deque)  # for their verdicts, the oldest first
 
     def late(self, work: LateWork) -> None:
-        """Take one late decision; the first of an incident reads the system's counters at once.
+        """Take one late decision.
 
         It belongs to the incident before it if that was not over when its own exposure ended.
         """
@@ -244,7 +245,6 @@ class Incidents:
             or work.end_ns - latest.first.end_ns > LONGEST_INCIDENT_NS
         ):
             self._waiting.append(_Incident(work, work, work))
-            self.evidence.sample(work.end_ns)
             return
         if work.end_ns - work.begin_ns > latest.worst.end_ns - latest.worst.begin_ns:
             latest.worst = work
@@ -256,11 +256,13 @@ class Incidents:
         if not self._waiting:
             return None
         oldest = self._waiting[0]
-        if not final and now_ns - oldest.last.end_ns < QUIET_NS and now_ns - oldest.first.end_ns < LONGEST_INCIDENT_NS:
+        quiet_ns, end_ns = now_ns - oldest.last.end_ns, oldest.worst.end_ns
+        if not final and quiet_ns < QUIET_NS and now_ns - oldest.first.end_ns < LONGEST_INCIDENT_NS:
+            return None
+        if not final and quiet_ns < PATIENCE_NS and not self.evidence.heard_since(end_ns):
             return None
         self._waiting.popleft()
         first, worst, last, decisions = oldest.first, oldest.worst, oldest.last, oldest.decisions
-        self.evidence.sample(now_ns)
         verdict = judge(self.evidence.facts(*worst[1:]))
         self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + decisions
         return {

@@ -1,32 +1,32 @@
 """What was going on while work became late: spans of the loop's time, the scheduler's counters, messages that say when they left.
 
-Owns the collecting, in bounded memory: nothing here looks at a photon, and nothing is read from the system per block. Never judges
-(blame.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept: none of them
-alone can make anything late. In virtual time the machine is no witness and is not asked.
+Owns the collecting, in bounded memory: nothing here looks at a photon, and a thread of its own reads the system (counters.py). Never
+judges (blame.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept: none of
+them alone can make anything late. In virtual time the machine is no witness and is not asked.
 """
 
 from __future__ import annotations
 
 import gc
-import os
-import sys
 import threading
 import time
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from .counters import Counters
 from .plan import Plan
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
-SAMPLE_EVERY_NS = 100 * NS_PER_MS
+STALE_NS = 250 * NS_PER_MS  # a counters' thread that was not heard for so long is starved: the loop reads for itself
 FLOOR_NS = 100 * NS_PER_US
 OVERSLEPT_NS = 500 * NS_PER_US  # a timer that fires later than this was not the timer's fault
 MAX_SPANS = 1024
-MAX_SAMPLES = 64
 MAX_STAMPED = 64
 MAX_ARRIVALS = 512
 
@@ -43,16 +43,6 @@ class Span(NamedTuple):
     begin_ns: int
     end_ns: int
     cpu_ns: int = -1
-
-
-class Sample(NamedTuple):
-    """Counters of the system at `at_ns`; they only ever grow. `run_delays_ns`: of each watched thread, waiting for a processor."""
-
-    at_ns: int
-    cpu_ns: int  # that the loop's thread has computed
-    run_delays_ns: tuple[int, ...]
-    steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
-    switches: int  # involuntary, of the loop's thread
 
 
 class Stamped(NamedTuple):
@@ -91,11 +81,9 @@ class Evidence:
         self._now, self._virtual, self._pause_ns = now_ns, virtual, pause_ns
         self._arrivals: deque[int] = deque(maxlen=MAX_ARRIVALS)
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
-        self._samples: deque[Sample] = deque(maxlen=MAX_SAMPLES)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
         self._collecting_ns = self._cpu_mark_ns = 0
-        self._due_ns = 0
-        self._counters = _Counters([])
+        self._counters = Counters(now_ns, [])
 
     def watch(self, threads: Iterable[int | None] = ()) -> None:
         """From here on watch collections, the calling thread (the loop's) and `threads`, by native id; a new link has a new reader."""
@@ -104,9 +92,7 @@ class Evidence:
         if self._on_gc not in gc.callbacks:
             gc.callbacks.append(self._on_gc)
         self._counters.close()
-        self._counters = _Counters([threading.get_native_id(), *(thread for thread in threads if thread)])
-        self._samples.clear()
-        self.sample(self._now())
+        self._counters = Counters(self._now, [threading.get_native_id(), *(thread for thread in threads if thread)])
 
     def close(self) -> None:
         """End: leave the collector as it was found; idempotent."""
@@ -143,33 +129,36 @@ class Evidence:
         """Note a message that says when it left the device."""
         self._stamped.append(message)
 
-    def sample(self, now_ns: int) -> None:
-        """Read the system's counters: some ten microseconds, so at most ten times per second, and when something is late."""
-        if not self._virtual:
-            self._samples.append(self._counters.read(now_ns))
-            self._due_ns = now_ns + SAMPLE_EVERY_NS
+    def heard_since(self, end_ns: int) -> bool:
+        """Return whether the system's counters were read after `end_ns`; in virtual time nobody asks them."""
+        return self._virtual or self._counters.heard_ns >= end_ns
 
-    def sample_in_slack(self, now_ns: int) -> None:
-        """Read the counters if they are due; to be called when there is nothing else to do."""
-        if now_ns >= self._due_ns:
-            self.sample(now_ns)
+    def read_if_stale(self, now_ns: int) -> None:
+        """Read the counters here and now if nobody has done so for STALE_NS, as a loop that is never away makes it happen."""
+        if not self._virtual and now_ns - self._counters.heard_ns >= STALE_NS:
+            self._counters.read()
 
     # -- what is known -------------------------------------------------------------------------------------------------
 
     def facts(self, begin_ns: int, arrival_ns: int, end_ns: int, uncertainty_ns: int) -> Facts:
         """Return what is known about the time from `begin_ns` to `end_ns`, both host times."""
-        first, last = self._around(begin_ns, end_ns)
+        if not self.heard_since(end_ns):
+            self._counters.read()
+        first, last = self._counters.around(begin_ns, end_ns)
         cpu_ns = last.cpu_ns - first.cpu_ns
         own, *readers = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
         # a reader that waits while the loop computes waits for the loop
         delay_ns = max([own, *(delay - cpu_ns for delay in readers)])
+        spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends
+        first_span = bisect_right(spans, begin_ns, key=attrgetter("end_ns"))
+        first_arrival = bisect_right(arrivals_ns, begin_ns)
         return Facts(
             begin_ns,
             arrival_ns,
             end_ns,
             uncertainty_ns,
-            tuple(span for span in self._spans if span.end_ns > begin_ns and span.begin_ns < end_ns),
-            tuple(arrival for arrival in self._arrivals if begin_ns < arrival < end_ns),
+            tuple(span for span in spans[first_span:] if span.begin_ns < end_ns),
+            tuple(arrivals_ns[first_arrival : bisect_left(arrivals_ns, end_ns)]),
             self._pause_ns,
             cpu_ns,
             delay_ns,
@@ -183,67 +172,12 @@ class Evidence:
             ),
         )
 
-    def _around(self, begin_ns: int, end_ns: int) -> tuple[Sample, Sample]:
-        """The latest sample before and the first one after; as near as there are."""
-        if not self._samples:
-            nothing = Sample(0, 0, (), 0, 0)
-            return nothing, nothing
-        before = [sample for sample in self._samples if sample.at_ns <= begin_ns]
-        after = [sample for sample in self._samples if sample.at_ns >= end_ns]
-        return before[-1] if before else self._samples[0], after[0] if after else self._samples[-1]
-
     def _on_gc(self, phase: str, info: dict[str, Any]) -> None:
         if phase == "start":
             self._collecting_ns = self._now()
         elif self._collecting_ns:
             self.worked(GC, self._collecting_ns, self._now())
             self._collecting_ns = 0
-
-
-class _Counters:
-    """The scheduler's counters of some threads and the machine's stolen time; zeros where the system does not tell."""
-
-    def __init__(self, threads: list[int]) -> None:
-        self._files = [_open(f"/proc/self/task/{thread}/schedstat") for thread in threads]
-        self._stat = _open("/proc/stat") if threads else None
-        self._tick_ns = NS_PER_S // (os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100)
-
-    def read(self, now_ns: int) -> Sample:
-        delays = tuple(_field(file, 1) for file in self._files)
-        return Sample(
-            now_ns, time.thread_time_ns(), delays, _field(self._stat, 8) * self._tick_ns, _involuntary_switches()
-        )
-
-    def close(self) -> None:
-        for file in (*self._files, self._stat):
-            if file is not None:
-                os.close(file)
-        self._files, self._stat = [], None
-
-
-def _open(path: str) -> int | None:
-    try:
-        return os.open(path, os.O_RDONLY)
-    except OSError:
-        return None
-
-
-def _field(file: int | None, index: int) -> int:
-    """Field `index` of a file's first line, which the kernel makes afresh for each read from its start."""
-    if file is None:
-        return 0
-    try:
-        return int(os.pread(file, 512, 0).partition(b"\n")[0].split()[index])
-    except (OSError, ValueError, IndexError):
-        return 0
-
-
-def _involuntary_switches() -> int:
-    if sys.platform != "linux":
-        return 0
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 
 def longest_pause_ns(plan: Plan) -> int:

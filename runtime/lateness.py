@@ -83,7 +83,7 @@ class Lateness:
         if idle and not self._asked and now_ns >= self.block_ns + self._patience_ns:
             connection.session.probe(now_ns)  # is the link open while the block is overdue?
             self._asked = True
-        self.evidence.sample_in_slack(now_ns)
+        self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)
 
     def last_words(self, now_ns: int) -> list[dict[str, Any]]:
