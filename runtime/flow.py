@@ -36,6 +36,10 @@ MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of the kernel; it is called again
 MAX_MARKS_AT_ONCE = 64
 NO_FLAGS = DecisionFlag(0)
+# the same as plain integers: an enumeration's operators cost a microsecond each
+_GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS = (
+    int(flag) for flag in (DecisionFlag.GAP, DecisionFlag.ABSTAINED, DecisionFlag.NOT_FINITE, DecisionFlag.AMBIGUOUS)
+)
 WATCHED_FRAMES = 256  # empty frames that the guard is told of at once
 Q = 32  # bits after the point of a bar's alignment, in exposures
 
@@ -201,9 +205,10 @@ class FlowCore(Follower):
 
     def _watch_empty(self, guard: DarkGuard) -> list[dict[str, Any]]:
         """Without dark slots, the frames in which no object was found tell the dark rates."""
-        frames, clicks = self.empty_frames - self._watched[0], self.empty_channels - self._watched[1]
+        frames = self.empty_frames - self._watched[0]
         if frames < WATCHED_FRAMES:
             return guard.news()
+        clicks = self.empty_channels - self._watched[1]
         self._watched = (self.empty_frames, self.empty_channels.copy())
         return guard.take_empty(frames, np.minimum(clicks, frames))
 
@@ -285,32 +290,32 @@ class FlowCore(Follower):
 
     # -- one decision --------------------------------------------------------------------------------------------------
 
-    def _row(self, passage: Passage, first: int, end_tick: int, flags: DecisionFlag, out: Rows) -> None:
-        """Decide on the window from exposure `first` on, which ended at `end_tick`; `flags` say why it must not be decided."""
-        label, probability, clicks, crc = NO_LABEL, 0.0, 0, 0
-        if not flags & DecisionFlag.GAP:
+    def _row(self, passage: Passage, first: int, end_tick: int, why: DecisionFlag, out: Rows) -> None:
+        """Decide on the window from exposure `first` on, which ended at `end_tick`; `why` it must not be decided."""
+        label, probability, clicks, crc, flags = NO_LABEL, 0.0, 0, 0, int(why)
+        if not flags & _GAP:
             unlit = self._sum_clicks(first)
             if unlit:
-                flags |= DecisionFlag.GAP
+                flags |= _GAP
             else:
                 clicks, crc = int(self._clicks.sum()), zlib.crc32(self._clicks.tobytes())
                 if self.guard is not None:
                     self.guard.take_object(self._clicks.sum(axis=0), NO_OBJECT)
         if self.guard is not None:
-            alarmed = self.guard.flags
-            flags |= alarmed if alarmed & DecisionFlag.ABSTAINED else NO_FLAGS
+            alarmed = int(self.guard.flags)
+            flags |= alarmed if alarmed & _ABSTAINED else 0
         if not flags:
             label, probability = self._verdict()
             if not probability > 0:
-                flags |= DecisionFlag.NOT_FINITE
+                flags |= _NOT_FINITE
             elif probability < self.settings.sure:
-                flags |= DecisionFlag.AMBIGUOUS
+                flags |= _AMBIGUOUS
         if flags:
-            label, flags = NO_LABEL, flags | DecisionFlag.ABSTAINED
+            label, flags = NO_LABEL, flags | _ABSTAINED
             self.n_abstained += 1
         last = first + self.frames - 1
         decision = Decision(
-            self.n_decisions, end_tick, max(0, last), self.n_passages, 0, clicks, label, UNKNOWN_TRUTH, int(flags), probability, crc
+            self.n_decisions, end_tick, max(0, last), self.n_passages, 0, clicks, label, UNKNOWN_TRUTH, flags, probability, crc
         )  # fmt: skip
         self.n_decisions += 1
         self.n_passages = (self.n_passages + 1) & 0xFFFFFFFF

@@ -262,11 +262,12 @@ class LiveRun:
             return
         self.gates.take(output.actions)
         end_ns = uncertainty_ns = 0
-        if output.block_end_tick is not None:
-            end_ns, uncertainty_ns = self.connection.known_clock().to_host_ns(output.block_end_tick)
+        clock = self.connection.known_clock()
+        if output.block_end_tick is not None and not output.passages:
+            end_ns, uncertainty_ns = clock.to_host_ns(output.block_end_tick)
         for place, decision in enumerate(output.decisions):
-            if output.passages:  # it has a time of its own, and its number is no mark's
-                end_ns, _ = self.connection.known_clock().to_host_ns(output.passages[place].leave_tick)
+            if output.passages and output.block_end_tick is not None:  # a time of its own, and its number is no mark's
+                end_ns, uncertainty_ns = clock.to_host_ns(output.passages[place].leave_tick)
             mark = None if output.passages else self.core.marks.get(decision.object)
             self.tally.add(decision, float("nan") if mark is None else mark.photons)
             if self._recorder is not None:

@@ -23,18 +23,19 @@ from .wire import Mark
 
 MAX_REMEMBERED_PULSES = 1 << 16  # whose fate may still change
 MAX_GAPS = 4096
+_ABSTAINED, _COINCIDENCE = int(DecisionFlag.ABSTAINED), int(DecisionFlag.COINCIDENCE)
 REASONS = (  # the first that applies names an abort
-    (DecisionFlag.GAP, "gap"),
-    (DecisionFlag.INCOMPLETE, "incomplete"),
-    (DecisionFlag.COINCIDENCE, "coincidence"),
-    (DecisionFlag.AMBIGUOUS, "ambiguous"),
-    (DecisionFlag.NOT_FINITE, "not finite"),
+    (int(DecisionFlag.GAP), "gap"),
+    (int(DecisionFlag.INCOMPLETE), "incomplete"),
+    (int(DecisionFlag.COINCIDENCE), "coincidence"),
+    (int(DecisionFlag.AMBIGUOUS), "ambiguous"),
+    (int(DecisionFlag.NOT_FINITE), "not finite"),
 )
 
 
 def abort_reason(flags: int) -> str:
     """Return why a decision abstained, "" if it did not."""
-    return next((name for flag, name in REASONS if flags & flag), "other" if flags & DecisionFlag.ABSTAINED else "")
+    return next((name for flag, name in REASONS if flags & flag), "other" if flags & _ABSTAINED else "")
 
 
 class _Row(NamedTuple):
@@ -83,7 +84,7 @@ class PassageMatcher:
         counts["clicks"] += decision.clicks
         counts["passage_clicks"] += passage.clicks
         counts["passage_frames"] += passage.last - passage.first + 1
-        if decision.flags & DecisionFlag.ABSTAINED:
+        if decision.flags & _ABSTAINED:
             self.aborted[abort_reason(decision.flags)] += 1
         self._rows.append(
             _Row(
@@ -159,7 +160,7 @@ class PassageMatcher:
             counts["in_gaps"] += 1
         elif coincident:
             counts["coincident"] += 1
-            counts["coincident_aborted"] += any(row.flags & DecisionFlag.COINCIDENCE for row in mine)
+            counts["coincident_aborted"] += any(row.flags & _COINCIDENCE for row in mine)
             counts["coincident_labelled"] += any(row.label != NO_LABEL for row in mine)
         else:
             self._settle_alone(mark, mine)

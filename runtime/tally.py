@@ -16,6 +16,7 @@ import numpy.typing as npt
 from .core import NO_LABEL, Decision
 from .record import DecisionFlag
 
+_ABSTAINED = int(DecisionFlag.ABSTAINED)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
 
 
@@ -41,7 +42,7 @@ class RunTally:
         if not math.isnan(photons_per_shot):
             self.photons += photons_per_shot * self.shots
             self.photons_known += 1
-        if decision.flags & DecisionFlag.ABSTAINED or decision.label == NO_LABEL:
+        if decision.flags & _ABSTAINED or decision.label == NO_LABEL:
             self.abstained += 1
         if decision.truth < 0 or decision.truth >= len(self.confusion):
             return
