@@ -134,4 +134,6 @@ def test_without_marks_rows_do_not_pile_up() -> None:
 def test_reasons_have_names() -> None:
     assert abort_reason(0) == ""
     assert abort_reason(DecisionFlag.GAP | DecisionFlag.COINCIDENCE | DecisionFlag.ABSTAINED) == "gap"
-    assert abort_reason(DecisionFlag.ABSTAINED | DecisionFlag.DARK_ALARM) == "other"
+    assert abort_reason(DecisionFlag.ABSTAINED | DecisionFlag.DARK_ALARM) == "dark counts"
+    assert abort_reason(DecisionFlag.ABSTAINED) == "other"
+    assert abort_reason(DecisionFlag.DARK_ALARM) == ""  # decided, with another table
