@@ -89,11 +89,21 @@ class FlowCore(Follower):
         self._max_block = plan.block_exposures
         self._facts: I64 = np.zeros(walking.N_FACTS, np.int64)
         self._slot_offsets = plan.slot_offset_ticks.astype(np.int64)
-        self._new_marks: I64 = np.zeros((MAX_MARKS_AT_ONCE, walking.N_MARK), np.int64)
-        self._new_photons = np.zeros(MAX_MARKS_AT_ONCE, np.float32)
+        self._new = walking.NewMarks(
+            np.zeros((MAX_MARKS_AT_ONCE, walking.N_MARK), np.int64), np.zeros(MAX_MARKS_AT_ONCE, np.float32)
+        )
         self._limits: I64 = np.zeros(0, np.int64)  # of what looks for passages; none where their times are known
         self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
         self._prepare(plan)
+        self._arrays = walking.FlowArrays(
+            self._words,
+            self._counts,
+            self._limits,
+            self._state,
+            self.dark_channels,
+            self.empty_channels,
+            self._passages,
+        )
 
     def _prepare(self, plan: Plan) -> None:
         """Make what this kind of flow needs besides, once, before arming."""
@@ -178,7 +188,7 @@ class FlowCore(Follower):
         position = facts[walking.NEXT_SEQ], facts[walking.NEXT_EXPOSURE]
         self.tracker.advance(position, n_marks + n_blocks, facts[walking.EXPOSURES])
         if n_marks:
-            for mark, photons in zip(self._new_marks[:n_marks].tolist(), self._new_photons[:n_marks].tolist()):
+            for mark, photons in zip(self._new.rows[:n_marks].tolist(), self._new.photons[:n_marks].tolist()):
                 self._remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
         if not n_blocks:
             return taken, Output([], [], None)
@@ -195,13 +205,11 @@ class FlowCore(Follower):
             self._max_block, self._plan.cycle_ticks, self._dark_cycle, watch_at,
         )  # fmt: skip
         facts[walking.JITTER_TICKS] = self.jitter_ticks
-        return int(
-            walking.walk(
-                messages.buffer, messages.spans, place, facts, self._slot_offsets, (self._words, self._counts), self._limits,
-                self._state, self.dark_channels, self.empty_channels, self._channel_mask, self._new_marks, self._new_photons,
-                self._passages,
-            )
-        )  # fmt: skip
+        buffer, spans = messages
+        taken = walking.walk(
+            buffer, spans, place, facts, self._slot_offsets, self._arrays, self._channel_mask, self._new
+        )
+        return int(taken)
 
     def _watch_empty(self, guard: DarkGuard) -> list[dict[str, Any]]:
         """Without dark slots, the frames in which no object was found tell the dark rates."""
@@ -301,9 +309,9 @@ class FlowCore(Follower):
                 clicks, crc = int(self._clicks.sum()), zlib.crc32(self._clicks.tobytes())
                 if self.guard is not None:
                     self.guard.take_object(self._clicks.sum(axis=0), NO_OBJECT)
-        if self.guard is not None:
-            alarmed = int(self.guard.flags)
-            flags |= alarmed if alarmed & _ABSTAINED else 0
+        alarmed = 0 if self.guard is None else int(self.guard.flags)
+        if alarmed & _ABSTAINED:
+            flags |= alarmed
         if not flags:
             label, probability = self._verdict()
             if not probability > 0:
@@ -313,6 +321,7 @@ class FlowCore(Follower):
         if flags:
             label, flags = NO_LABEL, flags | _ABSTAINED
             self.n_abstained += 1
+        flags |= alarmed  # decided, but with another table
         last = first + self.frames - 1
         decision = Decision(
             self.n_decisions, end_tick, max(0, last), self.n_passages, 0, clicks, label, UNKNOWN_TRUTH, flags, probability, crc
@@ -337,9 +346,14 @@ class FlowCore(Follower):
         return unlit
 
     def _verdict(self) -> Verdict:
+        decider = self._decider
+        if self.guard is not None:
+            decider = self.guard.decider(decider)
+            for counts in self._clicks:
+                self.guard.count_word(counts)
         if self.settings.pool == 1:
-            return self._decider.decide(self._clicks[0], self.shots)
-        scores = self._decider.scores_batch(self._clicks, self.shots)
+            return decider.decide(self._clicks[0], self.shots)
+        scores = decider.scores_batch(self._clicks, self.shots)
         return softmax_winner(log_evidence(scores).sum(axis=0))
 
 

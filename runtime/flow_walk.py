@@ -6,7 +6,10 @@ Owns the ordinary case: messages in order, nothing lost, blocks that fit the pla
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from .flow_kernels import EMPTY_FRAMES, NEXT, put_frames, scan
@@ -28,18 +31,35 @@ _HEADER, _BLOCK_HEADER, _MARK_BYTES = 8, 36, 32
 _LARGEST = _U(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
 
 
+class FlowArrays(NamedTuple):
+    """The ring and what follows it, see flow_kernels.py; `limits` is empty where no passages are looked for. `out` are the passages."""
+
+    words: npt.NDArray[np.uint64]
+    counts: npt.NDArray[np.int16]
+    limits: npt.NDArray[np.int64]
+    state: npt.NDArray[np.int64]
+    dark_channels: npt.NDArray[np.int64]
+    empty_channels: npt.NDArray[np.int64]
+    out: npt.NDArray[np.int64]
+
+
+class NewMarks(NamedTuple):
+    """Marks that a call has met: int64 (m, N_MARK), and their photons, float32 (m,)."""
+
+    rows: npt.NDArray[np.int64]
+    photons: npt.NDArray[np.float32]
+
+
 @njit(cache=True, nogil=True)
-def walk(  # type: ignore[no-untyped-def]
-    buffer, spans, place, facts, slot_offsets, ring, limits, state, dark_channels, empty_channels, mask, marks, photons, out
-):  # fmt: skip
+def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type: ignore[no-untyped-def]
     """Take messages from `place` on; return how many, 0 when that one is not ordinary.
 
-    buffer uint8, spans int64 (n, 2), facts int64 (N_FACTS,), slot_offsets int64 (slots of a cycle,) in ticks, ring (words, counts),
-    limits, state, dark_channels, empty_channels and out (passages) as in flow_kernels.py; `limits` is empty where no passages are looked
-    for: every block then ends the call. marks int64 (m, N_MARK) and photons float32 (m,) are filled; a full one ends the call too.
-    Ends behind the first block with passages (facts[PASSAGES] of them) and when facts[WATCH_AT] empty frames have been seen.
+    buffer uint8, spans int64 (n, 2), facts int64 (N_FACTS,), slot_offsets int64 (slots of a cycle,) in ticks, flow FlowArrays, mask
+    uint64 of the channels. `marks` NewMarks are filled; when they are full the call ends. Without limits every block ends it, else it
+    ends behind the first block with passages (facts[PASSAGES] of them) and when facts[WATCH_AT] empty frames have been seen.
     """
-    words, counts = ring
+    words, counts, limits, state = flow.words, flow.counts, flow.limits, flow.state
+    dark_channels = flow.dark_channels
     facts[BLOCKS] = facts[EXPOSURES] = facts[MARKS] = facts[PASSAGES] = 0
     at = place
     while at < spans.shape[0]:
@@ -48,11 +68,11 @@ def walk(  # type: ignore[no-untyped-def]
         if load4(buffer, payload) != _U(facts[NEXT_SEQ]):
             break
         if buffer[start] == _MARK:
-            if stop - payload != _U(_MARK_BYTES) or facts[MARKS] == marks.shape[0]:
+            if stop - payload != _U(_MARK_BYTES) or facts[MARKS] == marks.photons.size:
                 break
             if load8(buffer, payload + _U(12)) >= _LARGEST or load8(buffer, payload + _U(20)) >= _LARGEST:
                 break
-            _take_mark(buffer, payload, marks[facts[MARKS]], photons, facts[MARKS])
+            _take_mark(buffer, payload, marks, facts[MARKS])
             facts[MARKS] += 1
             facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
             at += 1
@@ -73,19 +93,20 @@ def walk(  # type: ignore[no-untyped-def]
         at += 1
         if not limits.size:
             break
-        facts[PASSAGES] = scan(first + count, words, counts, limits, state, empty_channels, out)
+        facts[PASSAGES] = scan(first + count, words, counts, limits, state, flow.empty_channels, flow.out)
         if facts[PASSAGES] or state[NEXT] < first + count or state[EMPTY_FRAMES] >= facts[WATCH_AT]:
             break
     return at - place
 
 
 @njit(cache=True, nogil=True)
-def _take_mark(buffer, payload, row, photons, number):  # type: ignore[no-untyped-def]
+def _take_mark(buffer, payload, marks, number):  # type: ignore[no-untyped-def]
+    row = marks.rows[number]
     row[M_SEQ], row[M_OBJECT] = np.int64(load4(buffer, payload)), np.int64(load4(buffer, payload + _U(4)))
     packed = load4(buffer, payload + _U(8))
     row[M_TRUTH], row[M_HALF] = np.int64(np.int16(np.uint16(packed & _U(0xFFFF)))), np.int64(packed >> _U(16))
     row[M_EXPOSURE], row[M_TICK] = np.int64(load8(buffer, payload + _U(12))), np.int64(load8(buffer, payload + _U(20)))
-    photons[number : number + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
+    marks.photons[number : number + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
 
 
 @njit(cache=True, nogil=True)
