@@ -87,7 +87,8 @@ def _picture(shared: Options) -> Options:
 
 
 def _digits(shared: Options, row: PassiveRow) -> Options:
-    return replace(_plain(shared), clicks=CLICKS_AIM_MMF * row.clicks)
+    digits = replace(_plain(shared), clicks=CLICKS_AIM_MMF * row.clicks)
+    return replace(digits, starts=4) if row.features == 5 else digits
 
 
 def _cells(shared: Options, row: PassiveRow) -> Options:
