@@ -1,6 +1,7 @@
 """Gradient estimators: exact against finite differences, the unbiased ones against exact, the flips against plain passes."""
 
 # ruff: noqa: E402  (what follows needs torch)
+import naive_ssim
 import numpy as np
 import pytest
 
@@ -8,7 +9,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.clicks import ClickLaw
 from pans.trainer.detection import click_probability, click_words, sample_clicks, word_probabilities
-from pans.trainer.estimators import ESTIMATORS, cross_entropy, exact, squared_error
+from pans.trainer.estimators import ESTIMATORS, cross_entropy, exact, similarity_loss, squared_error
 from pans.trainer.heads import MlpHead
 
 READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
@@ -90,6 +91,22 @@ def test_exact_loss_of_pictures_is_the_sum_over_words():
         ]
     )
     assert found == pytest.approx(wanted)
+
+
+def test_similarity_loss_weighs_ssim_of_what_is_shown_against_the_error_of_the_scores():
+    random = torch.Generator().manual_seed(7)
+    scores = torch.rand(3, 7 * 9, generator=random, dtype=torch.float64) * 1.6 - 0.3  # some beyond black and white
+    wanted = torch.rand(3, 7 * 9, generator=random, dtype=torch.float64)
+    found = similarity_loss(0.25, (7, 9))(scores, wanted)
+    for i in range(3):
+        shown = np.clip(scores[i].numpy(), 0, 1).reshape(7, 9)
+        alike = np.mean(naive_ssim.ssim_map(shown.tolist(), wanted[i].reshape(7, 9).tolist()))
+        error = np.square(scores[i].numpy() - wanted[i].numpy()).mean()
+        assert float(found[i]) == pytest.approx(0.75 * error + 0.25 * (1 - alike), rel=1e-9)
+    assert torch.equal(similarity_loss(0.0, (7, 9))(scores, wanted), squared_error(scores, wanted))
+    every = similarity_loss(0.25, (7, 9))(scores.unsqueeze(0), wanted.unsqueeze(1))  # as `exact` asks for it
+    assert every.shape == (3, 3)
+    assert torch.allclose(every.diagonal(), found)
 
 
 @pytest.mark.parametrize("name", ["local", "disarm", "loo"])

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.cli import main
 from pans.runtime.profile import load_profile
+from pans.trainer import passive_recipes, task_mmf
 from pans.trainer import reproduce_active as active
 from pans.trainer import reproduce_passive as passive
 from pans.trainer.options import Options, check_options, plain_options, same_options
@@ -18,6 +19,7 @@ from pans.trainer.paper_tables import ACTIVE, PASSIVE, ActiveRow
 from pans.trainer.report_active import markdown
 from pans.trainer.report_passive import markdown as passive_markdown
 from pans.trainer.tasks import Objects, Task
+from pans.trainer.training_data import TrainingData
 
 ROWS = [(name, row) for name, rows in ACTIVE.items() for row in rows]
 CELLS = [(name, row, dark) for name, table in PASSIVE.items() for row in table.rows for dark in table.dark]
@@ -177,6 +179,28 @@ def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatc
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "load", lambda *_: task)
     found = passive.make_cell(tmp_path, "mmf-mnist-image", row, 0.01, None, lambda _line: None)
+    ((title, samples),) = passive.samples_of(tmp_path, "mmf-mnist-image", [(row, found)])
+    assert title.startswith("d_f = 4, dark 0.01")
+    assert np.array_equal(samples.pictures, images[:1])  # all are of one class
+    assert 0 < samples.clicks.max() <= 4
+    assert not passive.samples_of(tmp_path, "mmf-mnist-image", [(row, found | {"dark": 0.1})])
     assert 0.2 < found["value"] < 1.0
     assert found["illumination"] == 0.0
     assert found["photons"] > 0
+
+
+def test_a_table_of_pictures_shows_speckle_and_asks_for_the_digit(monkeypatch):
+    images = np.random.default_rng(1).integers(0, 256, (5, 28, 28), dtype=np.uint8)
+    digits = Objects(images, np.arange(5))
+    task = Task(
+        "mmf-mnist-image", ("a", "b"), digits, digits, "0" * 64, "", light="field", optics="mmf", target="image"
+    )
+    monkeypatch.setattr(passive_recipes, "load_task", lambda *_, **__: task)
+    passive_recipes.load.cache_clear()
+    shown = passive_recipes.load("mmf-mnist-image", None)
+    passive_recipes.load.cache_clear()
+    options = Options(features=4, encoder="coherent")
+    data = TrainingData(shown, load_profile("ideal"), options)
+    assert data.target.numpy() == pytest.approx(images.reshape(5, -1) / 255, abs=1e-6)
+    wanted = task_mmf.release_intensity(images).reshape(5, -1)
+    assert data.shown.numpy() == pytest.approx(wanted, abs=0.51 / 255)

@@ -14,13 +14,13 @@ from .paper_tables import PASSIVE, UNPRINTED, ActiveRow, PassiveRow
 DPI = 90
 
 
-def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2) -> tuple[Any, Any]:
+def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2, rows: int = 1) -> tuple[Any, Any]:
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    return pyplot.subplots(1, panels, figsize=(width, height), layout="constrained")
+    return pyplot.subplots(rows, panels, figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Any, path: Path) -> None:

@@ -99,6 +99,7 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     from .figures import measure_over_patterns
     from .generators import GENERATORS
     from .passive_recipes import TASKS
+    from .picture_samples import draw_samples
     from .report_passive import markdown, table_of
 
     drawn = TASKS.get(name, name) in GENERATORS and name != "barcode"  # all its strings are judged
@@ -127,6 +128,8 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
     result = {"rows": [figures for _, figures in done + others], "markdown": text}
     if args.out:
         _write(args.out, name, result, lambda path: measure_over_patterns(path, name, done))
+        if samples := passive.samples_of(args.cache, name, done):
+            draw_samples(args.out / f"{name}-pictures.png", name, samples)
     return result
 
 

@@ -31,6 +31,8 @@ from .export import export_trained
 from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .paper_tables import PassiveRow
 from .passive_recipes import TASKS, basis_of, load, recipe
+from .picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
+from .report_passive import Done
 from .ssim import ssim
 from .tasks import Objects, Task
 from .train import Trained, train
@@ -38,6 +40,7 @@ from .training_data import CHUNK, encoder_input
 
 PROFILE = "ideal"
 TRIALS = 5
+SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
 SPECKLE = ("mmf-mnist", "mmf-mnist-image")  # in the release's way: images that no instrument sees
 
 
@@ -96,6 +99,8 @@ def make_cell(
     if name == "barcode" and dark == 0:
         best = solve_patterns(options, profile, "balanced")[0][0]
         figures["balanced"] = {"value": 100 * best.accuracy, "clicks": best.clicks}
+    if task.target == "image":
+        keep_samples(path.with_suffix(".npz"), _samples(task, trained))
     if name not in SPECKLE:  # what a bundle looks at must be what the task shows
         provenance = {
             "task_argument": TASKS.get(name, name),
@@ -137,6 +142,24 @@ def measure(name: str, task: Task, trained: Trained) -> dict[str, Any]:
             "photons": float((light.sum(dim=1) * share).sum()),
             "illumination": float(trained.encoder.illumination()),
         }
+
+
+def _samples(task: Task, trained: Trained) -> Samples:
+    """A few pictures given back, of held-out objects."""
+    objects = first_of_each_class(task.test)
+    return take_samples(trained.head, click_probability(light_of(task, objects, trained), trained.law), objects)
+
+
+def samples_of(cache: Path, name: str, done: Done) -> list[tuple[str, Samples]]:
+    """Return titles and samples of those cells of a table of pictures whose samples are drawn: the paper's choice, as far as it is done."""
+    kept = []
+    for row, figures in done:
+        path = _path(cache, name, row, figures["dark"]).with_suffix(".npz")
+        if (row.features, figures["dark"]) in SHOWN_CELLS and path.is_file():
+            kept.append(
+                (f"d_f = {row.features}, dark {figures['dark']:g}\nSSIM {figures['value']:.3f}", read_samples(path))
+            )
+    return kept
 
 
 def light_of(task: Task, objects: Objects, trained: Trained) -> Tensor:
