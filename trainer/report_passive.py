@@ -113,17 +113,17 @@ _NOTES = {
 }
 _NOTES["mmf-mnist-image"] = _NOTES["mmf-mnist"]
 _NOTES["cells"] = (
-    "Three classes and 3000 held-out images, as in the paper's release; the paper's text has a fourth class, the empty field "
-    "(`pans reproduce cells-4`). **The paper's images are not public: these are drawn by our generator** (docs/TASKS.md), which was set, on data seed 0, "
-    "so that a simple straight-through training came near the paper's figures. Its figures stand beside ours for orientation, "
-    "not as a comparison. We train on 5000 images per class, the paper on 10 000.",
+    "Three classes and 3000 held-out images, as in the paper's release; the paper's text has a fourth class, the empty field (`pans "
+    "reproduce cells-4`). **The paper's images are not public: these are drawn by our generator** (docs/TASKS.md), which was set, "
+    "on data seed 0, so that a simple straight-through training came near the paper's figures. Its figures stand beside ours for "
+    "orientation, not as a comparison. We train on 5000 images per class, the paper on 10 000.",
     "",
     "One recipe for all cells; all clicks, dark ones among them, are held to 0.98 of what the paper names at its first dark count. "
-    "The rate of learning and the number of epochs were tried on 6000 other objects of the generator (data seed 101; d_f = 10, no dark counts): "
-    "rates of 2.5e-3 to 1e-2 and 30 or 60 epochs lie within 0.3 points of each other, and the shortest was kept. The clicks aimed at were "
-    "lowered from 1.02 to 0.98 of the paper's after the first results (83.6, 90.6, 94.1, 96.2 and 98.5 % without dark counts). `photons` "
-    "are detected photoelectrons, dark counts not among them; nothing but the clicks bounds them. Direct imaging at equal photons: "
-    "[equal-photons](equal-photons.md).",
+    "The rate of learning and the number of epochs were tried on 6000 other objects of the generator (data seed 101; d_f = 10, no "
+    "dark counts): rates of 2.5e-3 to 1e-2 and 30 or 60 epochs lie within 0.3 points of each other, and the shortest was kept. The "
+    "clicks aimed at were lowered from 1.02 to 0.98 of the paper's after the first results (83.6, 90.6, 94.1, 96.2 and 98.5 % "
+    "without dark counts). `photons` are detected photoelectrons, dark counts not among them; nothing but the clicks bounds them. "
+    "Direct imaging at equal photons: [equal-photons](equal-photons.md).",
 )
 _NOTES["cells-4"] = (
     "Our generator, four classes: membrane, nucleolus, mitochondria, and the empty field of **the same total light** (docs/TASKS.md); the "
