@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .dark import wilson_interval
 from .dark_watch import ALL_CHANNELS, Alarm, ChannelWatch
 
 I64 = NDArray[np.int64]
@@ -26,7 +27,8 @@ F64 = NDArray[np.float64]
 BURST_RATIO = 5.0
 WARNING_RATIO = 1.5
 MOST = 0.5  # of the excess: a channel with more of it is the one to blame
-RETURN_EVIDENCE = 7.0  # log likelihood ratio for the expected rate at which a state is over: e^7 to one
+RETURN_EVIDENCE = 14.0  # log likelihood ratio for the expected rate at which a state is over: e^14 to one
+LEAST_CHANGE = 1.5  # times, that a state which lasts is taken to differ from what is expected
 _UNIT = 1e-6  # of the log likelihood ratio, so that sums are whole numbers
 LEVELS = ("notice", "warning", "alarm")
 
@@ -140,7 +142,7 @@ class ChannelHealth:
                 continue
             trials = fresh * len(chosen)
             expected = float(self._watch.expected[chosen].mean())
-            present = min(max(state.finding.rate, 1e-12), 1 - 1e-12)
+            present = _present(state, len(chosen), expected)
             hit, miss = math.log(expected / present), math.log1p(-expected) - math.log1p(-present)
             gain = round(hit / _UNIT) * clicks + round(miss / _UNIT) * (trials - clicks)
             state.evidence = max(0, state.evidence + gain)
@@ -192,6 +194,14 @@ class ChannelHealth:
         if alone:
             return (worst,), float(own[worst]), float(watch.expected[worst])
         return everyone, float(own.mean()), float(watch.expected.mean())
+
+
+def _present(state: _State, n_channels: int, expected: float) -> float:
+    """The rate held against the expected one: the nearer end of its interval, since an alarm may come after a click or two."""
+    low, high = wilson_interval(state.clicks, state.exposures * n_channels)
+    if state.finding.rate > expected:
+        return max(low, min(LEAST_CHANGE * expected, 0.5 * (1 + expected)))
+    return min(high, expected / LEAST_CHANGE)
 
 
 def _who(channels: tuple[int, ...], n_channels: int) -> str:

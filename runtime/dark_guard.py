@@ -4,9 +4,9 @@ Owns the policies; never counts (dark_watch.py), names (channels.py) or computes
 same blocks give the same events and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
 `decider` for every decision, and passes its events on.
 
-Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates; `mask` leaves channels
-out that are hot, quiet or dead, and abstains where all are concerned; `abstain` gives no label while a warning or an alarm
-lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
+Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates, without dead channels; `mask`
+leaves channels out that are hot, quiet or dead; both abstain where all are left out, or more than can be done (dark_tables.py);
+`abstain` gives no label while a warning or an alarm lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .bundle import Bundle
 from .channels import LEVELS, ChannelHealth, Finding
 from .dark import DarkMonitor, DarkReport, wilson_interval
-from .dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
+from .dark_tables import Adapter, extra_probability, make_adapter
 from .dark_watch import FLOOR_RATE, Alarm, ChannelWatch
 from .decide import Decider
 from .errors import UsageError
@@ -30,7 +30,6 @@ from .record_format import DecisionFlag
 from .wire import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 POLICIES = ("warn", "tables", "mask", "abstain")
-REMAKE = 2  # a table is made again when this many times the dark exposures are behind the rates
 MAX_FINDINGS = 1000  # kept for the summary; the recording has them all
 F64 = NDArray[np.float64]
 
@@ -51,11 +50,12 @@ class DarkGuard:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
         self._parallel = plan.mode == "parallel"
-        if policy in ("tables", "mask") and (bundle is None or bundle.table is None or shots != 1):
-            raise UsageError(
-                f"--on-dark {policy} needs a bundle with a table, and one shot per decision",
-                remedy="use --on-dark abstain",
-            )
+        self._adapter: Adapter | None = None
+        if policy in ("tables", "mask"):
+            if bundle is None:
+                raise UsageError(f"--on-dark {policy} needs a bundle")
+            self._adapter = make_adapter(bundle, shots)
+        self._n_features = plan.n_patterns
         self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
         self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
         self._any_click = np.zeros(1, np.int64)
@@ -67,9 +67,7 @@ class DarkGuard:
         self._any_dark = bool(self._dark_slot.any())
         self._silent_before: bool | None = None  # of the exposure before the next block; None where it is not known
         self._next = 0
-        self._table = None if bundle is None else bundle.table
-        self._seen = np.zeros(0 if self._table is None else len(self._table), np.int64)
-        self._made: AdaptedTable | None = None
+        self._made: Decider | None = None
         self._made_for: tuple[Any, ...] = ()
 
     def warm_up(self) -> None:
@@ -178,30 +176,45 @@ class DarkGuard:
         serious = self.serious if self.policy != "warn" else []
         if not serious:
             return DecisionFlag(0)
-        abstains = self.policy == "abstain" or (self.policy == "mask" and self._all_concerned(serious))
+        if self.policy == "abstain":
+            return DecisionFlag.DARK_ALARM | DecisionFlag.ABSTAINED
+        assert self._adapter is not None
+        extra, masked = self._concerned(serious)
+        abstains = masked.all() or not self._adapter.can_do(masked | (extra > 0))
         return DecisionFlag.DARK_ALARM | (DecisionFlag.ABSTAINED if abstains else DecisionFlag(0))
 
     def decider(self, ordinary: Decider) -> Decider:
-        """The back end for a decision made now."""
-        if self.policy not in ("tables", "mask") or not self.serious:
+        """The back end for a decision made now, unless `flags` say that there is none."""
+        serious = self.serious if self._adapter is not None else []
+        if not serious:
             return ordinary
-        assert self._table is not None
-        if self.policy == "mask":
-            masked = np.zeros(len(self._seen).bit_length() - 1, np.bool_)
-            masked[[channel for finding in self.serious for channel in finding.channels]] = True
-            return self._remade(("mask", *np.flatnonzero(masked).tolist()), np.zeros(len(masked)), masked)
-        n_features = len(self._seen).bit_length() - 1
-        looks = max(1, self.watch.exposures - min(finding.since for finding in self.serious))
-        key = ("tables", looks.bit_length(), *(finding.channels for finding in self.serious))
-        extra = np.resize(extra_probability(self.health.rates(), self.watch.expected), n_features)
-        return self._remade(key, extra, np.zeros(n_features, np.bool_))
+        assert self._adapter is not None
+        extra, masked = self._concerned(serious)
+        looks = 0
+        if self.policy == "tables":
+            looks = max(1, self.watch.exposures - min(finding.since for finding in serious)).bit_length()
+        key = (looks, masked.tobytes(), *(finding.channels for finding in serious))
+        if self._made is None or key != self._made_for:
+            self._made, self._made_for = self._adapter.made(ordinary, extra, masked), key
+        return self._made
 
     def count_word(self, counts: NDArray[np.int64]) -> None:
-        """Remember the word of a decision made while nothing was wrong, int64 (d_f,): how often words come is what tables are
-        made with.
+        """Remember the clicks of a decision made while nothing was wrong, int64 (d_f,): how often they come is what other tables
+        are made with.
         """
-        if len(self._seen) and self.policy in ("tables", "mask") and not self.health.present:
-            self._seen[int(counts @ (1 << np.arange(len(counts))))] += 1
+        if self._adapter is not None and not self.health.present:
+            self._adapter.count(counts)
+
+    def _concerned(self, serious: list[Finding]) -> tuple[F64, NDArray[np.bool_]]:
+        """How much more often a silent exposure of each channel clicks, float64 (d_f,), and which channels are left out, bool (d_f,)."""
+        masked = np.zeros(self._n_features, np.bool_)
+        for finding in serious:
+            if self.policy == "mask" or finding.kind == "dead":
+                masked[list(finding.channels) if self._parallel else slice(None)] = True
+        if self.policy == "mask":
+            return np.zeros(self._n_features), masked
+        extra = np.resize(extra_probability(self.health.rates(), self.watch.expected), self._n_features)
+        return np.where(masked, 0.0, extra), masked
 
     def report(self, report: DarkReport) -> DarkReport:
         """Return `report` with the findings, what lasts, and every channel's rate with its interval.
@@ -240,16 +253,6 @@ class DarkGuard:
             )
             for finding in self.health.present
         )
-
-    def _all_concerned(self, serious: list[Finding]) -> bool:
-        return not self._parallel or any(len(finding.channels) == self.watch.n_channels for finding in serious)
-
-    def _remade(self, key: tuple[Any, ...], extra: F64, masked: NDArray[np.bool_]) -> AdaptedTable:
-        if self._made is None or key != self._made_for:
-            assert self._table is not None
-            self._made = AdaptedTable(adapted_scores(self._table, word_prior(self._seen), extra, masked))
-            self._made_for = key
-        return self._made
 
 
 def _silence_words(who: str, has_others: bool, silence: Silence) -> str:

@@ -131,8 +131,8 @@ class CountTableDecider:
         demand_golden(self.name, head.scores(bundle.golden_means), bundle.golden_scores, bundle)
         rows = np.arange((shots + 1) ** self.n_features, dtype=np.int64)
         counts = rows[:, None] // self.radix[None, :] % (shots + 1)
-        self._scores = head.scores(counts.astype(np.float32) / np.float32(shots))
-        self.labels, self.probabilities = softmax_winners(self._scores)
+        self.scores = head.scores(counts.astype(np.float32) / np.float32(shots))
+        self.labels, self.probabilities = softmax_winners(self.scores)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
         """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots."""
@@ -143,7 +143,7 @@ class CountTableDecider:
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return the head's scores, float32 (n, classes), for click counts (n, d_f)."""
-        return self._scores[self._index(counts, shots)]
+        return self.scores[self._index(counts, shots)]
 
     def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
         """Return the labels, int64 (n,), for click counts (n, d_f)."""

@@ -30,12 +30,15 @@ REASONS = (  # the first that applies names an abort
     (int(DecisionFlag.COINCIDENCE), "coincidence"),
     (int(DecisionFlag.AMBIGUOUS), "ambiguous"),
     (int(DecisionFlag.NOT_FINITE), "not finite"),
+    (int(DecisionFlag.DARK_ALARM), "dark counts"),
 )
 
 
 def abort_reason(flags: int) -> str:
     """Return why a decision abstained, "" if it did not."""
-    return next((name for flag, name in REASONS if flags & flag), "other" if flags & _ABSTAINED else "")
+    if not flags & _ABSTAINED:
+        return ""
+    return next((name for flag, name in REASONS if flags & flag), "other")
 
 
 class _Row(NamedTuple):

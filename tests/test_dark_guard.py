@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,25 @@ import pytest
 from numpy.typing import NDArray
 from plans import parallel, shot_major
 
+from pans.runtime.bundle import load_bundle
 from pans.runtime.channels import ChannelHealth, Finding
 from pans.runtime.cli import main
 from pans.runtime.dark import DarkMonitor
 from pans.runtime.dark_guard import DarkGuard
-from pans.runtime.dark_tables import AdaptedTable, adapted_scores, extra_probability, word_prior
+from pans.runtime.dark_tables import (
+    MAX_MIXED,
+    AdaptedCounts,
+    AdaptedTable,
+    HeadAdapter,
+    TableAdapter,
+    adapted_scores,
+    dark_clicks,
+    extra_probability,
+    make_adapter,
+    meant,
+    n_features_of,
+    word_prior,
+)
 from pans.runtime.dark_watch import ChannelWatch, WatchSettings
 from pans.runtime.errors import UsageError
 from pans.runtime.wire import ClickBlock
@@ -81,6 +97,14 @@ def test_a_dead_channel() -> None:
         [(one.kind, one.channels) for one in found] == [("quiet", (2,))]
     )
     assert health.rates()[2] < 0.003
+
+
+def test_a_burst_found_in_few_exposures_is_not_over_at_the_first_silence() -> None:
+    """An alarm after two clicks in two exposures is no proof of a rate of 1."""
+    for seed in range(20):
+        bits = np.concatenate([dark(60 + seed, 3_000, 1e-4, 1), dark(90 + seed, 300, 0.6, 1)])
+        _, found = found_states(bits, 1e-4, block=1)
+        assert [one.kind for one in found] == ["burst"]
 
 
 def test_one_detector() -> None:
@@ -163,6 +187,127 @@ def test_prior_is_a_distribution_also_without_words() -> None:
     assert word_prior(seen)[3] > 0.999
 
 
+# ---- tables of counts, and heads with too many of them ----
+
+
+def binomial(p: NDArray[np.float64], shots: int, count: int) -> NDArray[np.float64]:
+    return math.comb(shots, count) * p**count * (1 - p) ** (shots - count)
+
+
+def counts_bayes(
+    light: NDArray[np.float64], dark_rates: NDArray[np.float64], shots: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `bayes`, for all vectors of counts, channel 0 the lowest digit."""
+    base, d = shots + 1, light.shape[1]
+    p = 1 - np.exp(-light) * (1 - dark_rates)
+    each = np.stack([binomial(p, shots, count) for count in range(base)], axis=2)  # objects, channels, counts
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    like = np.prod([each[:, channel, digits[:, channel]] for channel in range(d)], axis=0)
+    return like, np.log(like.reshape(-1, 2, base**d).sum(axis=1).T + 1e-300)
+
+
+@pytest.mark.parametrize("shots", [1, 2, 3])
+def test_tables_of_counts_are_exact_when_the_prior_is(shots: int) -> None:
+    """With the true P(c), new scores are the exact joint probability of the changed detector: loops over everything."""
+    rng = np.random.default_rng(50)
+    light, d, base = rng.exponential(0.8, (6, 4)), 4, shots + 1
+    extra, masked = np.array([0.1, 0.0, 0.3, 0.0]), np.array([False, True, False, False])
+    like, scores = counts_bayes(light, np.zeros(d), shots)
+    made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), extra, masked, base)
+    now, _ = counts_bayes(light[:, ~masked], extra[~masked], shots)
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    key = digits[:, ~masked] @ base ** np.arange(3)
+    wanted = now.reshape(-1, 2, base**3).sum(axis=1).T / len(light)
+    assert np.exp(made.astype(np.float64)) == pytest.approx(wanted[key], rel=2e-5)
+
+
+def test_moves_of_dark_clicks_are_binomial() -> None:
+    moves = dark_clicks(3, 0.2)
+    assert moves.sum(axis=1) == pytest.approx(np.ones(4))
+    assert moves[1] == pytest.approx([0, 0.64, 0.32, 0.04])
+    assert moves[3].tolist() == [0, 0, 0, 1]
+    assert dark_clicks(2, 0.0).tolist() == np.eye(3).tolist()
+
+
+def test_prior_of_counts_is_a_distribution() -> None:
+    seen = np.zeros(27, np.int64)
+    seen[5] = 10**6  # counts 2, 1, 0
+    prior = word_prior(seen, 3)
+    assert prior.sum() == pytest.approx(1.0)
+    assert prior[5] > 0.999
+    assert n_features_of(27, 3) == 3
+    assert word_prior(np.zeros(9, np.int64), 3) == pytest.approx(np.full(9, 1 / 9))
+
+
+def test_what_a_channel_meant_is_bayes() -> None:
+    rng = np.random.default_rng(51)
+    seen = rng.integers(1, 1000, 3)
+    own = (seen + 0.5) / (seen.sum() + 1.5)
+    weights = meant(seen, 0.25, masked=False)
+    for found in range(3):
+        joint = np.array([own[c] * dark_clicks(2, 0.25)[c, found] for c in range(3)])
+        assert weights[found] == pytest.approx(joint / joint.sum())
+    assert meant(seen, 0.0, masked=True) == pytest.approx(np.tile(own, (3, 1)))
+
+
+class Scored:
+    """A head that is a table of scores, behind the interface of a decider."""
+
+    name, n_classes = "scored", 4
+
+    def __init__(self, scores: NDArray[np.float64], base: int) -> None:
+        self.table = AdaptedCounts(scores.astype(np.float32), base)
+        self.n_features = self.table.n_features
+        self.decide, self.decide_batch = self.table.decide, self.table.decide_batch
+        self.scores_batch = self.table.scores_batch
+
+
+def test_a_mixed_head_keeps_most_of_what_is_lost_without() -> None:
+    """One dead and one hot channel: the head as it is, mixed over both, and exact for the changed detector."""
+    rng = np.random.default_rng(52)
+    shots, d, lost, kept = 2, 5, [], []
+    base = shots + 1
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    for _ in range(6):
+        light = rng.exponential(0.8, (8, d)) * (rng.random((8, d)) < 0.6)
+        like, scores = counts_bayes(light, np.zeros(d), shots)
+        after = light.copy()
+        after[:, 1] = 0.0
+        extra, masked = np.array([0, 0, 0, 0.5, 0]), np.array([False, True, False, False, False])
+        like_now, best = counts_bayes(after, extra, shots)
+        adapter, head = HeadAdapter(d, shots), Scored(scores, base)
+        for word in rng.choice(base**d, 3000, p=like.mean(axis=0) / like.mean(axis=0).sum()):
+            adapter.count(digits[word])
+        mixed = adapter.made(head, extra, masked)
+        optimum = accuracy(best.argmax(axis=1), like_now)
+        lost.append(optimum - accuracy(scores.argmax(axis=1), like_now))
+        kept.append(optimum - accuracy(mixed.decide_batch(digits, shots), like_now))
+        verdict = mixed.decide(digits[77], shots)
+        assert verdict.label == mixed.decide_batch(digits[77:78], shots)[0]
+        assert 0 < verdict.probability <= 1
+    assert np.mean(lost) > 0.05
+    assert np.mean(kept) < 0.5 * np.mean(lost)
+
+
+def test_what_is_too_much_to_mix_is_not_decided() -> None:
+    adapter = HeadAdapter(20, 3)
+    concerned = np.zeros(20, np.bool_)
+    concerned[:4] = True
+    assert adapter.can_do(concerned)
+    assert MAX_MIXED == 4**4
+    concerned[4] = True
+    assert not adapter.can_do(concerned)
+
+
+def test_the_adapter_fits_the_bundle() -> None:
+    bundle = load_bundle(Path(__file__).parent.parent / "runtime" / "shipped" / "fashion10.pans")[0]
+    assert isinstance(make_adapter(bundle, 1), TableAdapter)
+    assert isinstance(make_adapter(bundle, 2), TableAdapter)  # 3^10 rows
+    assert isinstance(make_adapter(bundle, 3), HeadAdapter)  # 4^10 are too many
+    with pytest.raises(UsageError, match="only a table of single clicks"):
+        make_adapter(replace(bundle, head_onnx=None), 2)
+
+
 # ---- what the guard takes in ----
 
 
@@ -203,9 +348,9 @@ def test_empty_fields_as_counts() -> None:
     assert "channel 2" in guard.words()
 
 
-def test_tables_and_masks_need_a_table() -> None:
+def test_tables_and_masks_need_a_bundle() -> None:
     watch = ChannelWatch(1, np.array([0.01]))
-    with pytest.raises(UsageError, match="needs a bundle with a table"):
+    with pytest.raises(UsageError, match="needs a bundle"):
         DarkGuard(shot_major(3, 1), watch, "tables")
     with pytest.raises(UsageError, match="allowed: warn"):
         DarkGuard(shot_major(3, 1), watch, "panic")
@@ -253,3 +398,20 @@ def test_a_run_says_so_and_a_replay_agrees(policy: str, tmp_path: Path, capsys: 
     assert replayed["identical"]
     assert replayed["decisions"] == 400
     assert main(["verify", str(tmp_path / "run.pansrec")]) == 0
+
+
+@pytest.mark.parametrize(("shots", "policy"), [(2, "tables"), (3, "mask")])
+def test_several_shots_per_decision(
+    shots: int, policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A table of counts decides on with tables made anew; where one detector is masked, nothing is left to decide with."""
+    bundle = Path(__file__).parent.parent / "runtime" / "shipped" / "fashion10.pans"
+    (tmp_path / "hot.toml").write_text(SCENE)
+    device = f"sim:oled-qcmos?scene={tmp_path}/hot.toml&pace=fast&seed=2"
+    words = ["run", str(bundle), "--device", device, "--decisions", "250", "--shots", str(shots), "--on-dark", policy]
+    assert main([*words, "--out", str(tmp_path), "--json"]) == 1
+    summary = json.loads(capsys.readouterr().out)
+    assert {one["state"] for one in summary["dark"]["findings"]} == {"burst"}
+    assert (summary["abstained"] > 50) == (policy == "mask")
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]
