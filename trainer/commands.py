@@ -101,6 +101,13 @@ def _configure_schedule(parser: argparse.ArgumentParser) -> None:
         help="last part of the epochs, trained for decisions (default 0)",
     )
     parser.add_argument(
+        "--similarity",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="of pictures: share of 1 - SSIM in the loss, the rest being the squared error (default 0)",
+    )
+    parser.add_argument(
         "--mix",
         type=float,
         default=0.0,
@@ -234,7 +241,7 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     same = (
         "features photons clicks epochs restarts starts warm polish mix shots seed hidden batch slope clamp dark budget"
     )
-    same += " complex_field conserving input_photons shift_px offset_px"
+    same += " similarity complex_field conserving input_photons shift_px offset_px"
     return Options(
         alpha=alpha,
         estimator=estimator,
