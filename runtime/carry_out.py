@@ -97,7 +97,7 @@ def _prepare(args: argparse.Namespace, job: Job, started_ns: int) -> _Prepared:
     if job.flow is not None:
         plan, flow_core, n_cycles = core_of(honest.profile, bundle, decider, job.flow, job.shots, job.seconds)
         flow_core.guard = honest.guard(plan, bundle, job.shots, flow=True)
-        core, passing, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act)), 0.0
+        core, passing, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act, job.act_profile)), 0.0
     else:
         plan = build_plan(
             honest.profile,

@@ -62,6 +62,7 @@ class Job:
     command: str
     flow: FlowSettings | None
     act: str
+    act_profile: Profile
     continuous: Continuous
 
 
@@ -156,6 +157,7 @@ def _job(
         command=shlex.join(["pans", *sys.argv[1:]]),
         flow=flow,
         act=getattr(args, "act", "device"),
+        act_profile=load_profile(args.act_profile) if getattr(args, "act_profile", None) else loaded,
         continuous=continuous_of(args),
     )
 

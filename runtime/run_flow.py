@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .flow import FlowCore
     from .live_run import LiveRun
     from .plan import Plan
+    from .second_device import SecondInstrument
     from .verdict import Decider
 
 
@@ -39,7 +40,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--act",
         default="device",
         metavar="URL",
-        help="what pulses: device (default: its GATE command), or NAME:...",
+        help="what pulses: device (default: its GATE command), a second instrument's URL (tcp:HOST:PORT too), or NAME:...",
+    )
+    group.add_argument(
+        "--act-profile",
+        metavar="PROFILE",
+        help="hardware profile of the second instrument (default: that of the first)",
     )
     group.add_argument(
         "--pool", type=int, metavar="N", help="windows side by side whose evidence is added (default: the settings', 1)"
@@ -93,7 +99,7 @@ def replayed_figures(core: FlowCore, events: Iterable[Mapping[str, Any]]) -> dic
 class FlowRun:
     """Joins core and gates of one run, and says afterwards what came of both."""
 
-    def __init__(self, core: FlowCore, actuator: Actuator | None) -> None:
+    def __init__(self, core: FlowCore, actuator: Actuator | SecondInstrument | None) -> None:
         self.core = core
         self._actuator = actuator
         self._gates: dict[str, Any] = {}
@@ -106,13 +112,22 @@ class FlowRun:
     def prepared(self, run: LiveRun) -> None:
         """Before arming: pulses go to the actuator, and the figures hear of those that were not made."""
         self._run = run
-        run.gates.actuator = self._actuator
+        from .second_device import SecondInstrument
+
+        if isinstance(self._actuator, SecondInstrument):
+            self._actuator.connect()
+            run.gates.second = self._actuator
+        else:
+            run.gates.actuator = self._actuator
         run.gates.failed = self.core.matcher.undo
 
     def summary(self) -> dict[str, Any]:
         """Return the flow's part of the summary, under the contract's keys."""
+        from .second_device import SecondInstrument
+
         core = self.core
         core.matcher.finish()
+        second = self._actuator.facts() if isinstance(self._actuator, SecondInstrument) else None
         if self._actuator is not None:
             self._actuator.close()
         limits = core.limits
@@ -131,6 +146,7 @@ class FlowRun:
             },
             **core.matcher.summary(core.frames),
             "gates": {} if self._run is None else self._run.gates.summary(),
+            "second_instrument": second,
         }
 
 

@@ -12,10 +12,12 @@ from pans.runtime.clock import ClockModel
 from pans.runtime.errors import UsageError
 from pans.runtime.follower import Action
 from pans.runtime.journal import Journal
+from pans.runtime.profile import load_profile
 from pans.runtime.session import HostSession
 from pans.runtime.wire import Ack, AckStatus, FrameDecoder
 
 MS = 1_000_000
+PROFILE = load_profile("flow-snspd")
 TICK_HZ = 1_000_000  # one tick per microsecond, device time = host time
 
 
@@ -156,6 +158,6 @@ def test_an_actuator_of_ones_own_gets_host_times() -> None:
 
 
 def test_unknown_actuators_are_refused_by_name() -> None:
-    assert open_actuator("device") is None
+    assert open_actuator("device", PROFILE) is None
     with pytest.raises(UsageError, match="no actuator 'sorter', known: device"):
-        open_actuator("sorter:COM3")
+        open_actuator("sorter:COM3", PROFILE)
