@@ -12,18 +12,24 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import count, pairwise
+from statistics import median
 from typing import NamedTuple
 
 NS_PER_S = 1_000_000_000
-READ_EVERY_S = 0.05
-MAX_READINGS = 64
+READ_EVERY_S = 0.02
+MAX_READINGS = 160
+USUAL_STEPS, USUAL_LEAST = 8, 32  # the usual waiting is the median of so many stretches; of fewer readings, unknown
+LOOK_BACK_EVERY = 50  # readings
+USUAL_MOST = 0.05  # of the time: who waits for a processor for longer than this is starved all the time
 READ_BYTES = 4096  # more than one of these files needs, /proc/stat apart, whose first line counts
 JOIN_S = 2.0
 
 
 class Sample(NamedTuple):
-    """Counters of the system; they only ever grow. `run_delays_ns`: of each watched thread, the loop's first, waiting for a processor."""
+    """Counters of the system at `at_ns`; they only ever grow. `run_delays_ns`: how long each thread, the loop's first, waited to run."""
 
+    at_ns: int
     cpu_ns: int  # that the loop's thread has computed
     run_delays_ns: tuple[int, ...]
     steal_ns: int  # of the whole machine: time in which the hypervisor ran somebody else
@@ -48,6 +54,7 @@ class Counters:
 
     def __init__(self, now_ns: Callable[[], int], threads: list[int]) -> None:
         self.heard_ns = 0  # when the latest reading began
+        self.usual: tuple[float, ...] = ()
         self._now = now_ns
         self._readings: deque[Reading] = deque(maxlen=MAX_READINGS)
         self._lock = threading.Lock()
@@ -79,18 +86,39 @@ class Counters:
         """Return the latest sample that was whole at `begin_ns` and the first one begun at `end_ns`; as near as there are."""
         readings = list(self._readings)
         if not readings:
-            nothing = Sample(0, (), 0, 0)
+            nothing = Sample(0, 0, (), 0, 0)
             return nothing, nothing
         before = next((reading for reading in reversed(readings) if reading.ended_ns <= begin_ns), readings[0])
         after = next((reading for reading in readings if reading.began_ns >= end_ns), readings[-1])
         return self.sample(before), self.sample(after)
 
+    def look_back(self) -> tuple[float, ...]:
+        """Return, and keep as `usual`, the share of time for which each thread usually waits for a processor; () if not known yet.
+
+        Each wake-up takes some microseconds. The median over the time of the readings that are kept, so that one bad stretch is not
+        taken for the rule.
+        """
+        readings = list(self._readings)
+        if self._thread is None or len(readings) < USUAL_LEAST:
+            return ()
+        samples = [self.sample(reading) for reading in readings[:: len(readings) // USUAL_STEPS]]
+        shares = [
+            [
+                (late - early) / max(after.at_ns - before.at_ns, 1)
+                for early, late in zip(before.run_delays_ns, after.run_delays_ns)
+            ]
+            for before, after in pairwise(samples)
+        ]
+        self.usual = tuple(min(median(of_thread), USUAL_MOST) for of_thread in zip(*shares))
+        return self.usual
+
     def sample(self, reading: Reading) -> Sample:
         """Take a reading apart."""
         if self._thread is None:
-            return Sample(reading.cpu_ns, (), 0, 0)
+            return Sample(reading.began_ns, reading.cpu_ns, (), 0, 0)
         status, stat, *threads = reading.files
         return Sample(
+            reading.began_ns,
             _number(threads[0], 0),
             tuple(_number(text, 1) for text in threads),
             _number(stat.partition(b"\n")[0], 8) * self._tick_ns,
@@ -110,8 +138,12 @@ class Counters:
 
     def _watch(self) -> None:
         _give_way()
-        while not self._stop.wait(READ_EVERY_S):
+        for turn in count():
+            if self._stop.wait(READ_EVERY_S):
+                return
             self.read()
+            if turn % LOOK_BACK_EVERY == 0:
+                self.look_back()
 
 
 def _give_way() -> None:

@@ -65,7 +65,7 @@ class Facts(NamedTuple):
     arrivals_ns: tuple[int, ...]  # when the reader stamped bytes
     pause_ns: int  # the longest time between two blocks when everything is on time
     cpu_ns: int  # the loop's thread computed for so long, at most
-    run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor
+    run_delay_ns: int  # it, or its reader while it did not compute, waited for a processor, beyond what is usual
     steal_ns: int
     switches: int
     stamped: tuple[Stamped, ...]
@@ -146,7 +146,11 @@ class Evidence:
             self._counters.read()
         first, last = self._counters.around(begin_ns, end_ns)
         cpu_ns = last.cpu_ns - first.cpu_ns
-        own, *readers = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
+        delays_ns = [after - before for before, after in zip(first.run_delays_ns, last.run_delays_ns)] or [0]
+        usual = self._counters.usual or [0.0] * len(delays_ns)
+        own, *readers = [
+            max(delay - round(share * (last.at_ns - first.at_ns)), 0) for delay, share in zip(delays_ns, usual)
+        ]
         # a reader that waits while the loop computes waits for the loop
         delay_ns = max([own, *(delay - cpu_ns for delay in readers)])
         spans, arrivals_ns = list(self._spans), list(self._arrivals)  # both in the order of their ends

@@ -31,8 +31,8 @@ def test_a_reading_is_taken_apart() -> None:
     counters.close()
     tick_ns = 10**9 // os.sysconf("SC_CLK_TCK")
     found = counters.sample(reading(0, 1, 120))
-    assert found == (120, (77, 240), 120 * tick_ns, 12)
-    assert counters.sample(Reading(0, 1, -1, (b"", b"", b"", b"damaged"))) == (0, (0, 0), 0, 0)
+    assert found == (0, 120, (77, 240), 120 * tick_ns, 12)
+    assert counters.sample(Reading(0, 1, -1, (b"", b"", b"", b"damaged"))) == (0, 0, (0, 0), 0, 0)
 
 
 @linux_only
@@ -58,6 +58,20 @@ def test_the_readings_around_a_stretch_are_the_nearest_that_enclose_it(
     assert first == counters.sample(before[-1] if before else readings[0])
     assert last == counters.sample(after[0] if after else readings[-1])
     assert last.cpu_ns >= first.cpu_ns
+
+
+@linux_only
+@given(st.integers(0, 60), st.integers(0, 7), st.integers(0, 10**6))
+def test_the_usual_waiting_is_not_moved_by_one_bad_stretch(per_mille: int, bad: int, extra: int) -> None:
+    counters = Counters(time.perf_counter_ns, [])
+    counters._thread = threading.current_thread()
+    for step in range(160):
+        waited = per_mille * 20 * step + (extra * 1000 if step >= 20 * bad + 5 else 0)
+        counters._readings.append(Reading(20_000 * step, 20_000 * step, 0, (b"", b"", b"1 %d 1" % waited)))
+    assert counters.look_back() == pytest.approx((min(per_mille / 1000, 0.05),))
+    for _ in range(150):
+        counters._readings.popleft()
+    assert counters.look_back() == ()  # too few to say
 
 
 @linux_only
