@@ -42,8 +42,7 @@ HEAP_OBJECTS = 1_500_000
 PIPE_BYTES = 4096
 F_SETPIPE_SZ = 1031
 AFTER_S = 1.0
-DISK_PRIORITY, CANARY_PRIORITY = 15, 12  # the host's loop has 10
-CANARY_EVERY_NS, CANARY_LATE_NS = 4_000_000, 6_000_000
+DISK_PRIORITY = 15  # the host's loop has 10
 NEVER = 1 << 62
 
 
@@ -246,25 +245,6 @@ def hog(script_path: str) -> None:
             pass
 
 
-# ---- the canary ----
-
-
-def canary(seconds: str, core: str) -> None:
-    """Note when a process above the host's priority was kept from a core: the machine disturbed the experiment."""
-    os.sched_setaffinity(0, {int(core)})
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(CANARY_PRIORITY))
-    start_ns = _ready()
-    late: list[tuple[int, int]] = []
-    due = start_ns
-    while due < start_ns + float(seconds) * 1e9:
-        time.sleep(max(0.0, (due - time.perf_counter_ns()) * 1e-9))
-        now = time.perf_counter_ns()
-        if now - due > CANARY_LATE_NS:
-            late.append((due, now))
-        due = max(due, now) + CANARY_EVERY_NS
-    print(json.dumps(late), flush=True)
-
-
 if __name__ == "__main__":
-    roles: dict[str, Callable[..., None]] = {"instrument": instrument, "host": host, "hog": hog, "canary": canary}
+    roles: dict[str, Callable[..., None]] = {"instrument": instrument, "host": host, "hog": hog}
     roles[sys.argv[1]](*sys.argv[2:])

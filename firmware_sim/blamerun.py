@@ -31,6 +31,8 @@ from typing import Any, NamedTuple
 
 from pans.runtime.record import read_recording
 
+from .canary import Canary
+
 KINDS = ("link", "device", "host", "gc", "disk", "inference")
 NAMED_IN_TIME = 0.95
 SPACING_S = (0.9, 1.2)
@@ -40,6 +42,7 @@ SETTLE_S = 1.5
 NEAR_NS = 60_000_000  # an injection and what the machine does so shortly before or after it are one incident
 HOST_CORE, INSTRUMENT_CORE = 0, 1
 ORCHESTRATOR_PRIORITY, HOG_PRIORITY = 70, 60
+CANARY_PRIORITY, CANARY_EVERY_US, CANARY_LATE_US = 12, 4_000, 6_000  # the host's loop has 10
 READY_S = 60.0
 
 
@@ -116,18 +119,11 @@ class Role:
 
     def said(self) -> dict[str, Any]:
         """Return the next line of the child, an object."""
-        return dict(self._line())
-
-    def said_list(self) -> list[Any]:
-        """Return the next line of the child, a list."""
-        return list(self._line())
-
-    def _line(self) -> Any:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(f"the {self.name} ended with {self.process.wait()}")
-        return json.loads(line)
+        return dict(json.loads(line))
 
     def tell(self, word: object) -> None:
         """Send the child one line."""
@@ -151,24 +147,25 @@ def run_all(script: list[Injection], listen: str, folder: Path, seed: int) -> tu
     """Make every cause of `script`; return the start time, what the host says of its run, and its recording."""
     plan_file, recording = folder / "script.json", folder / "blame.pansrec"
     plan_file.write_text(json.dumps(script))
-    roles = [Role("instrument", str(plan_file), listen, str(seed))]
+    roles, canaries = [Role("instrument", str(plan_file), listen, str(seed))], list[Canary]()
     try:
         url = roles[0].said()["url"]
         roles.append(Role("host", url, str(plan_file), str(recording)))
         roles.append(Role("hog", str(plan_file)))
         for core in (HOST_CORE, INSTRUMENT_CORE):
-            roles.append(Role("canary", str(script[-1].at_ns * 1e-9 + 1.0), str(core)))
+            canaries.append(Canary(core, CANARY_PRIORITY, CANARY_EVERY_US, CANARY_LATE_US))
         host = roles[1].said()
         roles[2].said()
-        roles[3].said()
-        roles[4].said()
         start_ns = time.perf_counter_ns() + 500_000_000
         for role in roles:
             role.tell(start_ns)
         _stop_and_go(script, start_ns, {"host": int(host["pid"]), "disk": int(host["disk_pid"])})
         words = roles[1].said()
-        return start_ns, words | {"canary": roles[3].said_list() + roles[4].said_list()}, recording
+        away = [(gap.begin_ns, gap.end_ns) for one in canaries for gap in one.end().gaps]
+        return start_ns, words | {"canary": away}, recording
     finally:
+        for one in canaries:
+            one.kill()
         for role in reversed(roles):
             role.end()
 

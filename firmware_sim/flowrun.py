@@ -34,7 +34,8 @@ LATE_EXIT = 4  # of `pans run`: finished, with late or lost work
 PROGRESS_S = 10.0
 KEPT = (
     "decisions", "accuracy", "accuracy_ci", "missed", "missed_ci", "doubled", "doubled_ci", "purity", "yield",
-    "clicks_mean", "photons_mean", "aborted", "gates", "passages", "latency_us", "late", "late_blame", "late_cause", "lost", "realtime", "ended", "versions",
+    "clicks_mean", "photons_mean", "aborted", "gates", "passages", "latency_us", "late", "late_blame", "late_cause",
+    "lost", "realtime", "ended", "versions",
 )  # fmt: skip
 
 
@@ -235,7 +236,8 @@ def show(result: dict[str, Any]) -> str:
         shares = ", ".join(f"{name} {share / 1000:.2f}" for name, share in entry["shares_us"].items())
         lines.append(
             f"  {entry['whose']} {entry['decision']}: {entry['latency_us'] / 1000:.2f} ms "
-            f"(bytes after {entry['until_bytes_us'] / 1000:.2f}), away {entry['away_us'] / 1000:.2f} ms; named {entry['cause']} ({shares} ms): {entry['why']}"
+            f"(bytes after {entry['until_bytes_us'] / 1000:.2f}), away {entry['away_us'] / 1000:.2f} ms; "
+            f"named {entry['cause']} ({shares} ms): {entry['why']}"
         )
     return "\n".join([*lines, *(f"BROKEN: {text}" for text in result["broken"])])
 
