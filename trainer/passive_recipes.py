@@ -88,6 +88,8 @@ def _picture(shared: Options) -> Options:
 
 def _digits(shared: Options, row: PassiveRow) -> Options:
     digits = replace(_plain(shared), clicks=CLICKS_AIM_MMF * row.clicks)
+    if row.features > EXACT_FEATURES_MAX:
+        return replace(digits, clicks=1.03 * row.clicks, epochs=80, polish=0.4, front_rate=2e-2)
     return replace(digits, starts=4) if row.features == 5 else digits
 
 
