@@ -189,9 +189,7 @@ class LiveRun:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
         outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
-        if self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns):
-            self.connection.session.poll(now_ns)
-            self.connection.flush()  # a pulse does not wait for the rest of the turn
+        self._act(now_ns)
         self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
         self.journal.refusals(self.connection)
         if watch is not None:
@@ -208,6 +206,12 @@ class LiveRun:
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self._turn_page(now_ns)
         self.ended = why_ended(self, now_ns)
+
+    def _act(self, now_ns: int) -> None:
+        """Send the pulses that wait, at once: a pulse does not wait for the rest of what has to be done."""
+        if self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns):
+            self.connection.session.poll(now_ns)
+            self.connection.flush()
 
     def take(self, arrived: list[Arrived]) -> list[Output]:
         """Decide on what came for the core and account for what came of it."""
@@ -245,6 +249,8 @@ class LiveRun:
             self.last_data_ns = arrival_ns
             self.outage_ns = None
             self.lateness.block_came(arrival_ns)
+        if output.actions:
+            self._act(self.now_ns())
         outputs.append(output)
 
     def settle(self, output: Output) -> None:
