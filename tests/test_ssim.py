@@ -90,6 +90,20 @@ def test_float32_is_good_to_five_digits() -> None:
     assert (ssim(a.float(), b.float()) - ssim(a, b)).abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("both", [False, True])
+def test_the_gradient_is_that_of_the_pixels(both: bool) -> None:
+    a, b = torch.rand(2, 3, 9, 13, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    a, b = a.requires_grad_(True), b.requires_grad_(both)
+    weight = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    wanted = torch.autograd.grad((weight * ssim_map(a, b).mean(dim=(-2, -1))).sum(), (a, b) if both else (a,))
+    found = torch.autograd.grad((weight * ssim(a, b)).sum(), (a, b) if both else (a,))
+    for ours, slow in zip(found, wanted):
+        np.testing.assert_allclose(ours.numpy(), slow.numpy(), rtol=1e-10, atol=1e-14)
+    black = torch.zeros(1, 12, 12, requires_grad=True)
+    ssim(black, torch.zeros(1, 12, 12)).sum().backward()
+    assert black.grad is not None and not black.grad.any()  # at its best already
+
+
 def test_following_the_gradient_makes_images_alike() -> None:
     generator = torch.Generator().manual_seed(3)
     wanted, shown = torch.rand(2, 16, 16, generator=generator, dtype=torch.float64)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,29 +29,74 @@ def ssim(shown: Tensor, wanted: Tensor) -> Tensor:
 
     Differentiable in both; 1 for equal images. Use float64 where the last digits matter: the variances are differences.
     """
-    return ssim_map(shown, wanted).mean(dim=(-2, -1))
+    _check(shown, wanted)
+    values: Tensor = _Mean.apply(*_stacked(shown, wanted))
+    return values.reshape(shown.shape[:-2])
 
 
 def ssim_map(shown: Tensor, wanted: Tensor) -> Tensor:
     """Return the SSIM of every pixel, the shape of the images (..., height, width)."""
+    _check(shown, wanted)
+    _, _, above, below = _terms(*_stacked(shown, wanted))
+    return (above[0] * above[1] / (below[0] * below[1])).reshape(shown.shape)
+
+
+class _Mean(torch.autograd.Function):
+    """The mean over the pixels, with its gradient in closed form: less than half the time of a gradient step by step."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
+        mean_x, mean_y, above, below = _terms(x, y)
+        values = above[0] * above[1] / (below[0] * below[1])
+        ctx.save_for_backward(x, y, mean_x, mean_y, *above, *below, values)
+        return values.mean(dim=(-2, -1))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        x, y, mean_x, mean_y, luminance, structure, power, variance, values = ctx.saved_tensors
+        scale = gradients[0][:, None, None] / values[0].numel()
+        of_product = 2 * scale * luminance / (power * variance)  # by the mean of x * y
+        of_square = -scale * values / variance  # by that of x * x, and as well of y * y
+        cross = 2 * scale * structure / (power * variance) - of_product  # by mean_x is cross * mean_y + own * mean_x
+        own = -2 * scale * values / power - 2 * of_square
+
+        def through(image: Tensor, mean: Tensor, other: Tensor, other_mean: Tensor) -> Tensor:
+            by_mean, by_square, by_product = _blur(
+                torch.stack([cross * other_mean + own * mean, of_square, of_product])
+            )
+            return by_mean + 2 * image * by_square + other * by_product
+
+        wanted = ctx.needs_input_grad
+        return (
+            through(x, mean_x, y, mean_y) if wanted[0] else None,
+            through(y, mean_y, x, mean_x) if wanted[1] else None,
+        )
+
+
+def _terms(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """The two means, and SSIM as a fraction: factors above (luminance, structure) and below (powers of the means, variances)."""
+    mean_x, mean_y, square_x, square_y, product = _blur(torch.stack([x, y, x * x, y * y, x * y]))
+    both, power = mean_x * mean_y, mean_x**2 + mean_y**2
+    above = 2 * both + C1, 2 * (product - both) + C2
+    return mean_x, mean_y, above, (power + C1, square_x + square_y - power + C2)
+
+
+def _check(shown: Tensor, wanted: Tensor) -> None:
     if shown.shape != wanted.shape or shown.dim() < 2 or 0 in shown.shape:
         raise UsageError(
             f"images are {tuple(shown.shape)} and {tuple(wanted.shape)}, allowed: equal (..., height, width)"
         )
     if not shown.dtype.is_floating_point or shown.dtype != wanted.dtype:
         raise UsageError(f"images are {shown.dtype} and {wanted.dtype}, allowed: one floating-point type, in [0, 1]")
-    x, y = (image.reshape(-1, *shown.shape[-2:]) for image in (shown, wanted))
-    means = _blur(torch.cat([x, y, x * x, y * y, x * y]))
-    mean_x, mean_y, square_x, square_y, product = means.chunk(5)
-    variances = square_x + square_y - mean_x**2 - mean_y**2
-    covariance = product - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
-    structure = (2 * covariance + C2) / (variances + C2)
-    return (luminance * structure).reshape(shown.shape)
+
+
+def _stacked(shown: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    return shown.reshape(-1, *shown.shape[-2:]), wanted.reshape(-1, *wanted.shape[-2:])
 
 
 def _blur(images: Tensor) -> Tensor:
-    """Gaussian means of (n, height, width) with zeros outside: the window is a product, one matrix for the rows, one for the columns.
+    """Gaussian means of (..., height, width) with zeros outside: the window is a product, one matrix for the rows, one for the columns.
 
     Many small pictures are 20 times as fast this way as by a convolution of one channel, forward and backward.
     """
