@@ -83,7 +83,8 @@ def _fiber(shared: Options, row: PassiveRow) -> Options:
 
 
 def _picture(shared: Options) -> Options:
-    return replace(shared, estimator="ste", epochs=30, hidden=512)
+    few = shared.features <= EXACT_FEATURES_MAX  # the bias of `ste` costs most there, and `local` a pass per detector
+    return replace(shared, estimator="local" if few else "ste", epochs=16, warm=0.5, hidden=512, similarity=0.9)
 
 
 def _digits(shared: Options, row: PassiveRow) -> Options:
