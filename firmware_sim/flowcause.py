@@ -69,7 +69,8 @@ def attribute(
         before = int(np.searchsorted(punctual, place)) - 1
         since_ns = min(end_ns, int(timings["decided_ns"][punctual[before]])) if before >= 0 else end_ns
         overlapping = (table[:, 0] < decided_ns) & (table[:, 1] > since_ns)
-        counting = [gaps[one] for one in np.flatnonzero(overlapping & (end_ns - table[:, 1] <= CATCH_UP * table[:, 2]))]
+        felt = overlapping & (end_ns - table[:, 1] <= CATCH_UP * table[:, 2])
+        counting = [gaps[one] for one in np.flatnonzero(felt).tolist()]
         pieces = [(max(gap.begin_ns, since_ns), min(gap.end_ns, decided_ns)) for gap in counting]
         queued = sum(gap.length_ns for gap in counting if gap.queued)
         found.append(

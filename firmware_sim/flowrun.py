@@ -248,14 +248,13 @@ def main() -> int:
     if not hasattr(os, "sched_setscheduler") or len(os.sched_getaffinity(0)) < 2:
         print("this needs Linux and two cores: one each for host and instrument", file=sys.stderr)
         return 2
-    pin = None if args.pin == "none" else tuple(int(core) for core in args.pin.split(","))
     classes = tuple(name for names in args.gate_class for name in names.split(","))
     with tempfile.TemporaryDirectory() as scratch:
         folder = args.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         job = Job(
             args.bundle, args.profile, args.scene, args.flow, args.seconds, args.seed, args.link,
-            classes, args.deadline_us, pin, tuple(args.more),
+            classes, args.deadline_us, args.pin, tuple(args.more),
         )  # fmt: skip
         try:
             result = report(job, carry_out(job, folder))
@@ -266,6 +265,15 @@ def main() -> int:
         args.json.write_text(json.dumps(result) + "\n")
     print(show(result))
     return 1 if result["broken"] else 0
+
+
+def _cores(text: str) -> tuple[int, int] | None:
+    if text == "none":
+        return None
+    host, simulator = (int(core) for core in text.split(","))
+    if not {host, simulator} <= os.sched_getaffinity(0):
+        raise argparse.ArgumentTypeError(f"{text}: this process may use the cores {sorted(os.sched_getaffinity(0))}")
+    return host, simulator
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -285,7 +293,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=5, help="of the simulated instrument (default 5)")
     parser.add_argument("--link", default="tcp", choices=("tcp", "pty"), help="between the two (default tcp)")
-    parser.add_argument("--pin", default="0,1", metavar="HOST,SIM", help="cores of the two, or none (default 0,1)")
+    parser.add_argument(
+        "--pin", type=_cores, default="0,1", metavar="HOST,SIM", help="cores of the two, or none (default 0,1)"
+    )
     parser.add_argument("--folder", type=Path, help="where to leave recording and summary (default: nowhere)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as one JSON object")
     parser.add_argument("more", nargs="*", help="after --: further words for `pans run`")
