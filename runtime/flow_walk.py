@@ -12,6 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from .block_kernels import (
+    BLOCK_HEADER,
+    BODY_HEADER,
+    LARGEST,
+    MARK_BYTES,
+    block_shape,
+    block_times,
+    is_next,
+    mark_photons,
+    mark_truth,
+)
 from .flow_kernels import EMPTY_FRAMES, NEXT, put_frames, scan
 from .wire_kernels import load4, load8
 from .wire_schema import MessageType
@@ -27,8 +38,6 @@ M_SEQ, M_OBJECT, M_TRUTH, M_EXPOSURE, M_TICK, M_HALF, N_MARK = range(7)
 
 _U = np.uint64
 _FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
-_HEADER, _BLOCK_HEADER, _MARK_BYTES = 8, 36, 32
-_LARGEST = _U(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
 
 
 class FlowArrays(NamedTuple):
@@ -64,32 +73,38 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
     at = place
     while at < spans.shape[0]:
         start, stop = _U(spans[at, 0]), _U(spans[at, 1])
-        payload = start + _U(_HEADER)
+        payload = start + _U(BODY_HEADER)
         if load4(buffer, payload) != _U(facts[NEXT_SEQ]):
             break
         if buffer[start] == _MARK:
-            if stop - payload != _U(_MARK_BYTES) or facts[MARKS] == marks.photons.size:
+            if stop - payload != _U(MARK_BYTES) or facts[MARKS] == marks.photons.size:
                 break
-            if load8(buffer, payload + _U(12)) >= _LARGEST or load8(buffer, payload + _U(20)) >= _LARGEST:
+            if load8(buffer, payload + _U(12)) >= LARGEST or load8(buffer, payload + _U(20)) >= LARGEST:
                 break
             _take_mark(buffer, payload, marks, facts[MARKS])
             facts[MARKS] += 1
             facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
             at += 1
             continue
-        count = _ordinary(buffer, start, payload, stop, facts, dark_channels.size) if buffer[start] == _FRAMES else 0
-        if not count:
+        if buffer[start] != _FRAMES:
             break
         first = facts[NEXT_EXPOSURE]
-        width = np.int64(load4(buffer, payload + _U(28)) >> _U(16))
-        frames_at = np.int64(payload) + _BLOCK_HEADER
+        count, width = block_shape(buffer, payload, stop)
+        if count == 0 or count > facts[MAX_BLOCK] or 8 * width < dark_channels.size:
+            break
+        if not is_next(buffer, payload, count, facts[NEXT_SEQ], facts[DROPS], first, facts[END_EXPOSURE]):
+            break
+        tick, period = block_times(buffer, payload)
+        if period != facts[PERIOD_TICKS]:
+            break
+        frames_at = np.int64(payload) + BLOCK_HEADER
         frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
         put_frames(frames, first, words, counts, facts[DARK_CYCLE], state, dark_channels, mask)
         facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
         facts[NEXT_EXPOSURE] = first + count
         facts[BLOCKS] += 1
         facts[EXPOSURES] += count
-        _note_end(buffer, payload, count, facts, slot_offsets)
+        _note_end(tick, count, facts, slot_offsets)
         at += 1
         if not limits.size:
             break
@@ -103,40 +118,15 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
 def _take_mark(buffer, payload, marks, number):  # type: ignore[no-untyped-def]
     row = marks.rows[number]
     row[M_SEQ], row[M_OBJECT] = np.int64(load4(buffer, payload)), np.int64(load4(buffer, payload + _U(4)))
-    packed = load4(buffer, payload + _U(8))
-    row[M_TRUTH], row[M_HALF] = np.int64(np.int16(np.uint16(packed & _U(0xFFFF)))), np.int64(packed >> _U(16))
+    row[M_TRUTH], row[M_HALF] = mark_truth(buffer, payload), np.int64(load4(buffer, payload + _U(8)) >> _U(16))
     row[M_EXPOSURE], row[M_TICK] = np.int64(load8(buffer, payload + _U(12))), np.int64(load8(buffer, payload + _U(20)))
-    marks.photons[number : number + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
+    mark_photons(buffer, payload, marks.photons, number)
 
 
 @njit(cache=True, nogil=True)
-def _ordinary(buffer, start, payload, stop, facts, n_channels):  # type: ignore[no-untyped-def]
-    """Number of frames of a block that is the next one and fits the plan; 0 for any other."""
-    if stop - payload <= _U(_BLOCK_HEADER):
-        return 0
-    shape = load4(buffer, payload + _U(28))
-    count, width = np.int64(shape & _U(0xFFFF)), np.int64(shape >> _U(16))
-    first = load8(buffer, payload + _U(16))
-    if (
-        np.int64(stop - payload) != _BLOCK_HEADER + count * width
-        or count == 0
-        or count > facts[MAX_BLOCK]
-        or 8 * width < n_channels
-        or load4(buffer, payload + _U(4)) != _U(facts[DROPS])
-        or load8(buffer, payload + _U(8)) >= _LARGEST
-        or first != _U(facts[NEXT_EXPOSURE])
-        or np.int64(first) + count > facts[END_EXPOSURE]
-        or np.int64(load4(buffer, payload + _U(24))) != facts[PERIOD_TICKS]
-    ):
-        return 0
-    return count
-
-
-@njit(cache=True, nogil=True)
-def _note_end(buffer, payload, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
+def _note_end(tick, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
     """Note when the block's last exposure ended, and by how much that is not the plan's time."""
     last = facts[NEXT_EXPOSURE] - 1
-    tick = np.int64(load8(buffer, payload + _U(8)))
     facts[END_TICK] = tick + (count - 1) * facts[PERIOD_TICKS] + facts[EXPOSURE_TICKS]
     cycle = last // slot_offsets.size
     planned = facts[START_TICK] + cycle * facts[CYCLE_TICKS] + slot_offsets[last - cycle * slot_offsets.size]

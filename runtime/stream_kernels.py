@@ -12,6 +12,16 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from .block_kernels import (
+    BLOCK_HEADER,
+    BODY_HEADER,
+    MARK_BYTES,
+    block_shape,
+    block_times,
+    is_next,
+    mark_photons,
+    mark_truth,
+)
 from .record_format import NO_LABEL, DecisionFlag
 from .window import DARK_CLICKS, DARK_EXPOSURES
 from .wire_kernels import load4, load8
@@ -27,8 +37,7 @@ MARK_SLOTS = 4096  # as many objects as core.MAX_MARKS
 _U = np.uint64
 _LANE = _U(0xFF)
 _FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
-_HEADER, _BLOCK_HEADER, _MARK_BYTES = 8, 36, 32
-_LARGEST = _U(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
+_HEADER, _BLOCK_HEADER, _MARK_BYTES = BODY_HEADER, BLOCK_HEADER, MARK_BYTES
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
 _GAP = int(DecisionFlag.GAP) | _ABSTAINED
 _NOT_FINITE = int(DecisionFlag.NOT_FINITE) | _ABSTAINED
@@ -115,9 +124,8 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     number = np.int64(load4(buffer, payload + _U(4)))
     slot = number % MARK_SLOTS
     marks.objects[slot] = number
-    marks.truths[slot] = np.int16(np.uint16(load4(buffer, payload + _U(8)) & _U(0xFFFF)))
-    bits = load4(buffer, payload + _U(28))
-    marks.photons[slot : slot + 1].view(np.uint32)[0] = np.uint32(bits)
+    marks.truths[slot] = np.int16(mark_truth(buffer, payload))
+    mark_photons(buffer, payload, marks.photons, slot)
     state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
     state[MESSAGES] += 1
     return True
@@ -126,24 +134,14 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True)
 def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Account for a block that is the next one and fits the plan; else False, and nothing done."""
-    if stop - payload <= _U(_BLOCK_HEADER):
+    count, word_bytes = block_shape(buffer, payload, stop)
+    first = state[NEXT_EXPOSURE]
+    if count == 0 or word_bytes < windows.lanes.size:
         return False
-    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
-    word_bytes = np.int64(load4(buffer, payload + _U(28)) >> _U(16))
-    tick, first = load8(buffer, payload + _U(8)), load8(buffer, payload + _U(16))
-    if (
-        np.int64(stop - payload) != _BLOCK_HEADER + count * word_bytes
-        or count == 0
-        or word_bytes < windows.lanes.size
-        or load4(buffer, payload) != _U(state[NEXT_SEQ])
-        or load4(buffer, payload + _U(4)) != _U(state[DROPS])
-        or tick >= _LARGEST
-        or first != _U(state[NEXT_EXPOSURE])
-        or np.int64(first) + count > state[END_EXPOSURE]
-    ):
+    if not is_next(buffer, payload, count, state[NEXT_SEQ], state[DROPS], first, state[END_EXPOSURE]):
         return False
-    visit = np.int64(first) // state[VISIT_EXPOSURES]
-    if np.int64(first) + count > (visit + 1) * state[VISIT_EXPOSURES]:
+    visit = first // state[VISIT_EXPOSURES]
+    if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
         return False
     if visit != state[VISIT]:
         if state[NEXT_WINDOW] != windows.counts.shape[0]:
@@ -152,9 +150,9 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
         windows.seen[:] = 0
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
-    period = np.int64(load4(buffer, payload + _U(24)))
+    tick, period = block_times(buffer, payload)
     state[OBJECT] = np.int64(load4(buffer, payload + _U(32)))
-    state[LAST_TICK] = np.int64(tick) + (count - 1) * period + state[EXPOSURE_TICKS]
+    state[LAST_TICK] = tick + (count - 1) * period + state[EXPOSURE_TICKS]
     state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
     state[MESSAGES] += 1
     state[NEXT_EXPOSURE] += count
@@ -168,7 +166,7 @@ def _block_facts(buffer, payload, state, marks):  # type: ignore[no-untyped-def]
     count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
     word_bytes = load4(buffer, payload + _U(28)) >> _U(16)
     first = np.int64(load8(buffer, payload + _U(16)))
-    tick, period = np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
+    tick, period = block_times(buffer, payload)
     number = state[OBJECT]
     known = number != _NO_OBJECT and marks.objects[number % MARK_SLOTS] == number
     truth = np.int64(marks.truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
