@@ -105,9 +105,7 @@ def _digits(shared: Options, row: PassiveRow) -> Options:
 
 def _cells(shared: Options, row: PassiveRow) -> Options:
     cells = replace(_plain(shared), front_rate=CELLS_RATE)
-    if (
-        row.features == 3
-    ):  # one of two starts may end in a poor valley; and with dark counts there are no clicks to give away
+    if row.features == 3:  # two starts may both end in a poor valley; and with dark counts there are no clicks to spare
         return replace(cells, starts=6)
     return replace(cells, clicks=CLICKS_AIM_CELLS * row.clicks)
 
