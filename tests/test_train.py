@@ -16,7 +16,7 @@ from pans.runtime.clicks import click_probability, object_transmission
 from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import load_profile
 from pans.trainer.detection import click_probability as torch_probability
-from pans.trainer.detection import sample_clicks
+from pans.trainer.detection import click_words, sample_clicks, word_probabilities
 from pans.trainer.device import computing_on
 from pans.trainer.estimators import cross_entropy, decision_loss
 from pans.trainer.evaluate import evaluate_exactly, light_of
@@ -24,8 +24,8 @@ from pans.trainer.head_fit import fit_head_exactly, joint_distribution
 from pans.trainer.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks import load_task
-from pans.trainer.train import train
-from pans.trainer.training_data import encoder_input
+from pans.trainer.train import Run, train
+from pans.trainer.training_data import TrainingData, encoder_input
 
 PROFILE = load_profile("oled-qcmos")
 SMALL = Options(features=4, alpha=1e-3, epochs=10, hidden=32, batch=64, front_rate=3e-2, head_rate=1e-2)
@@ -105,6 +105,29 @@ def test_restarts_keep_the_best(task):
     losses = [one.validation_loss for one in single]
     assert best.validation_losses == pytest.approx(losses)
     assert np.array_equal(best.quantised.levels, single[int(np.argmin(losses))].quantised.levels)
+
+
+def test_with_several_shots_in_the_loss_restarts_are_judged_by_them_too(task):
+    data = TrainingData(task, PROFILE, SMALL)
+    run = Run(data, PROFILE, SMALL, 0)
+    for _ in range(5):
+        run.one_epoch()
+
+    def judged(mix):
+        run.options = replace(SMALL, mix=mix, shots=2)
+        return run.validation_loss()
+
+    zero, half, whole = judged(0.0), judged(0.5), judged(1.0)
+    assert half == pytest.approx((zero + whole) / 2)
+    # two shots by all pairs of words
+    p, target = run.probabilities(data.n_fit, len(data.labels)), data.target[data.n_fit :]
+    words, chances = click_words(4), word_probabilities(p)
+    with torch.no_grad():
+        scores = run.head((words.unsqueeze(0) + words.unsqueeze(1)).flatten(0, 1) / 2)
+        losses = cross_entropy(scores.unsqueeze(0), target.unsqueeze(1))  # (n, pairs)
+    pairs = (chances.unsqueeze(1) * chances.unsqueeze(2)).flatten(1)
+    assert whole == pytest.approx(float((pairs * losses).sum() / len(p)), rel=0.03)
+    assert whole < 0.97 * zero
 
 
 def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
@@ -226,6 +249,7 @@ def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_
         ({"dark": -1.0}, "--dark"),
         ({"mix": 0.5}, "--shots"),
         ({"polish": 1.5}, "--polish"),
+        ({"similarity": -0.1}, "--similarity"),
         ({"seed": -1}, "--seed"),
     ],
 )

@@ -230,7 +230,10 @@ class Run:
         return torch.cat(parts)
 
     def validation_loss(self) -> float:
-        """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples."""
+        """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples.
+
+        With `mix`, several shots have the same share of it as of the training loss.
+        """
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
         target = self.data.target[self.data.n_fit :]
         loss_of = schedule.loss_at(self.options, self.epoch, self.data.picture_shape)
@@ -239,9 +242,22 @@ class Run:
         with torch.no_grad():
             if self.options.features <= EXACT_FEATURES_MAX and not self.data.is_image:
                 scores = self.head(click_words(self.options.features)).double()
-                return float((word_probabilities(p) * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
-            drawn = [self.head(sample_clicks(p, random).float()) for _ in range(VALIDATION_SAMPLES)]
-            return float(torch.stack([loss_of(scores, target).mean() for scores in drawn]).mean())
+                one = float((word_probabilities(p) * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
+            else:
+                one = self._mean_loss(p, loss_of, 1, random)
+            if self.options.mix == 0:
+                return one
+            numbers = range(2, self.options.shots + 1)
+            more = [self._mean_loss(p, loss_of, shots, random) for shots in numbers]
+            return (1 - self.options.mix) * one + self.options.mix * sum(more) / len(more)
+
+    def _mean_loss(self, p: Tensor, loss_of: LossOf, shots: int, random: torch.Generator) -> float:
+        """Return the mean loss of the validation objects over `VALIDATION_SAMPLES` draws of mean clicks of `shots` shots."""
+        target, losses = self.data.target[self.data.n_fit :], []
+        for _ in range(VALIDATION_SAMPLES):
+            clicks = torch.stack([sample_clicks(p, random) for _ in range(shots)]).mean(dim=0)
+            losses.append(loss_of(self.head(clicks.float()), target).mean())
+        return float(torch.stack(losses).mean())
 
     def finish(self, losses: tuple[float, ...]) -> Trained:
         """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
