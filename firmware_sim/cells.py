@@ -18,11 +18,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pans.runtime.wire import NO_OBJECT, Mark
+from pans.runtime.wire import NO_OBJECT
 
 from .changes import Changes
 from .detector import uniform_numbers
 from .exposures import Exposures
+from .marks import Marks, no_marks
 from .moving import Cells
 from .shifts import ShiftTable
 
@@ -58,7 +59,7 @@ class Arrivals(NamedTuple):
 
 
 class CellFlow:
-    """One run's cells in front of one table; `mark` is the next one that is due, and `rows` may only move forward in time."""
+    """One run's cells in front of one table; `rows` and `take_marks` may only move forward in time."""
 
     def __init__(self, cells: Cells, table: ShiftTable, exposures: Exposures, changes: Changes, seed: int) -> None:
         self._cells, self._table, self._exposures, self._changes, self._seed = cells, table, exposures, changes, seed
@@ -70,20 +71,15 @@ class CellFlow:
         self._n_drawn = 0
         # Nothing is half in when the run starts: a usual cell takes this long from the edge to the middle.
         self._flown_ticks = table.width / fastest
-        self._marks: list[Mark] = []
-        self._next_mark = 0
+        self._marks = no_marks()
         self.probability: F64 | None = None
 
-    @property
-    def mark(self) -> Mark:
-        """The next passage's mark; `tick` counts from the start of the run."""
-        while self._next_mark >= len(self._marks):
+    def take_marks(self, before_tick: int) -> Marks:
+        """Return the marks of passages whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
+        while not len(self._marks.ticks) or self._marks.ticks[-1] < before_tick:
             self._draw_chunk()
-        return self._marks[self._next_mark]
-
-    def take_mark(self) -> None:
-        """Go on to the mark after."""
-        self._next_mark += 1
+        taken, self._marks = self._marks.split(int(np.searchsorted(self._marks.ticks, before_tick)))
+        return taken
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """Expected photoelectrons of exposures first..first+count-1: float64 (rows, channels), and int64 (count,) of the row of each."""
@@ -105,8 +101,7 @@ class CellFlow:
     def _draw_chunk(self) -> None:
         new = self._arrivals(self._n_drawn, CHUNK)
         self._known = self._known.and_then(new)
-        self._marks = self._marks[self._next_mark :] + self._marks_of(self._n_drawn, new)
-        self._next_mark = 0
+        self._marks = self._marks.and_then(self._marks_of(self._n_drawn, new))
         self._n_drawn += CHUNK
 
     def _arrivals(self, first: int, count: int) -> Arrivals:
@@ -124,7 +119,7 @@ class CellFlow:
         images = (numbers[:, 1] * cells.objects.n_objects).astype(np.int64)
         return Arrivals(flown, speed, images, (numbers[:, 2] * (2 * cells.offset_px + 1)).astype(np.int64))
 
-    def _marks_of(self, first: int, arrivals: Arrivals) -> list[Mark]:
+    def _marks_of(self, first: int, arrivals: Arrivals) -> Marks:
         exposures = self._exposures
         centred = np.maximum(exposures.begun_by(arrivals.centre_ticks.astype(np.int64)) - 1, 0)
         gone = exposures.begun_by(
@@ -136,12 +131,8 @@ class CellFlow:
         _alone(begins, float(exposures.exposure_ticks), arrivals, self._table, photons)
         if self._changes:
             photons *= self._changes.efficiency(exposures.seconds(begins))
-        truths = self._cells.objects.labels[arrivals.images]
-        columns = (truths.tolist(), centred.tolist(), begins.tolist(), photons.tolist(), half.tolist())
-        return [
-            Mark(0, (first + k) % NO_OBJECT, truth, exposure, tick, light, long)
-            for k, (truth, exposure, tick, light, long) in enumerate(zip(*columns))
-        ]
+        truths = self._cells.objects.labels[arrivals.images].astype(np.int64)
+        return Marks(np.arange(first, first + len(begins)) % NO_OBJECT, truths, centred, begins, half, photons)
 
 
 def warm_up() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import zlib
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,11 @@ from pans.runtime.wire import DARK_PATTERN, ClickBlock, FrameBlock, Mark
 from pans.runtime.wire_commands import Gate, unpack_gate
 
 from .device import Instrument
-from .measurement import StreamMessage
+from .measurement import Measurement, StreamMessage
 from .stream import StreamBuffer
+
+if TYPE_CHECKING:
+    from .frame_run import FrameRun
 
 RING = 1 << 17  # exposures of a stream that are remembered
 MAX_VIOLATIONS = 20
@@ -306,6 +309,9 @@ class WatchedStream(StreamBuffer):
     def put(self, message: StreamMessage, session: int) -> list[bytes]:
         self.checker.on_put(session, message, len(self._held) >= self.capacity)
         return super().put(message, session)
+
+    def put_due(self, run: Measurement | FrameRun, tick: int, session: int) -> list[bytes | memoryview]:
+        return self.put_each(run, tick, session)
 
 
 class WatchedInstrument(Instrument):

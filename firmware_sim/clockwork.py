@@ -24,6 +24,9 @@ class SteppedDevice(Protocol):
 
     def next_event_tick(self) -> int | None: ...
 
+    def draw_ahead(self) -> bool:
+        """Do a piece of work that will be needed, of a fraction of a millisecond; whether there was any."""
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceClock:

@@ -95,6 +95,10 @@ class FrameEcho:
         """See `SteppedDevice`."""
         return None
 
+    def draw_ahead(self) -> bool:
+        """See `SteppedDevice`."""
+        return False
+
 
 def _watch_stdin() -> threading.Event:
     """Return an event that is set when the starting process closes our standard input, by dying at the latest."""

@@ -12,6 +12,7 @@ non-paralysable dead time n / (1 + n tau); the generator mixes counters with the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,7 @@ def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.flo
     return click_probability(replace(model.law, dark_per_exposure=0.0), counted)
 
 
+@lru_cache(maxsize=64)
 def stream_key(seed: int, stream: int) -> int:
     """Return the 64-bit key of one stream of random numbers."""
     return _mix_int(_mix_int(seed & _MASK) ^ _mix_int(stream + 1))

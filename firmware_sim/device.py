@@ -16,13 +16,14 @@ from pans.runtime.analyser import Analyser
 from pans.runtime.errors import ConfigError
 from pans.runtime.profile import Profile
 from pans.runtime.wire import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
-from pans.runtime.wire_commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
+from pans.runtime.wire_commands import PARALLEL, Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
 
 from .changes import Changes
 from .detector import detector_model
+from .drawing import ClickSource
 from .exposures import Exposures
 from .gates import GATE_CHANNELS, Gates
-from .light import LightTable, begin, prepare, tabulate, warm_up
+from .light import LightTable, StillObjects, begin, prepare, tabulate, warm_up
 from .measurement import MAX_LEASE_MS, Measurement, check_arm
 from .moving import SceneFile
 from .optics import passive_photoelectrons
@@ -31,12 +32,13 @@ from .stream import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
 
 if TYPE_CHECKING:
-    from .frame_writer import FrameWriter
+    from .frame_run import FrameRun
     from .shifts import ShiftTable
     from .tape import BarTable
 
 FIRMWARE = "pans-sim 1"
 BUFFER_MESSAGES = 256
+NEVER = 1 << 64
 
 
 @dataclass(slots=True)
@@ -72,6 +74,11 @@ class Instrument:
         self.scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
         _check_scene(self.scene, profile, optics)
         warm_up(self.scene)
+        if profile.mode == "parallel":  # nothing is compiled after the instrument is switched on
+            from . import detector_kernels, frame_writer
+
+            detector_kernels.warm_up()
+            frame_writer.warm_up()
         self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
         self.decoder.use_kernels()
@@ -80,8 +87,8 @@ class Instrument:
         self.gates = Gates()
         self._seed, self._epoch, self._tick, self._tick_hz = seed, epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
-        self.stream = StreamBuffer(buffer_messages, _writer(profile))
-        self._out: list[bytes] = []
+        self.stream = StreamBuffer(buffer_messages)
+        self._out: list[bytes | memoryview] = []
         self._forget_session()
 
     def _forget_session(self) -> None:
@@ -91,7 +98,7 @@ class Instrument:
         self._plan = PlanMemory(self.profile)
         self._light: tuple[tuple[int, int, int], LightTable | ShiftTable | BarTable] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
-        self._run: Measurement | None = None
+        self._run: Measurement | FrameRun | None = None
         self._lease_tick: int | None = None
         self._status_tick: int | None = None
         self._exposures_ended = 0
@@ -114,9 +121,14 @@ class Instrument:
         """Advance to `tick` (never back), digest `data` as having arrived then, and return all bytes sent by then."""
         if tick < self._tick:
             raise ValueError(f"device time cannot go back: at {self._tick}, asked for {tick}")
-        while (event := self._next_event()) is not None and event[0] <= tick:
-            self._tick = event[0]
-            self._happen(event[1])
+        while True:
+            due, what = self._next_event()
+            if self.state is DeviceState.RUNNING and self._run is not None:
+                self._out += self.stream.put_due(self._run, min(due, tick), self.session)
+            if due > tick:
+                break
+            self._tick = due
+            self._happen(what)
         self._tick = tick
         if data:
             for frame in self.decoder.feed(data):
@@ -126,35 +138,33 @@ class Instrument:
         return sent
 
     def next_event_tick(self) -> int | None:
-        """Tick at which the device does something by itself next; None when it only waits for the host.
+        """Tick at which the device does something by itself next; None when it only waits for the host."""
+        due, _ = self._next_event()
+        if self.state is DeviceState.RUNNING and self._run is not None and (message := self._run.next_tick) is not None:
+            due = min(due, message)
+        return None if due == NEVER else due
 
-        Shells ask when they have sent what there was and are about to wait: that is the time to draw clicks ahead.
-        """
-        if self._run is not None:
-            self._run.draw_ahead()
-        event = self._next_event()
-        return None if event is None else event[0]
+    def draw_ahead(self) -> bool:
+        """Do a piece of work that will be needed: for shells that have nothing else to do. Whether there was any."""
+        return self._run is not None and self._run.draw_ahead()
 
-    def _next_event(self) -> tuple[int, str] | None:
-        """The earliest event; at the same tick in the order start, message, end, lease, status."""
-        run, due, what = self._run, self._status_tick, "status"
-        if run is not None:
-            events: tuple[tuple[int | None, str], ...] = ((run.start_tick, "start"),)
-            if self.state is not DeviceState.ARMED:
-                events = ((run.end_tick, "end"), (run.next_tick, "message"))
-            for tick, name in ((self._lease_tick, "lease"), *events):
-                if tick is not None and (due is None or tick <= due):
-                    due, what = tick, name
-        return None if due is None else (due, what)
+    def _next_event(self) -> tuple[int, str]:
+        """The earliest event but for the stream's messages, which go before it; at the same tick in the order end, lease, status."""
+        due, what = NEVER if self._status_tick is None else self._status_tick, "status"
+        if self._run is None:
+            return due, what
+        if self._lease_tick is not None and self._lease_tick <= due:
+            due, what = self._lease_tick, "lease"
+        if self.state is DeviceState.ARMED:
+            return (self._run.start_tick, "start") if self._run.start_tick <= due else (due, what)
+        end = self._run.end_tick
+        return (end, "end") if end is not None and end <= due else (due, what)
 
     def _happen(self, what: str) -> None:
-        run = self._run
         if what == "status":
             self._send_status()
         elif what == "start":
             self._enter(DeviceState.RUNNING, StateReason.NONE)
-        elif what == "message" and run is not None:
-            self._out += self.stream.put(run.emit(), self.session)
         elif what == "end":
             self._end_run(DeviceState.IDLE, StateReason.COMPLETED)
         elif what == "lease":
@@ -330,7 +340,13 @@ class Instrument:
         light = begin(self.scene, table, program, exposures, changes, self._seed, self._draws)
         self.stream.restart()
         self._exposures_ended = 0
-        self._run = Measurement(program, arm, light, exposures, model, changes, self._seed, self._draws)
+        source = ClickSource(light, exposures, model, changes, self._seed, self._draws)
+        if isinstance(light, StillObjects) and program.mode != PARALLEL:
+            self._run = Measurement(program, arm, light, source)
+        else:
+            from .frame_run import FrameRun  # numba is loaded only for parallel instruments
+
+            self._run = FrameRun(program, arm, light, source, self.scene.moves)
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
 
@@ -377,14 +393,3 @@ def _check_scene(scene: SceneFile, profile: Profile, optics: Analyser | None) ->
         raise ConfigError(
             f"scene {scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
         )
-
-
-def _writer(profile: Profile) -> FrameWriter | None:
-    """The compiled encoder, and every other kernel of a parallel instrument with it: nothing is compiled after it is switched on."""
-    if profile.mode != "parallel":
-        return None
-    from .detector_kernels import warm_up as warm_up_detector
-    from .frame_writer import FrameWriter
-
-    warm_up_detector()
-    return FrameWriter()

@@ -240,6 +240,10 @@ class FaultyDevice:
             ticks.append(self._late_until)
         return min((max(tick, self._tick) for tick in ticks if tick is not None), default=None)
 
+    def draw_ahead(self) -> bool:
+        """See `SteppedDevice`."""
+        return self.device.draw_ahead()
+
     def _advance(self, tick: int, data: bytes) -> bytes:
         self._tick = tick
         for kind, schedule in self._schedules.items():

@@ -1,75 +1,172 @@
-"""Frame blocks and marks as bytes on the wire, by a compiled kernel: a parallel instrument sends thousands of them a second.
+"""Frame blocks and marks as bytes on the wire, many at a time: a parallel instrument sends thousands of them a second.
 
-Owns one buffer for each direction of the work; the bytes are those of `wire.encode_frames` and `wire.encode_mark`, which stay the reference
-(tests/test_moving.py holds them against each other). Never keeps a message.
+Owns the order of blocks and marks and their encoding, in two compiled kernels; the bytes are those of `wire.encode_frames` and
+`wire.encode_mark`, which stay the reference (tests/test_frame_run.py holds them against each other). Never draws a click, keeps no state.
 """
 
 from __future__ import annotations
 
-import struct
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from pans.runtime.wire import FrameBlock, Mark
+from pans.runtime.wire import BLOCK_HEADER_BYTES, NO_OBJECT
 from pans.runtime.wire_kernels import crc32_span
-from pans.runtime.wire_schema import HEADER, LAYOUTS, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, MessageType
+from pans.runtime.wire_schema import HEADER, SCHEMA, MessageType
 
-_BLOCK = struct.Struct(LAYOUTS["HEADER"] + LAYOUTS["FRAMES"].removeprefix("<"))
-_MARK = struct.Struct(LAYOUTS["HEADER"] + LAYOUTS["MARK"].removeprefix("<"))
+from .marks import Stamp, no_marks
+
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+# Columns of a message; those of a block and those of a mark differ from FIRST_WORD on, and a mark has no exposures.
+DUE, EXPOSURES, TICK, EXPOSURE, OBJECT, FIRST_WORD, N_COLUMNS = 0, 1, 2, 3, 4, 5, 8
+TRUTH, HALF, PHOTONS = 5, 6, 7  # photons: the bits of the float32
+MARK_BYTES = 32
+OVERHEAD_BYTES = HEADER.size + max(BLOCK_HEADER_BYTES, MARK_BYTES) + 4  # of a message, before COBS
+_FRAMES, _MARK, _HEADER_BYTES = int(MessageType.FRAMES), int(MessageType.MARK), HEADER.size
+_U = np.uint64
+_U32 = 0xFFFFFFFF
 
 
-class FrameWriter:
-    """Writes one message at a time; the kernel is compiled, or loaded, when it is made."""
+class BlockPlan(NamedTuple):
+    """The blocks of one cycle, int64 (blocks,): first slot, exposures, ticks of begin and end; and how cycles follow each other.
 
-    def __init__(self) -> None:
-        self._body = np.zeros(HEADER.size + MAX_PAYLOAD_BYTES + 4, np.uint8)
-        self._raw = memoryview(self._body.data)
-        self._out = np.zeros(MAX_FRAME_BYTES + 1, np.uint8)
-        self.mark(Mark(0, 0, 0, 0, 0, 0.0), 0, 0)
+    cycles_per_object 0: no object is known, since they pass by on their own.
+    """
 
-    def block(self, block: FrameBlock, sequence: int, drops: int, session: int) -> bytes:
-        """Return `block` as a frame with this sequence number and drop count."""
-        words = block.words
-        count, word_bytes = words.shape
-        _BLOCK.pack_into(
-            self._raw, 0, MessageType.FRAMES, 0, 0, session, sequence, drops, block.tick, block.exposure_index,
-            block.period_ticks, count, word_bytes, block.object_index,
-        )  # fmt: skip
-        stop = _BLOCK.size + words.size
-        self._body[_BLOCK.size : stop] = words.reshape(-1)
-        return self._frame(stop)
+    firsts: I64
+    counts: I64
+    begins: I64
+    ends: I64
+    n_slots: int
+    cycle_ticks: int
+    cycles_per_object: int
+    period_ticks: int
 
-    def mark(self, mark: Mark, sequence: int, session: int) -> bytes:
-        """Return `mark` as a frame with this sequence number."""
-        _MARK.pack_into(
-            self._raw, 0, MessageType.MARK, 0, 0, session, sequence, mark.object_index, mark.truth,
-            mark.half_exposures, mark.exposure_index, mark.tick, mark.photons,
-        )  # fmt: skip
-        return self._frame(_MARK.size)
 
-    def _frame(self, n_bytes: int) -> bytes:
-        return self._out[: _finish(self._body, n_bytes, SCHEMA, self._out)].tobytes()
+def encoded_bytes(n_messages: int, n_word_bytes: int) -> int:
+    """Return how many bytes `n_messages` with all these bytes of words take at most, delimiters included."""
+    body = n_messages * OVERHEAD_BYTES + n_word_bytes
+    return body + body // 254 + 3 * n_messages
+
+
+def warm_up() -> None:
+    """Compile or load the kernels."""
+    one = np.ones(1, np.int64)
+    messages, words = np.zeros((2, N_COLUMNS), np.int64), np.zeros((1, 1), np.uint8)
+    lay_out(BlockPlan(one, one, one, one, 1, 1, 1, 1), 0, 0, 1, no_marks(), 0, messages)
+    body, out = np.zeros(100, np.uint8), np.zeros(300, np.uint8)
+    write_messages(messages, words, 1, Stamp(0, 0, 1), SCHEMA, body, out, np.zeros(3, np.int64))
 
 
 @njit(cache=True, nogil=True)
-def _finish(body, n_bytes, schema, out):  # type: ignore[no-untyped-def]
-    """Append the CRC to body[:n_bytes], and write the COBS string of all of it and a delimiter to `out`; return its length."""
-    crc = crc32_span(body, 0, n_bytes, schema)
-    for k in range(4):
-        body[n_bytes + k] = (crc >> np.uint64(8 * k)) & np.uint64(0xFF)
-    code_at, at, code = 0, 1, 1
-    for i in range(n_bytes + 4):
-        byte = body[i]
-        if byte != 0:
-            out[at] = byte
+def lay_out(plan, cycle, block, n_blocks, marks, start_tick, messages):  # type: ignore[no-untyped-def]
+    """Write `n_blocks` blocks from `block` of `cycle` on and all `marks` to messages int64 (n_blocks + marks, N_COLUMNS), in order.
+
+    A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first.
+    """
+    at = taken = word = 0
+    for _ in range(n_blocks):
+        cycle_tick = start_tick + cycle * plan.cycle_ticks
+        end = cycle_tick + plan.ends[block]
+        while taken < marks.ticks.size and start_tick + marks.ticks[taken] < end:
+            message = messages[at]
+            message[DUE] = message[TICK] = start_tick + marks.ticks[taken]
+            message[EXPOSURES] = 0
+            message[EXPOSURE], message[OBJECT] = marks.exposures[taken], marks.objects[taken]
+            message[TRUTH], message[HALF] = marks.truths[taken], marks.halves[taken]
+            message[PHOTONS] = np.int64(np.float32(marks.photons[taken]).view(np.uint32))
+            taken += 1
             at += 1
-            code += 1
-        if byte == 0 or code == 255:
-            out[code_at] = code
+        message = messages[at]
+        message[DUE], message[EXPOSURES] = end, plan.counts[block]
+        message[TICK], message[EXPOSURE] = cycle_tick + plan.begins[block], cycle * plan.n_slots + plan.firsts[block]
+        message[OBJECT] = NO_OBJECT
+        if plan.cycles_per_object:
+            message[OBJECT] = cycle // plan.cycles_per_object % NO_OBJECT
+        message[FIRST_WORD] = word
+        word += plan.counts[block]
+        at += 1
+        block += 1
+        if block == plan.counts.size:
+            block = 0
+            cycle += 1
+
+
+@njit(cache=True, nogil=True)
+def write_messages(messages, words, period_ticks, stamp, schema, body, out, ends):  # type: ignore[no-untyped-def]
+    """Encode `messages` with their frames in words uint8 (exposures, bytes): frames to `out`, message k at ends[k]..ends[k + 1].
+
+    body uint8: room for one message before COBS; out uint8: `encoded_bytes` of all; ends int64 (messages + 1,).
+    """
+    ends[0] = 0
+    for k in range(messages.shape[0]):
+        message = messages[k]
+        sequence = (stamp.sequence + k) & _U32
+        used = _block(body, message, words, sequence, stamp.drops, period_ticks)
+        _put(body, 4, stamp.session, 4)
+        _put(body, used, crc32_span(body, 0, used, schema), 4)
+        ends[k + 1] = _stuff(body, used + 4, out, ends[k])
+
+
+@njit(cache=True, nogil=True)
+def _block(body, message, words, sequence, drops, period_ticks):  # type: ignore[no-untyped-def]
+    """Write a block or mark to `body`, but for the session and the CRC; return where it ends."""
+    count = message[EXPOSURES]
+    _put(body, 0, _FRAMES if count else _MARK, 4)
+    _put(body, 8, sequence, 4)
+    if count == 0:
+        _put(body, 12, message[OBJECT], 4)
+        _put(body, 16, message[TRUTH], 2)
+        _put(body, 18, message[HALF], 2)
+        _put(body, 20, message[EXPOSURE], 8)
+        _put(body, 28, message[TICK], 8)
+        _put(body, 36, message[PHOTONS], 4)
+        return _HEADER_BYTES + MARK_BYTES
+    _put(body, 12, drops, 4)
+    _put(body, 16, message[TICK], 8)
+    _put(body, 24, message[EXPOSURE], 8)
+    _put(body, 32, period_ticks, 4)
+    _put(body, 36, count, 2)
+    _put(body, 38, words.shape[1], 2)
+    _put(body, 40, message[OBJECT], 4)
+    at = _HEADER_BYTES + BLOCK_HEADER_BYTES
+    first = message[FIRST_WORD]
+    for t in range(first, first + count):
+        for p in range(words.shape[1]):
+            body[at] = words[t, p]
+            at += 1
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _put(body, at, value, n_bytes):  # type: ignore[no-untyped-def]
+    """Write a whole number, two's complement, least byte first."""
+    bits = _U(value)
+    for k in range(n_bytes):
+        body[at + k] = (bits >> _U(8 * k)) & _U(0xFF)
+
+
+@njit(cache=True, nogil=True)
+def _stuff(body, n_bytes, out, start):  # type: ignore[no-untyped-def]
+    """Write the COBS string of body[:n_bytes] and a delimiter to out[start:]; return where they end.
+
+    No branch depends on the data but that of a full group: the place of the code is moved on, or not, for every byte.
+    """
+    code_at, at = start, start + 1
+    for i in range(n_bytes):
+        byte = body[i]
+        out[at] = byte
+        out[code_at] = at - code_at
+        code_at = at if byte == 0 else code_at
+        at += 1
+        if at - code_at == 255:
+            out[code_at] = 255
             code_at = at
             at += 1
-            code = 1
-    out[code_at] = code
+    out[code_at] = at - code_at
     out[at] = 0
     return at + 1

@@ -18,6 +18,7 @@ from pans.runtime.wire_commands import PARALLEL
 from .changes import Changes
 from .detector import detector_model, first_click_probability, stream_key
 from .exposures import Exposures
+from .marks import Marks
 from .moving import Cells, SceneFile, Tape
 from .optics import expected_photoelectrons
 from .scene import Scene
@@ -46,12 +47,8 @@ class RunLight(Protocol):
 
     probability: F64 | None  # of all rows, where they are known beforehand
 
-    @property
-    def mark(self) -> Mark:
-        """The next mark; its tick counts from the start of the run."""
-
-    def take_mark(self) -> None:
-        """Go on to the mark after."""
+    def take_marks(self, before_tick: int) -> Marks:
+        """Return the marks whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """Expected photoelectrons float64 (rows, channels), and int64 (count,) of the row of each of exposures first..first+count-1."""
@@ -135,7 +132,7 @@ class StillObjects:
 
     @property
     def mark(self) -> Mark:
-        """See `RunLight`."""
+        """The next mark; its tick counts from the start of the run."""
         exposure = self._object * self._program.cycles_per_object * self._program.n_slots
         tick = int(self._exposures.begins(exposure, 1)[0])
         number = self._object % NO_OBJECT
@@ -145,8 +142,22 @@ class StillObjects:
         return Mark(0, number, self._scene.truth(number % self._scene.n_objects), exposure, tick, photons)
 
     def take_mark(self) -> None:
-        """See `RunLight`."""
+        """Go on to the mark after."""
         self._object += 1
+
+    def take_marks(self, before_tick: int) -> Marks:
+        """See `RunLight`."""
+        exposures_per_object = self._program.cycles_per_object * self._program.n_slots
+        begun = int(self._exposures.begun_by(np.array([before_tick - 1]))[0])
+        passing = np.arange(self._object, max(self._object, -(-begun // exposures_per_object)))
+        self._object += len(passing)
+        ticks = self._exposures.begins_of(passing * exposures_per_object)
+        numbers = passing % NO_OBJECT
+        photons = self._photons[numbers % self._scene.n_objects]
+        if self._changes:
+            photons = photons * self._changes.efficiency(ticks / self._exposures.tick_hz)
+        truths = self._scene.labels[numbers % self._scene.n_objects].astype(np.int64)
+        return Marks(numbers, truths, passing * exposures_per_object, ticks, np.zeros_like(ticks), photons)
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """See `RunLight`: parallel, an object is a row and the last one is dark; sequential, a row is an object under a pattern."""

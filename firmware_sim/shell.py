@@ -21,6 +21,7 @@ READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20
 FIFO_PRIORITY = 20  # above the host's loop: light does not wait for a computer
 LONGEST_WAIT_S = 0.25  # how late a stop request may be noticed
+DRAW_S = 200e-6  # when nothing is due for so long, there is time to make a piece of what is due later
 
 
 class Port(Protocol):
@@ -32,7 +33,8 @@ class Port(Protocol):
 
     def write(self, data: bytes) -> int: ...
 
-    def wait(self, timeout_s: float, wants_to_write: bool) -> None: ...
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
+        """Wait until there is something to read, or room to write for who wants to; whether there is something to read."""
 
     def close(self) -> None: ...
 
@@ -78,8 +80,8 @@ class PtyPort:
         except BlockingIOError:
             return 0
 
-    def wait(self, timeout_s: float, wants_to_write: bool) -> None:
-        select.select([self._master], [self._master] if wants_to_write else [], [], timeout_s)
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
+        return bool(select.select([self._master], [self._master] if wants_to_write else [], [], timeout_s)[0])
 
     def hang_up(self) -> None:
         raise UsageError("a pseudo-terminal cannot break and come back under its name")
@@ -128,9 +130,9 @@ class TcpPort:
             self.hang_up()
             return len(data)
 
-    def wait(self, timeout_s: float, wants_to_write: bool) -> None:
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
         source = self._client or self._listener
-        select.select([source], [source] if wants_to_write and self._client else [], [], timeout_s)
+        return bool(select.select([source], [source] if wants_to_write and self._client else [], [], timeout_s)[0])
 
     def close(self) -> None:
         self.hang_up()
@@ -167,8 +169,9 @@ def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callab
     ask_for_priority()
     backlog = bytearray()
     session = device.session
+    readable = True
     while not stopped():
-        data = port.read()
+        data = port.read() if readable else b""
         if not getattr(device, "connected", True):
             port.hang_up()
             backlog.clear()
@@ -185,4 +188,6 @@ def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callab
         wait_s = LONGEST_WAIT_S
         if due is not None:
             wait_s = min(wait_s, max(0.0, (clock.host_ns_at(due) - time.perf_counter_ns()) * 1e-9))
-        port.wait(wait_s, bool(backlog))
+        if wait_s > DRAW_S and device.draw_ahead():
+            wait_s = 0.0
+        readable = port.wait(wait_s, bool(backlog))

@@ -1,6 +1,6 @@
 """The device's end of the stream: sequence numbers, receive window, buffer and drop count (docs/PROTOCOL.md, section 5).
 
-Owns what waits to be sent; never retransmits. `StreamBuffer.put` and `grant` return the frames that may be sent now.
+Owns what waits to be sent; never retransmits. `StreamBuffer.put`, `put_due` and `grant` return the frames that may be sent now.
 """
 
 from __future__ import annotations
@@ -11,23 +11,20 @@ from typing import TYPE_CHECKING
 
 from pans.runtime import wire
 
-from .measurement import StreamMessage
+from .marks import Stamp
+from .measurement import Measurement, StreamMessage
 
 if TYPE_CHECKING:
-    from .frame_writer import FrameWriter
+    from .frame_run import FrameRun
 
 U32 = 0xFFFFFFFF
 
 
 @dataclass(slots=True)
 class StreamBuffer:
-    """At most `capacity` messages are held back; when it is full the newest is dropped whole and its exposures counted.
-
-    With a `writer`, blocks of frames and marks are encoded by its kernel.
-    """
+    """At most `capacity` messages are held back; when it is full the newest is dropped whole and its exposures counted."""
 
     capacity: int
-    writer: FrameWriter | None = None
     sequence: int = 0
     limit: int = 0
     dropped_exposures: int = 0
@@ -49,10 +46,45 @@ class StreamBuffer:
         self.sequence = (self.sequence + 1) & U32
         return self._released()
 
+    def put_each(self, run: Measurement | FrameRun, tick: int, session: int) -> list[bytes | memoryview]:
+        """`put` every message of `run` that is due by `tick`."""
+        sent: list[bytes | memoryview] = []
+        while (due := run.next_tick) is not None and due <= tick:
+            sent += self.put(run.emit(), session)
+        return sent
+
+    def put_due(self, run: Measurement | FrameRun, tick: int, session: int) -> list[bytes | memoryview]:
+        """As `put_each`, but in one piece where messages are made ahead and the window lets all of them out."""
+        if isinstance(run, Measurement):
+            return self.put_each(run, tick, session)
+        sent: list[bytes | memoryview] = []
+        while due := run.due_by(tick):
+            if not self._held and self._open() >= due:
+                sent.append(run.take(due, self._stamp(session)))
+                self.sequence = (self.sequence + due) & U32
+                continue
+            for _ in range(due):
+                if len(self._held) >= self.capacity:
+                    self.dropped_messages += 1
+                    self.dropped_exposures += run.skip()
+                    continue
+                self._held.append((self.sequence, bytes(run.take(1, self._stamp(session)))))
+                self.sequence = (self.sequence + 1) & U32
+                sent += self._released()
+        return sent
+
     def grant(self, limit: int) -> list[bytes]:
         """Move the receive window: messages with a sequence below `limit` may leave; return those that now do."""
         self.limit = limit
         return self._released()
+
+    def _open(self) -> int:
+        """How many messages from `sequence` on the window lets out, modulo 2^32."""
+        ahead = (self.limit - self.sequence) & U32
+        return ahead if ahead < 1 << 31 else 0
+
+    def _stamp(self, session: int) -> Stamp:
+        return Stamp(self.sequence, self.dropped_exposures & U32, session)
 
     def _released(self) -> list[bytes]:
         released = []
@@ -63,11 +95,6 @@ class StreamBuffer:
 
     def _encode(self, message: StreamMessage, session: int) -> bytes:
         drops = self.dropped_exposures & U32
-        if self.writer is not None:
-            if isinstance(message, wire.FrameBlock):
-                return self.writer.block(message, self.sequence, drops, session)
-            if isinstance(message, wire.Mark):
-                return self.writer.mark(message, self.sequence, session)
         if isinstance(message, wire.Mark):
             return wire.encode_mark(message._replace(seq=self.sequence), session)
         if isinstance(message, wire.ClickBlock):

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError
 from pans.runtime.profile import Profile
-from pans.runtime.wire import NO_OBJECT, Mark
+from pans.runtime.wire import NO_OBJECT
 
 from .cells import MAX_HALF_EXPOSURES
 from .changes import Changes
 from .detector import uniform_numbers
 from .exposures import Exposures
+from .marks import Marks, no_marks
 from .moving import Tape
 from .optics import photons_per_level
 
@@ -61,7 +62,7 @@ class BarTable:
 
 
 class TapeFlow:
-    """One run's tape in front of one table; `mark` is the next one that is due, and `rows` may only move forward in time."""
+    """One run's tape in front of one table; `rows` and `take_marks` may only move forward in time."""
 
     def __init__(self, tape: Tape, table: BarTable, exposures: Exposures, changes: Changes, seed: int) -> None:
         self._tape, self._table, self._exposures, self._changes, self._seed = tape, table, exposures, changes, seed
@@ -71,24 +72,21 @@ class TapeFlow:
         self._errors = np.zeros(0)  # at pitch numbers _first_pitch.. after the start
         self._first_pitch = 0
         self._last_error: float | None = None
-        self._marks: list[Mark] = []
-        self._next_mark, self._n_marked = 0, 0
+        self._marks = no_marks()
+        self._n_marked = 0
         self.probability: F64 | None = None
         self._keep_from = 0  # pitch number; what lies before may be forgotten
         self._margin = 4 + math.ceil(
             exposures.longest_period_ticks / self._pitch_ticks
         )  # a window's exposure may begin so much earlier
 
-    @property
-    def mark(self) -> Mark:
-        """The next window's mark; `tick` counts from the start of the run."""
-        if self._next_mark >= len(self._marks):
-            self._draw_marks()
-        return self._marks[self._next_mark]
-
-    def take_mark(self) -> None:
-        """Go on to the mark after."""
-        self._next_mark += 1
+    def take_marks(self, before_tick: int) -> Marks:
+        """Return the marks of windows whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
+        while not len(self._marks.ticks) or self._marks.ticks[-1] < before_tick:
+            self._marks = self._marks.and_then(self._marks_of(self._n_marked, MARK_CHUNK))
+            self._n_marked += MARK_CHUNK
+        taken, self._marks = self._marks.split(int(np.searchsorted(self._marks.ticks, before_tick)))
+        return taken
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """Expected photoelectrons of exposures first..first+count-1: float64 (rows, channels), and int64 (count,) of the row of each."""
@@ -101,14 +99,7 @@ class TapeFlow:
         rows[0] = 0.0
         row_of = np.where(lit, np.arange(1, count + 1), 0)
         _fill(start, stop, self._bits, self._first_bar, self._table.light, self._table.dark, rows)
-        while not self._marks or self._marks[-1].exposure_index < first + count:
-            self._draw_marks()  # now, that there is time: whoever asks for a mark is about to send it
         return rows, row_of
-
-    def _draw_marks(self) -> None:
-        self._marks = self._marks[self._next_mark :] + self._marks_of(self._n_marked, MARK_CHUNK)
-        self._next_mark = 0
-        self._n_marked += MARK_CHUNK
 
     def _path(self, begins: F64) -> tuple[F64, F64]:
         """Where the window begins, in bars, when exposures begin and end; float64 (n,) each."""
@@ -150,7 +141,7 @@ class TapeFlow:
         self._bits = np.concatenate([self._bits[drop:], new])
         self._first_bar += drop
 
-    def _marks_of(self, first: int, count: int) -> list[Mark]:
+    def _marks_of(self, first: int, count: int) -> Marks:
         tape, exposures = self._tape, self._exposures
         self._reach(first + count + 2)
         pitches = np.arange(first, first + count + 3)
@@ -177,12 +168,8 @@ class TapeFlow:
         windows = np.lib.stride_tricks.sliding_window_view(self._bits[at : at + count + tape.bars - 1], tape.bars)
         wanted = np.frombuffer(tape.target.encode(), np.uint8) - 48
         inside = np.lib.stride_tricks.sliding_window_view(windows, len(wanted), axis=1)
-        truths = (inside == wanted).all(axis=2).any(axis=1).astype(int)
-        columns = (truths.tolist(), centred.tolist(), begins.tolist(), photons.tolist(), half.tolist())
-        return [
-            Mark(0, (first + k) % NO_OBJECT, truth, exposure, tick, light, long)
-            for k, (truth, exposure, tick, light, long) in enumerate(zip(*columns))
-        ]
+        truths = (inside == wanted).all(axis=2).any(axis=1).astype(np.int64)
+        return Marks(np.arange(first, first + count) % NO_OBJECT, truths, centred, begins, half, photons)
 
 
 def warm_up() -> None:

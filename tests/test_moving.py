@@ -12,15 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_moving import mean_light, shifted, tape_field
 
-from pans.firmware_sim import bench_flow, measurement, shifts
+from pans.firmware_sim import bench_flow, frame_run, shifts
 from pans.firmware_sim import cells as cells_module
 from pans.firmware_sim.cells import CellFlow
 from pans.firmware_sim.changes import Changes
 from pans.firmware_sim.detector import detector_model
 from pans.firmware_sim.device import Instrument
+from pans.firmware_sim.drawing import ClickSource
 from pans.firmware_sim.exposures import Exposures
-from pans.firmware_sim.frame_writer import FrameWriter
-from pans.firmware_sim.light import begin, prepare
+from pans.firmware_sim.frame_run import FrameRun
+from pans.firmware_sim.light import StillObjects, begin, prepare
 from pans.firmware_sim.measurement import Measurement
 from pans.firmware_sim.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.optics import expected_photoelectrons, photons_per_level
@@ -70,25 +71,27 @@ def light_of(run: Any, first: int, count: int) -> np.ndarray:
 
 
 def marks_of(run: Any, n: int) -> list[wire.Mark]:
-    marks = []
-    for _ in range(n):
-        marks.append(run.mark)
-        run.take_mark()
-    return marks
+    marks: list[wire.Mark] = []
+    before = 0
+    while len(marks) < n:
+        before += 100_000
+        columns = [column.tolist() for column in run.take_marks(before)]
+        for number, truth, exposure, tick, half, photons in zip(*columns):
+            marks.append(wire.Mark(0, number, truth, exposure, tick, photons, half))
+    return marks[:n]
 
 
-def run_of(scene: SceneFile, plan: Program, *, cycles: int = 0, seed: int = 7, first_draw: int = 0) -> Measurement:
+def run_of(scene: SceneFile, plan: Program, *, cycles: int = 0, seed: int = 7, first_draw: int = 0) -> FrameRun:
     exposure_us = plan.exposure_ticks * 1e6 / TICK_HZ
     exposures = Exposures(plan, cycles or None, TICK_HZ)
     levels = LEVELS if not isinstance(scene.what, Tape) else BAR_LEVELS
     changes = Changes(scene.changes, 3)
     light = begin(scene, prepare(FLOW, scene, levels, exposure_us), plan, exposures, changes, seed, first_draw)
-    return Measurement(
-        plan, Arm(1000, cycles, 1), light, exposures, detector_model(FLOW, exposure_us), changes, seed, 0
-    )
+    source = ClickSource(light, exposures, detector_model(FLOW, exposure_us), changes, seed, 0)
+    return FrameRun(plan, Arm(1000, cycles, 1), light, source, scene.moves)
 
 
-def emitted(run: Measurement, n: int) -> list[Any]:
+def emitted(run: FrameRun | Measurement, n: int) -> list[Any]:
     return [run.emit() for _ in range(n) if run.next_tick is not None]
 
 
@@ -331,7 +334,7 @@ def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.Monkey
     whole = story()
     assert len(whole) > 120
     for size in (1, 37, 10_000):
-        monkeypatch.setattr(measurement, "AHEAD_EXPOSURES", size)
+        monkeypatch.setattr(frame_run, "STRETCH_EXPOSURES", size)
         assert story() == whole
         assert story(ahead=True) == whole
 
@@ -359,18 +362,8 @@ def test_messages_come_in_the_order_of_ticks() -> None:
 def test_another_run_meets_other_cells() -> None:
     scene = SceneFile("x", CELLS)
     first, again, later = (run_of(scene, program(), first_draw=draw) for draw in (0, 0, 5000))
-    assert first._light.mark == again._light.mark != later._light.mark
-
-
-def test_the_compiled_writer_is_the_reference() -> None:
-    writer = FrameWriter()
-    for count, size in ((1, 1), (40, 2), (254, 1), (300, 4), (9, 56)):
-        for lit in (0.0, 0.05, 1.0):
-            words = np.where(RNG.random((count, size)) < lit, RNG.integers(1, 256, (count, size)), 0).astype(np.uint8)
-            block = wire.FrameBlock(3, 4, 2**40 + count, 2**33, 250, wire.NO_OBJECT, words)
-            assert writer.block(block, 3, 4, 0xABCDEF01) == wire.encode_frames(block, 0xABCDEF01)
-    mark = wire.Mark(9, 8, -1, 7, 2**50, 3.25, 77)
-    assert writer.mark(mark, 9, 5) == wire.encode_mark(mark, 5)
+    marks = [marks_of(run._light, 3) for run in (first, again, later)]
+    assert marks[0] == marks[1] != marks[2]
 
 
 # -- what changes ----------------------------------------------------------------------------------------------------------
@@ -413,7 +406,8 @@ def test_a_dead_channel_is_silent_in_spite_of_crosstalk() -> None:
     plan = program()
     exposures, changes = Exposures(plan, None, TICK_HZ), Changes(scene.changes, 3)
     light = begin(scene, prepare(profile, scene, LEVELS, 2.0), plan, exposures, changes, 1, 0)
-    run = Measurement(plan, Arm(10, 0, 1), light, exposures, detector_model(profile, 2.0), changes, 1, 0)
+    source = ClickSource(light, exposures, detector_model(profile, 2.0), changes, 1, 0)
+    run = FrameRun(plan, Arm(10, 0, 1), light, source, moves=False)
     words = np.concatenate([block.words for block in emitted(run, 80) if isinstance(block, wire.FrameBlock)])
     clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3].mean(axis=0)
     assert clicks[1] == 0
@@ -456,7 +450,8 @@ def test_clicks_follow_the_light_that_the_scene_passes() -> None:
     def light() -> Any:
         return begin(scene, prepare(profile, scene, LEVELS, 2.0), plan, exposures, changes, 3, 0)
 
-    run = Measurement(plan, Arm(10, 0, 1), light(), exposures, model, changes, 3, 0)
+    source = ClickSource(chosen := light(), exposures, model, changes, 3, 0)
+    run = FrameRun(plan, Arm(10, 0, 1), chosen, source, moves=True)
     words = np.concatenate([block.words for block in emitted(run, 5500) if isinstance(block, wire.FrameBlock)])[:40_000]
     clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3]
     times_s = exposures.seconds(exposures.begins(0, len(words)))
@@ -477,7 +472,9 @@ def test_a_still_scene_changes_too_pattern_after_pattern() -> None:
     )  # 2 us at 1 MHz, one after the other
     exposures, changes = Exposures(plan, None, 1_000_000), Changes(scene.changes, 1)
     light = begin(scene, prepare(profile, scene, np.ones((1, 4), np.uint16), 2.0), plan, exposures, changes, 1, 0)
-    run = Measurement(plan, Arm(10, 0, 1), light, exposures, detector_model(profile, 2.0), changes, 1, 0)
+    source = ClickSource(light, exposures, detector_model(profile, 2.0), changes, 1, 0)
+    assert isinstance(light, StillObjects)
+    run = Measurement(plan, Arm(10, 0, 1), light, source)
     bits = np.concatenate([block.bits for block in emitted(run, 1100) if isinstance(block, wire.ClickBlock)])[:50_000]
     for part, mean in ((bits[:25_000], 0.02), (bits[25_000:], 0.2)):
         wanted = -np.expm1(-mean)

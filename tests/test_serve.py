@@ -368,8 +368,9 @@ class StuckPort:
         self.largest = max(self.largest, len(data))
         return 0
 
-    def wait(self, timeout_s: float, wants_to_write: bool) -> None:
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
         self.waits += 1
+        return False
 
     def close(self) -> None:
         pass
@@ -385,6 +386,9 @@ class Talker:
 
     def next_event_tick(self) -> int | None:
         return None
+
+    def draw_ahead(self) -> bool:
+        return False
 
 
 def test_a_client_that_never_reads_costs_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
