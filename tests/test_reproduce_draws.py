@@ -1,4 +1,4 @@
-"""Reproduction on other draws of a generator: told apart in the cache, named on the page, refused where nothing is drawn."""
+"""Reproduction on drawn tasks: other draws told apart, named on the page, refused where nothing is drawn; patterns by photons."""
 
 # ruff: noqa: E402  (what follows needs torch)
 import dataclasses
@@ -8,8 +8,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.cli import main
+from pans.runtime.profile import load_profile
 from pans.trainer import passive_recipes
+from pans.trainer import reproduce_equal as equal
 from pans.trainer import reproduce_passive as passive
+from pans.trainer.options import check_options
 from pans.trainer.paper_tables import PASSIVE
 from pans.trainer.report_passive import markdown
 from pans.trainer.tasks import draw_task
@@ -64,3 +67,14 @@ def test_the_command_trains_on_another_draw(tmp_path, capsys):
 def test_what_is_not_drawn_has_no_other_draws(name, capsys):
     assert main(["reproduce", name, "--data-seed", "7"]) == 2
     assert f"{name} is not drawn" in capsys.readouterr().err
+
+
+def test_more_photons_get_more_patterns_where_ten_would_saturate():
+    options = {photons: equal.recipe("cells-3", photons) for photons in equal.PHOTONS}
+    assert options[3.0].features == equal.FEATURES
+    assert options[3.0].estimator == "exact"
+    for photons in (10.0, 25.0):
+        assert options[photons].features > equal.FEATURES
+        assert options[photons].estimator == "local"  # too many words to enumerate
+        check_options(options[photons], load_profile("ideal"))
+    assert all(option.photons < photons and option.clicks is None for photons, option in options.items())
