@@ -6,18 +6,19 @@ Owns the command and the way from a recording back to a core; the decisions come
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .bundle import Bundle, load_bundle
 from .cli import EXIT_ALERT, EXIT_FINE, Command, emit
 from .connection import plan_from_chunks
 from .core import Core
 from .decide import make_decider
-from .errors import DamagedFileError
+from .errors import DamagedFileError, UsageError
 from .flow import FlowCore
 from .follower import Follower
 from .parts import parts_in, place_of
@@ -26,7 +27,7 @@ from .plan import Plan
 from .record import DECISION_DTYPE, Recording, read_recording
 from .record_log import log_hash
 from .run_dark import made_guard
-from .run_flow import replayed_core, replayed_figures
+from .run_flow import passage_words, replayed_core, replayed_figures
 from .verdict import Decider
 from .wire import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command, unpack_body
 from .wire_commands import Arm, PlanChunk, unpack_arm, unpack_plan
@@ -42,6 +43,25 @@ def replay(
 
     `pictures` collects those given back, `figures` what the decisions about passing objects were worth.
     """
+    core, n_decisions, sha256 = _replayed(recording, bundle, pictures)
+    if figures is not None and isinstance(core, FlowCore):
+        figures |= replayed_figures(core, recording.events())
+    return n_decisions, sha256
+
+
+def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[dict[str, Any], NDArray[np.int64]]:
+    """Return what a replay's decisions about passing objects were worth, and truth against decision (classes, classes).
+
+    UsageError where nothing passed.
+    """
+    core, _, _ = _replayed(recording, bundle, None)
+    if not isinstance(core, FlowCore):
+        raise UsageError(f"{recording.path}: no objects pass by in this run")
+    return replayed_figures(core, recording.events()), core.matcher.confusion
+
+
+def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, int, str]:
+    """Drive a core through `recording`; return it, the number of decisions and the SHA-256 of their log."""
     config = recording.header.get("config", {})
     try:
         chunks, arms = sent_plan(recording)
@@ -59,9 +79,7 @@ def replay(
         n_decisions += len(decisions)
         if pictures is not None:
             pictures.note(decisions)
-    if figures is not None and isinstance(core, FlowCore):
-        figures |= replayed_figures(core, recording.events())
-    return n_decisions, log.hexdigest()
+    return core, n_decisions, log.hexdigest()
 
 
 def _core(
@@ -162,8 +180,12 @@ def _run(args: argparse.Namespace) -> int:
     if pictures is not None and args.truth:
         payload |= pictures.compare(args.truth)
     words = "identical" if identical else f"DIFFERENT from the recorded log ({recording.n_decisions} decisions)"
-    emit(args, payload, f"{n_decisions} decisions, SHA-256 {sha256}: {words}")
+    emit(args, payload, "\n".join([f"{n_decisions} decisions, SHA-256 {sha256}: {words}", *_passage_words(figures)]))
     return EXIT_FINE if identical else EXIT_ALERT
+
+
+def _passage_words(figures: Mapping[str, Any]) -> list[str]:
+    return passage_words(figures) if "passages" in figures else []
 
 
 def _run_parts(args: argparse.Namespace) -> int:
@@ -172,15 +194,18 @@ def _run_parts(args: argparse.Namespace) -> int:
     for path in parts_in(args.recording):
         recording = read_recording(path)
         bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
-        n_decisions, sha256 = replay(recording, bundle)
+        figures: dict[str, Any] = {}
+        n_decisions, sha256 = replay(recording, bundle, None, figures)
         same = sha256 == recording.decisions_sha256
-        rows.append({"part": path.name, "decisions": n_decisions, "sha256": sha256, "identical": same})
+        rows.append({"part": path.name, "decisions": n_decisions, "sha256": sha256, "identical": same, **figures})
     identical = all(row["identical"] for row in rows)
     payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
-    lines = [
-        f"{row['part']}: {row['decisions']} decisions: {'identical' if row['identical'] else 'DIFFERENT'}"
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        lines += [
+            f"{row['part']}: {row['decisions']} decisions: {'identical' if row['identical'] else 'DIFFERENT'}",
+            *_passage_words(row),
+        ]
     emit(args, payload, "\n".join(lines))
     return EXIT_FINE if identical else EXIT_ALERT
 

@@ -274,6 +274,7 @@ class FlowCore(Follower):
         slots = np.arange(stop - len(place["counts"]), stop) & (len(self._words) - 1)
         self._words[slots] = np.frombuffer(bytes.fromhex(place["words"]), "<u8")
         self._counts[slots] = place["counts"]
+        self.matcher.forget_marks(stop - self.frames // 2)  # they were decided in the part before
 
     # -- what cells and tape do each in their way ----------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from .errors import UsageError
 F64 = NDArray[np.float64]
 DPI = 90
 PATTERNS_MAX = 64
+CLASSES_MAX = 100
 LEAST_US = 0.1
 
 
@@ -175,4 +176,25 @@ def per_pattern(values: F64, label: str) -> bytes:
     figure, axes = _new(min(9.0, 3.0 + 0.15 * len(values)), 2.6)
     axes[0, 0].bar(np.arange(len(values)), values, color="C0")
     axes[0, 0].set(xlabel="pattern", ylabel=label)
+    return _done(figure)
+
+
+def over_time(edges_s: F64, panels: Mapping[str, Mapping[str, NDArray[np.int64]]]) -> bytes:
+    """Draw counts per bin over time, one panel above the other; in a panel the counts of each name (bins,) are stacked."""
+    figure, axes = _new(9.0, 0.6 + 2.1 * len(panels), len(panels))
+    for axis, (title, rows) in zip(axes[:, 0], panels.items()):
+        base = np.zeros(len(edges_s) - 1, np.int64)
+        for number, (name, counts) in enumerate(rows.items()):
+            axis.stairs(
+                base + counts,
+                edges_s,
+                baseline=base,
+                fill=True,
+                color=f"C{number}",
+                label=f"{name} ({int(counts.sum())})",
+            )
+            base = base + counts
+        axis.set(ylabel=f"{title}\nper {edges_s[1] - edges_s[0]:.3g} s", xlim=(edges_s[0], edges_s[-1]), ylim=(0, None))
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    axes[-1, 0].set_xlabel("seconds since the first decision")
     return _done(figure)

@@ -19,13 +19,14 @@ from .bundle import Bundle
 from .dark import wilson_interval
 from .exposures import Exposures, is_dark, iter_exposures, recorded_plan
 from .page import Page
+from .page_flow import add_late, add_passages, is_flow
 from .plan import Plan
 from .record import DecisionFlag, Recording
 
 BINS = 120
 EXPOSURES_PER_BIN = 25  # of each pattern: a rate from fewer is noise
 EVENTS_SHOWN = 200
-CLASSES_DRAWN = 100
+EVENTS_OF_A_KIND = 30
 F64 = NDArray[np.float64]
 _TITLES = {
     "accuracy": "accuracy",
@@ -41,6 +42,7 @@ _TITLES = {
     "late": "late decisions",
     "lost": "lost exposures",
 }
+_STILL = {"accuracy_std_trials", "accuracy_stderr_objects", "objects", "trials"}  # of objects that stand still
 _SHOWN_ELSEWHERE = {
     *_TITLES,
     "simulated",
@@ -73,10 +75,20 @@ def recording_page(recording: Recording) -> bytes:
     _verdict(page, recording)
     page.heading("Results")
     if summary:
-        page.table([(text, _figure(key, summary[key])) for key, text in _TITLES.items() if key in summary])
-    decisions = recording.decisions()
-    _confusion(page, decisions, bundle)
+        hidden = _STILL if is_flow(recording) else set()
+        page.table(
+            [
+                (text, _figure(key, summary[key]))
+                for key, text in _TITLES.items()
+                if key in summary and key not in hidden
+            ]
+        )
+    if is_flow(recording):
+        add_passages(page, recording, bundle)
+    else:
+        _confusion(page, recording.decisions(), bundle)
     _timing(page, recording)
+    add_late(page, recording)
     plan = recorded_plan(recording)
     rates = count_rates(recording, plan)
     _rates(page, plan, rates, summary)
@@ -180,7 +192,7 @@ def _figure(key: str, value: Any) -> str:
 
 
 def _confusion(page: Page, decisions: NDArray[np.void], bundle: Bundle | None) -> None:
-    if bundle is None or not 2 <= bundle.n_classes <= CLASSES_DRAWN:
+    if bundle is None or not 2 <= bundle.n_classes <= draw.CLASSES_MAX:
         return
     decided = decisions[(decisions["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
     known = decided[(decided["truth"] >= 0) & (decided["truth"] < bundle.n_classes)]
@@ -235,7 +247,7 @@ def _rates(page: Page, plan: Plan, rates: Rates, summary: Mapping[str, Any]) -> 
         f"Clicks per exposure of each {what}, {len(rates.clicks)} bins over the run; right: the mean with its standard error.",
     )
     if not rates.dark_exposures.sum():
-        page.text("The run had no dark slots: nothing is known about dark counts.", "note")
+        _empty_fields(page, summary)
         return
     page.heading("Dark counts")
     clicks, exposures = int(rates.dark_clicks.sum()), int(rates.dark_exposures.sum())
@@ -254,6 +266,21 @@ def _rates(page: Page, plan: Plan, rates: Rates, summary: Mapping[str, Any]) -> 
         draw.dark_rates(centres, rates.dark_clicks[some], rates.dark_exposures[some], intervals, expected),
         "Dark clicks per dark exposure in each stretch of the run.",
     )
+
+
+def _empty_fields(page: Page, summary: Mapping[str, Any]) -> None:
+    """Without dark slots: what a flow's frames without an object told, channel by channel."""
+    channels = summary.get("dark", {}).get("channels") or []
+    if not channels or not channels[0]["exposures"]:
+        page.text("The run had no dark slots: nothing is known about dark counts.", "note")
+        return
+    page.heading("Dark counts")
+    page.text("The run had no dark slots; frames in which no object was found tell, as the run summed it up.", "note")
+    rows = [
+        (number, row["clicks"], row["exposures"], f"{row['low']:.3g} to {row['high']:.3g}", f"{row['expected']:.3g}")
+        for number, row in enumerate(channels)
+    ]
+    page.table(rows, ("channel", "clicks", "frames", "per frame, 95 %", "expected"))
 
 
 def _clock(page: Page, recording: Recording) -> None:
@@ -280,14 +307,17 @@ def _events(page: Page, recording: Recording) -> None:
     for event in recording.events():
         kind = str(event.get("kind", "?"))
         kinds[kind] += 1
-        if len(shown) < EVENTS_SHOWN and kind != "session":
+        if len(shown) < EVENTS_SHOWN and kinds[kind] <= EVENTS_OF_A_KIND and kind != "session":
             shown.append((kind, ", ".join(f"{key} {value}" for key, value in event.items() if key != "kind")))
     page.heading("Events")
     page.table([(kind, count) for kind, count in kinds.most_common()], ("kind", "how often"))
     if shown:
         page.table(shown, ("event", "what was noted"))
     if sum(kinds.values()) - kinds["session"] > len(shown):
-        page.text(f"The first {len(shown)} are shown; `pans export` writes them all.", "note")
+        page.text(
+            f"{len(shown)} are shown, the first {EVENTS_OF_A_KIND} of a kind at most; `pans export` writes them all.",
+            "note",
+        )
 
 
 def _optics(page: Page, bundle: Bundle) -> None:

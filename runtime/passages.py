@@ -80,6 +80,10 @@ class PassageMatcher:
         """Take a mark, in the order of the stream."""
         self._marks.append(mark)
 
+    def forget_marks(self, before: int) -> None:
+        """Marks centred before exposure `before` are none of this matcher's: a part of a recording begins here."""
+        self._marks = deque(mark for mark in self._marks if mark.exposure_index >= before)
+
     def add_decision(self, decision: Decision, passage: Passage, gated: bool) -> None:
         """Take a decision, in the order of the log."""
         counts = self.counts

@@ -188,14 +188,21 @@ def flow_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def flow_words(summary: Mapping[str, Any]) -> list[str]:
     """Return the lines of a flow's closing words."""
-    counts, gates = summary["passages"], summary["gates"]
+    gates = summary["gates"]
+    pulses = f"asked {gates['asked']}, done {gates['done']}, refused {gates['refused']}, expired {gates['expired']}"
+    return [*passage_words(summary), f"  gates         {pulses}"]
+
+
+def passage_words(summary: Mapping[str, Any]) -> list[str]:
+    """Return what the decisions about passing objects were worth, in lines; all of it is known in a replay, too."""
+    counts = summary["passages"]
     return [
         f"  passages      {counts['marks']}: {counts['alone']} alone, {counts['coincident']} in coincidence, {counts['in_gaps']} in gaps; "
         f"missed {_share(summary, 'missed')}, doubled {_share(summary, 'doubled')}",
+        f"  accuracy      {_share(summary, 'accuracy')} of those alone",
         f"  aborted       {', '.join(f'{name} {n}' for name, n in summary['aborted'].items()) or 'none'}",
         f"  light         {_mean(summary['clicks_mean'])} clicks of the window, {_mean(summary['passage_clicks_mean'])} of the passage",
-        f"  gates         asked {gates['asked']}, done {gates['done']}, refused {gates['refused']}, expired {gates['expired']}; "
-        f"yield {_share(summary, 'yield')}, purity {_share(summary, 'purity')}",
+        f"  pulses        {counts['pulses']} made; yield {_share(summary, 'yield')}, purity {_share(summary, 'purity')}",
     ]
 
 
