@@ -32,7 +32,7 @@ def columns(n, side, n_classes, seed=0, light="transmission"):
 def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(equal, "TASKS", ("columns",))
     monkeypatch.setattr(equal, "PHOTONS", (3.0,))
-    monkeypatch.setattr(equal, "NETWORK_EPOCHS", 1)
+    monkeypatch.setattr(equal, "NETWORK_EPOCHS_ELSE", 1)
     loaded = []
     monkeypatch.setattr(equal, "load_task", lambda *_: loaded.append(1) or columns(900, 6, 3))
     small = Options(features=3, alpha=0.0, photons=2.9, epochs=12, hidden=16, batch=50, front_rate=3e-2, head_rate=1e-2)

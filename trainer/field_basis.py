@@ -15,16 +15,21 @@ import math
 import torch
 from torch import Tensor
 
+from pans.runtime.errors import UsageError
+
 from .encoders import CoherentField, Encoder
 
 INPUTS_MAX = 1024  # finer images are binned before the eigenvectors are found: 2 x 2 pixels of 64 x 64
 RIDGE = 1e-6  # mean square amplitude that is added everywhere: less than an 8-bit step, it keeps the matrices regular
 
 
-def discriminant_basis(fields: Tensor, labels: Tensor, image_shape: tuple[int, int], size: int) -> Tensor:
+def discriminant_basis(
+    fields: Tensor, labels: Tensor, image_shape: tuple[int, int], size: int, *, turned: bool = False
+) -> Tensor:
     """Return `size` fields per class, float32 (pixels, classes * size): E[(b.x)^2] of that class largest against the rest.
 
-    `fields` (n, pixels) are real amplitudes; each basis field is scaled to a mean square of 1 over all objects.
+    `fields` (n, pixels) are real amplitudes; each basis field is scaled to a mean square of 1 over all objects. With `turned` the
+    moments are those of every object in all turns and reflections: for scenes without an up, and square images.
     """
     side = _binning(image_shape)
     coarse = _binned(fields, image_shape, side).double()
@@ -32,6 +37,8 @@ def discriminant_basis(fields: Tensor, labels: Tensor, image_shape: tuple[int, i
     found = []
     for label in range(int(labels.max()) + 1):
         ours, others = (_second_moment(coarse[mask]) for mask in (labels == label, labels != label))
+        if turned:
+            ours, others = (_turned(moment) for moment in (ours, others))
         lower = torch.linalg.cholesky(others + regular)
         half = torch.linalg.solve_triangular(lower, ours, upper=False)
         whitened = torch.linalg.solve_triangular(lower, half.T, upper=False)
@@ -40,6 +47,19 @@ def discriminant_basis(fields: Tensor, labels: Tensor, image_shape: tuple[int, i
     basis = torch.cat(found, dim=1)
     basis = basis / (coarse @ basis).square().mean(dim=0).sqrt()
     return _spread(basis, image_shape, side).float()
+
+
+def turns(image_shape: tuple[int, int]) -> list[Tensor]:
+    """Return which pixel stands where, int64 (pixels,), in each of the eight turns and reflections of a square image.
+
+    `image.flatten()[turns(shape)[0]]` is the image itself.
+    """
+    height, width = image_shape
+    if height != width:
+        raise UsageError(f"images are {height} x {width}, allowed for turns: as high as wide")
+    pixels = torch.arange(height * width).reshape(height, width)
+    quarters = [torch.rot90(pixels, quarter) for quarter in range(4)]
+    return [view.flatten() for quarter in quarters for view in (quarter, quarter.flip(1))]
 
 
 def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
@@ -58,6 +78,12 @@ def _binning(image_shape: tuple[int, int]) -> int:
 
 def _second_moment(rows: Tensor) -> Tensor:
     return rows.T @ rows / len(rows)
+
+
+def _turned(moment: Tensor) -> Tensor:
+    side = math.isqrt(len(moment))
+    views = turns((side, side))
+    return torch.stack([moment[view][:, view] for view in views]).mean(dim=0)
 
 
 def _binned(fields: Tensor, image_shape: tuple[int, int], side: int) -> Tensor:

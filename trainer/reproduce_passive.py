@@ -22,15 +22,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.profile import load_profile
+from pans.runtime.profile import Profile, load_profile
 
 from . import task_barcode
+from .anomaly_search import search
 from .barcode_search import solve, solve_patterns
 from .detection import click_probability, click_words, sample_clicks, word_probabilities
 from .export import export_trained
 from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .paper_tables import PassiveRow
-from .passive_recipes import TASKS, basis_of, load, recipe
+from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
 from .picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
 from .report_passive import Done
 from .ssim import ssim
@@ -81,11 +82,7 @@ def make_cell(
     path = _path(cache, name, row, dark, data_seed)
     task, profile = load(name, data_dir, data_seed), load_profile(PROFILE)
     started = time.process_time()
-    trained = (
-        solve(options, profile)
-        if name == "barcode"
-        else train(task, profile, options, basis=basis_of(name, task, options))
-    )
+    trained = _trained(name, task, profile, options)
     seconds = time.process_time() - started
     figures = {
         "task": name,
@@ -116,6 +113,14 @@ def make_cell(
     beside.write_text(json.dumps(figures, indent=1))
     os.replace(beside, path)
     return figures
+
+
+def _trained(name: str, task: Task, profile: Profile, options: Options) -> Trained:
+    if name == "barcode":
+        return solve(options, profile)
+    if name in SEARCH_SIZE:
+        return search(task, profile, options, SEARCH_SIZE[name])
+    return train(task, profile, options, basis=basis_of(name, task, options))
 
 
 def measure(name: str, task: Task, trained: Trained) -> dict[str, Any]:
