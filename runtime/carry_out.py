@@ -158,7 +158,8 @@ def _watched(
 
     bundle, honest, seen = ready.bundle, ready.honest, Attendants(job.continuous, recorder)
     title = f"{bundle.name} on {job.profile.name}"
-    with seen, live_view(title, bundle.classes, ready.expected_decisions, link.simulated) as watch:
+    view = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
+    with seen, view as watch:
 
         def prepared(run: LiveRun) -> None:
             honest.check_device(run)
