@@ -24,7 +24,7 @@ from pans.runtime.errors import PansError
 from pans.runtime.profile import load_profile
 from pans.runtime.record import read_recording
 
-from .canary import EVERY_US, LATE_US, Canary, Watched
+from .canary import EVERY_US, Canary, Watched
 from .flowcause import MACHINE, OURS, PARTLY, LateDecision, attribute, gap_figures, late_table, told, verdict_of
 
 BARS = {"late": 1e-4, "missed": 0.005, "doubled": 0.001}
@@ -53,6 +53,7 @@ class Job(NamedTuple):
     deadline_us: float = 0.0
     pin: tuple[int, int] | None = (0, 1)
     more: tuple[str, ...] = ()  # further words for `pans run`
+    canary_us: int = EVERY_US  # how often the canaries wake, and how late they must be to note it
 
 
 class Outcome(NamedTuple):
@@ -62,6 +63,7 @@ class Outcome(NamedTuple):
     recording: Path
     watched: tuple[Watched, ...]
     busy: dict[str, float]
+    stolen_s: dict[int, float]  # by core, as the hypervisor tells in /proc/stat, while the canaries were there
 
 
 def carry_out(job: Job, folder: Path) -> Outcome:
@@ -80,7 +82,8 @@ def carry_out(job: Job, folder: Path) -> Outcome:
         url = simulator.stdout.readline().strip()
         if not url:
             raise RuntimeError(f"the simulator ended with {simulator.wait()}: {_tail(folder / 'simulator.txt')}")
-        canaries = [Canary(core) for core in cores]
+        canaries = [Canary(core, every_us=job.canary_us, late_us=job.canary_us) for core in cores]
+        stolen_s = _stolen_s(cores)
         words = ["run", str(job.bundle), "--device", url, "--profile", job.profile, "--flow", job.flow]
         words += ["--seconds", str(job.seconds), "--out", str(folder / "out"), "--json"]
         words += [word for name in job.gate_classes for word in ("--gate-class", name)]
@@ -90,9 +93,10 @@ def carry_out(job: Job, folder: Path) -> Outcome:
         out, _ = host.communicate()
         if host.returncode not in (0, LATE_EXIT):
             raise RuntimeError(f"the host ended with {host.returncode}: {_tail(folder / 'host.txt')}")
+        stolen_s = {core: since - stolen_s[core] for core, since in _stolen_s(cores).items()}
         watched = tuple(canary.end() for canary in canaries)
         summary = json.loads(out)
-        return Outcome(summary, Path(summary["recording"]), watched, busy)
+        return Outcome(summary, Path(summary["recording"]), watched, busy, stolen_s)
     finally:
         for canary in canaries:
             canary.kill()
@@ -145,6 +149,12 @@ def _processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def _stolen_s(cores: list[int]) -> dict[int, float]:
+    lines = [line.split() for line in Path("/proc/stat").read_text().splitlines() if line.startswith("cpu")]
+    ticks = {line[0]: int(line[8]) for line in lines}
+    return {core: ticks[f"cpu{core}"] / os.sysconf("SC_CLK_TCK") for core in cores}
+
+
 def _tail(path: Path) -> str:
     return path.read_text(errors="replace")[-500:].strip()
 
@@ -179,7 +189,10 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
         "machine_by_core": _by_core(found),
         "machine_queued": sum(late.queued for late in found if late.whose == MACHINE),
         "named": late_table(found, verdicts),
-        "gaps": [gap_figures(watched, begin_ns, end_ns) for watched in outcome.watched],
+        "gaps": [
+            gap_figures(watched, begin_ns, end_ns) | {"stolen_ms": 1000 * outcome.stolen_s[watched.core]}
+            for watched in outcome.watched
+        ],
         "busy": outcome.busy,
         "run": summary,
         "explained": [entry for entry in entries if entry["whose"] == MACHINE][:TOLD],
@@ -227,7 +240,8 @@ def show(result: dict[str, Any]) -> str:
         rates = ", ".join(f"{rate:.2f} > {step} ms" for step, rate in gaps["per_s_above_ms"].items())
         lines.append(
             f"core {gaps['core']} away per second: {rates}; largest {gaps['largest_ms']:.2f} ms, in all {gaps['away_ms']:.0f} ms "
-            f"({gaps['queued_ms']:.0f} ms of it running something else); its canary took {gaps['canary_share_of_core']:.1%}"
+            f"({gaps['queued_ms']:.0f} ms of it running something else; stolen by the hypervisor's own count {gaps['stolen_ms']:.0f} ms); "
+            f"its canary took {gaps['canary_share_of_core']:.1%}"
         )
     lines += [
         f"{key}: {run[key]}" for key in ("accuracy", "missed", "doubled", "purity", "yield", "gates") if key in run
@@ -254,7 +268,7 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         job = Job(
             args.bundle, args.profile, args.scene, args.flow, args.seconds, args.seed, args.link,
-            classes, args.deadline_us, args.pin, tuple(args.more),
+            classes, args.deadline_us, args.pin, tuple(args.more), args.canary_us,
         )  # fmt: skip
         try:
             result = report(job, carry_out(job, folder))
@@ -296,12 +310,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--pin", type=_cores, default="0,1", metavar="HOST,SIM", help="cores of the two, or none (default 0,1)"
     )
+    parser.add_argument("--canary-us", type=int, default=EVERY_US, help=f"period of the canaries (default {EVERY_US})")
     parser.add_argument("--folder", type=Path, help="where to leave recording and summary (default: nowhere)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as one JSON object")
     parser.add_argument("more", nargs="*", help="after --: further words for `pans run`")
-    parser.epilog = (
-        f"Each core has a canary that wakes every {EVERY_US} us and notes when it was {LATE_US} us late or more."
-    )
+    parser.epilog = "Each core has a canary, which notes each time when it woke later than its period."
     return parser
 
 

@@ -231,6 +231,7 @@ def test_a_short_run_of_everything(tmp_path: Path) -> None:
     assert sum(count for row in result["named"].values() for count in row.values()) == result["late"]
     assert {figures["core"] for figures in result["gaps"]} >= set(cores)
     assert all(0 < figures["canary_share_of_core"] < 1 for figures in result["gaps"])
+    assert all(figures["stolen_ms"] >= 0 for figures in result["gaps"])
     assert 0 < result["busy"]["host"] <= 2
     text = show(result)
     assert text.startswith("SIMULATED instrument, real pace, 1 s")
