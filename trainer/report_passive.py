@@ -115,8 +115,9 @@ _NOTES["mmf-mnist-image"] = (
     *_NOTES["mmf-mnist"],
     "",
     "SSIM as in the release: Gaussian window of 11 x 11 pixels, sigma 1.5, zeros beyond the edge, mean over all pixels; one shot of "
-    "every held-out object. We train on nine parts of 1 - SSIM and one of the squared error, the measure itself; the paper's loss is not stated. "
-    "The decoder has one hidden layer of 512, the paper's two. A high SSIM of digits is mostly black that is black: look at the pictures.",
+    "every held-out object. We train on nine parts of 1 - SSIM and one of the squared error, the measure itself; the paper's loss is "
+    "not stated. The decoder has one hidden layer of 512, the paper's two. A high SSIM of digits is mostly black "
+    "that is black: look at the pictures.",
     "",
     "![the first held-out digit of every class, its speckle, and three single shots each](mmf-mnist-image-pictures.png)",
 )
