@@ -226,10 +226,13 @@ class Recorder:
             self._write_block(Kind.CLOCK, part.tobytes())
 
     def flush(self) -> None:
-        """Write everything that is buffered to the file; it then survives the death of this process."""
-        for buffer in (self._commands, self._messages, self._decisions, self._timings, self._events):
-            if buffer.used:
-                self._empty(buffer)
+        """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
+        n_decisions = self._decisions.used
+        buffers = (self._commands, self._messages, self._decisions, self._timings, self._events)
+        blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
+        if blocks:
+            self._write(b"".join(blocks))
+            self._n_decisions += n_decisions
 
     def sync(self) -> None:
         """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
@@ -263,25 +266,33 @@ class Recorder:
         buffer.add(data)
 
     def _empty(self, buffer: _Rows | _Bytes) -> None:
-        if not buffer.used:
-            return
+        if buffer.used:
+            n_decisions = self._decisions.used if buffer is self._decisions else 0
+            self._write(self._block_of(buffer))
+            self._n_decisions += n_decisions
+
+    def _block_of(self, buffer: _Rows | _Bytes) -> bytes:
+        """Empty a buffer into a block, which must be written next."""
         if buffer is self._decisions:
             rows = self._decisions.rows[: self._decisions.used]
             self._decisions.used = 0
-            self._write_decisions(rows)
-            return
-        self._write_block(buffer.kind, buffer.take())
+            return b"".join(self._framed(Kind.DECISIONS, self._log.block(rows)))
+        return b"".join(self._framed(buffer.kind, buffer.take()))
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
+        pieces = self._framed(kind, payload)
+        if len(payload) > _COPIED_BYTES:
+            self._write(*pieces)
+        else:
+            self._write(b"".join(pieces))
+
+    def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:
+        """Return what stands before a payload, the payload, and what stands behind it: the next block."""
         if len(payload) > LIMITS[kind]:
             raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
-        head, tail, chain = block_ends(kind, self._n_blocks, self._chain, payload)
-        if len(payload) > _COPIED_BYTES:
-            self._write(head, payload, tail)
-        else:
-            self._write(head + payload + tail)
-        self._chain = chain
+        head, tail, self._chain = block_ends(kind, self._n_blocks, self._chain, payload)
         self._n_blocks += 1
+        return head, payload, tail
 
     def _write(self, *pieces: bytes | memoryview) -> None:
         """Write one whole block (or the prologue); `_end` moves when all of it is there."""
