@@ -23,7 +23,7 @@ from pans.runtime.wire import NO_OBJECT
 from .changes import Changes
 from .detector import uniform_numbers
 from .exposures import Exposures
-from .marks import Marks, no_marks
+from .marks import MARK_TICK, mark_rows, no_marks, split_marks
 from .moving import Cells
 from .shifts import ShiftTable
 
@@ -74,11 +74,11 @@ class CellFlow:
         self._marks = no_marks()
         self.probability: F64 | None = None
 
-    def take_marks(self, before_tick: int) -> Marks:
-        """Return the marks of passages whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
-        while not len(self._marks.ticks) or self._marks.ticks[-1] < before_tick:
+    def take_marks(self, before_tick: int) -> I64:
+        """Return the rows (marks.py) of passages whose tick after the start is below `before_tick`, and go on to those after."""
+        while not len(self._marks) or self._marks[-1, MARK_TICK] < before_tick:
             self._draw_chunk()
-        taken, self._marks = self._marks.split(int(np.searchsorted(self._marks.ticks, before_tick)))
+        taken, self._marks = split_marks(self._marks, before_tick)
         return taken
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
@@ -90,7 +90,8 @@ class CellFlow:
         self._forget(float(begins[0]) - self._longest_half)
         row_of = np.empty(count, np.int64)
         rows = np.empty((count + 2, self._table.sums.shape[3]))
-        used = _fill(begins, lit, float(self._exposures.exposure_ticks), self._known, self._table, row_of, rows)
+        exposure = float(self._exposures.exposure_ticks)
+        used = _fill(begins, lit, exposure, self._longest_half + 1.0, self._known, self._table, row_of, rows)
         return rows[:used], row_of
 
     def _forget(self, before_ticks: float) -> None:
@@ -101,7 +102,7 @@ class CellFlow:
     def _draw_chunk(self) -> None:
         new = self._arrivals(self._n_drawn, CHUNK)
         self._known = self._known.and_then(new)
-        self._marks = self._marks.and_then(self._marks_of(self._n_drawn, new))
+        self._marks = np.concatenate([self._marks, self._marks_of(self._n_drawn, new)])
         self._n_drawn += CHUNK
 
     def _arrivals(self, first: int, count: int) -> Arrivals:
@@ -119,7 +120,7 @@ class CellFlow:
         images = (numbers[:, 1] * cells.objects.n_objects).astype(np.int64)
         return Arrivals(flown, speed, images, (numbers[:, 2] * (2 * cells.offset_px + 1)).astype(np.int64))
 
-    def _marks_of(self, first: int, arrivals: Arrivals) -> Marks:
+    def _marks_of(self, first: int, arrivals: Arrivals) -> I64:
         exposures = self._exposures
         centred = np.maximum(exposures.begun_by(arrivals.centre_ticks.astype(np.int64)) - 1, 0)
         gone = exposures.begun_by(
@@ -132,7 +133,7 @@ class CellFlow:
         if self._changes:
             photons *= self._changes.efficiency(exposures.seconds(begins))
         truths = self._cells.objects.labels[arrivals.images].astype(np.int64)
-        return Marks(np.arange(first, first + len(begins)) % NO_OBJECT, truths, centred, begins, half, photons)
+        return mark_rows(np.arange(first, first + len(begins)) % NO_OBJECT, truths, centred, begins, half, photons)
 
 
 def warm_up() -> None:
@@ -140,7 +141,7 @@ def warm_up() -> None:
     ints, floats, rows = np.zeros(1, np.int64), np.ones(1), np.zeros((3, 1))
     one = Arrivals(floats, floats, ints, ints)
     table = ShiftTable(np.zeros((1, 1, 3, 1), np.uint32), np.zeros((1, 3, 1)), 1.0, 1.0, floats, floats)
-    _fill(ints, np.ones(1, np.bool_), 1.0, one, table, ints.copy(), rows)
+    _fill(ints, np.ones(1, np.bool_), 1.0, 1.0, one, table, ints.copy(), rows)
     _alone(ints, 1.0, one, table, floats.copy())
 
 
@@ -175,15 +176,21 @@ def _add(begin, exposure, centre, speed, sums, behind, scale_step, scale_open, r
 
 
 @njit(cache=True, nogil=True)
-def _fill(begins, lit, exposure, arrivals, table, row_of, rows):  # type: ignore[no-untyped-def]
-    """Rows of light: 0 is a dark exposure, 1 the empty field, then one for each exposure with a cell in the field; return how many."""
+def _fill(begins, lit, exposure, longest_half, arrivals, table, row_of, rows):  # type: ignore[no-untyped-def]
+    """Rows of light: 0 is a dark exposure, 1 the empty field, then one for each exposure with a cell in the field; return how many.
+
+    Nobody is in the field longer than `longest_half` ticks before or after the middle.
+    """
     rows[0, :] = 0.0
     rows[1, :] = table.empty
     used = 2
     for t in range(begins.size):
         row_of[t] = 1 if lit[t] else 0
     width = table.sums.shape[2] // 2
-    for n in range(arrivals.centre_ticks.size):
+    # Who may be in the field: the others are not looked at.
+    early = np.searchsorted(arrivals.centre_ticks, begins[0] - longest_half)
+    late = np.searchsorted(arrivals.centre_ticks, begins[-1] + exposure + longest_half, "right")
+    for n in range(early, late):
         centre, speed = arrivals.centre_ticks[n], arrivals.speed_px[n]
         sums, behind = table.sums[arrivals.images[n], arrivals.offsets[n]], table.open_levels[arrivals.offsets[n]]
         half = width / speed

@@ -44,7 +44,7 @@ class ClickSource:
         count = len(words)
         probability, row_of = self._probability(first, count)
         sample_words(self._model, probability, row_of, self._seed, self._first_draw + first, before, words)
-        if self._changes.any_dead:  # nor does crosstalk wake a dead channel
+        if self._changes and self._changes.any_dead:  # nor does crosstalk wake a dead channel
             times_s = self._exposures.seconds(self._exposures.begins(first, count))
             alive = self._changes.alive(times_s)
             packed = np.packbits(alive, axis=1, bitorder="little")

@@ -26,7 +26,7 @@ from .marks import Stamp
 from .measurement import Timetable
 from .upload import Program, word_bytes
 
-STRETCH_EXPOSURES = 1024  # made at a time, in whole blocks,
+STRETCH_EXPOSURES = 2048  # made at a time, in whole blocks,
 STRETCH_NUMBERS = 1 << 15  # but not more clicks than these
 AHEAD_STRETCHES = 8
 _U32 = 0xFFFFFFFF
@@ -83,10 +83,8 @@ class FrameRun(Timetable):
         self._light, self._source = light, source
         first, count = np.array(program.blocks, np.int64).reshape(-1, 2).T
         ends = program.offsets[first + count - 1] + program.exposure_ticks
-        self._plan = BlockPlan(
-            first.copy(), count.copy(), program.offsets[first], ends, program.n_slots, program.cycle_ticks,
-            0 if moves else program.cycles_per_object, program.slot_period_ticks,
-        )  # fmt: skip
+        blocks = np.column_stack([first, count, program.offsets[first], ends])
+        self._plan = BlockPlan(blocks, program.n_slots, program.cycle_ticks, 0 if moves else program.cycles_per_object)
         self._word_bytes = word_bytes(program.channels)
         self._drawn_blocks = 0
         self._n_blocks = None if self._n_cycles is None else self._n_cycles * len(program.blocks)
@@ -160,16 +158,16 @@ class FrameRun(Timetable):
             n = min(n, self._n_blocks - self._drawn_blocks)
         if n <= 0 or self._broken_off:
             return False
-        plan, blocks = self._plan, len(self._plan.counts)
-        cycle, block = divmod(self._drawn_blocks, blocks)
-        last_cycle, last = divmod(self._drawn_blocks + n - 1, blocks)
-        first = cycle * plan.n_slots + int(plan.firsts[block])
-        count = last_cycle * plan.n_slots + int(plan.firsts[last] + plan.counts[last]) - first
-        words = np.zeros((count, self._word_bytes), np.uint8)
+        plan = self._plan
+        cycle, block = divmod(self._drawn_blocks, len(plan.blocks))
+        last_cycle, last = divmod(self._drawn_blocks + n - 1, len(plan.blocks))
+        last_slot, last_count, _, end = plan.blocks[last].tolist()
+        first = cycle * plan.n_slots + int(plan.blocks[block, frame_writer.FIRST_SLOT])
+        words = np.zeros((last_cycle * plan.n_slots + last_slot + last_count - first, self._word_bytes), np.uint8)
         self._source.words(first, self._before, words)
-        marks = self._light.take_marks(last_cycle * plan.cycle_ticks + int(plan.ends[last]))
-        messages = np.empty((n + len(marks.ticks), frame_writer.N_COLUMNS), np.int64)
-        frame_writer.lay_out(plan, cycle, block, n, marks, self._start_tick, messages)
-        self._ahead.append(Stretch(messages, words, plan.period_ticks))
+        marks = self._light.take_marks(last_cycle * plan.cycle_ticks + end)
+        messages = np.empty((n + len(marks), frame_writer.N_COLUMNS), np.int64)
+        frame_writer.lay_out(plan, cycle, block, marks, self._start_tick, messages)
+        self._ahead.append(Stretch(messages, words, self._program.slot_period_ticks))
         self._drawn_blocks += n
         return True

@@ -16,14 +16,23 @@ from pans.runtime.wire import BLOCK_HEADER_BYTES, NO_OBJECT
 from pans.runtime.wire_kernels import crc32_span
 from pans.runtime.wire_schema import HEADER, SCHEMA, MessageType
 
-from .marks import Stamp, no_marks
+from .marks import (
+    MARK_EXPOSURE,
+    MARK_HALF,
+    MARK_OBJECT,
+    MARK_PHOTONS,
+    MARK_TICK,
+    MARK_TRUTH,
+    Stamp,
+    no_marks,
+)
 
 I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 # Columns of a message; those of a block and those of a mark differ from FIRST_WORD on, and a mark has no exposures.
 DUE, EXPOSURES, TICK, EXPOSURE, OBJECT, FIRST_WORD, N_COLUMNS = 0, 1, 2, 3, 4, 5, 8
 TRUTH, HALF, PHOTONS = 5, 6, 7  # photons: the bits of the float32
+FIRST_SLOT, COUNT, BEGIN, END, N_BLOCK_COLUMNS = range(5)
 MARK_BYTES = 32
 OVERHEAD_BYTES = HEADER.size + max(BLOCK_HEADER_BYTES, MARK_BYTES) + 4  # of a message, before COBS
 _FRAMES, _MARK, _HEADER_BYTES = int(MessageType.FRAMES), int(MessageType.MARK), HEADER.size
@@ -32,19 +41,15 @@ _U32 = 0xFFFFFFFF
 
 
 class BlockPlan(NamedTuple):
-    """The blocks of one cycle, int64 (blocks,): first slot, exposures, ticks of begin and end; and how cycles follow each other.
+    """The blocks of one cycle, int64 (blocks, N_BLOCK_COLUMNS): first slot, exposures, ticks of begin and end; and how cycles follow.
 
     cycles_per_object 0: no object is known, since they pass by on their own.
     """
 
-    firsts: I64
-    counts: I64
-    begins: I64
-    ends: I64
+    blocks: I64
     n_slots: int
     cycle_ticks: int
     cycles_per_object: int
-    period_ticks: int
 
 
 def encoded_bytes(n_messages: int, n_word_bytes: int) -> int:
@@ -55,43 +60,42 @@ def encoded_bytes(n_messages: int, n_word_bytes: int) -> int:
 
 def warm_up() -> None:
     """Compile or load the kernels."""
-    one = np.ones(1, np.int64)
     messages, words = np.zeros((2, N_COLUMNS), np.int64), np.zeros((1, 1), np.uint8)
-    lay_out(BlockPlan(one, one, one, one, 1, 1, 1, 1), 0, 0, 1, no_marks(), 0, messages)
+    lay_out(BlockPlan(np.ones((1, N_BLOCK_COLUMNS), np.int64), 1, 1, 1), 0, 0, no_marks(), 0, messages)
     body, out = np.zeros(100, np.uint8), np.zeros(300, np.uint8)
     write_messages(messages, words, 1, Stamp(0, 0, 1), SCHEMA, body, out, np.zeros(3, np.int64))
 
 
 @njit(cache=True, nogil=True)
-def lay_out(plan, cycle, block, n_blocks, marks, start_tick, messages):  # type: ignore[no-untyped-def]
-    """Write `n_blocks` blocks from `block` of `cycle` on and all `marks` to messages int64 (n_blocks + marks, N_COLUMNS), in order.
+def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no-untyped-def]
+    """Fill messages int64 (n, N_COLUMNS) with blocks from `block` of `cycle` on and all `marks` (marks.py) among them, in order.
 
     A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first.
     """
-    at = taken = word = 0
-    for _ in range(n_blocks):
+    taken = word = 0
+    photons = marks.view(np.float64)
+    for at in range(messages.shape[0]):
+        message, facts = messages[at], plan.blocks[block]
         cycle_tick = start_tick + cycle * plan.cycle_ticks
-        end = cycle_tick + plan.ends[block]
-        while taken < marks.ticks.size and start_tick + marks.ticks[taken] < end:
-            message = messages[at]
-            message[DUE] = message[TICK] = start_tick + marks.ticks[taken]
+        end = cycle_tick + facts[END]
+        if taken < marks.shape[0] and start_tick + marks[taken, MARK_TICK] < end:
+            mark = marks[taken]
+            message[DUE] = message[TICK] = start_tick + mark[MARK_TICK]
             message[EXPOSURES] = 0
-            message[EXPOSURE], message[OBJECT] = marks.exposures[taken], marks.objects[taken]
-            message[TRUTH], message[HALF] = marks.truths[taken], marks.halves[taken]
-            message[PHOTONS] = np.int64(np.float32(marks.photons[taken]).view(np.uint32))
+            message[EXPOSURE], message[OBJECT] = mark[MARK_EXPOSURE], mark[MARK_OBJECT]
+            message[TRUTH], message[HALF] = mark[MARK_TRUTH], mark[MARK_HALF]
+            message[PHOTONS] = np.int64(np.float32(photons[taken, MARK_PHOTONS]).view(np.uint32))
             taken += 1
-            at += 1
-        message = messages[at]
-        message[DUE], message[EXPOSURES] = end, plan.counts[block]
-        message[TICK], message[EXPOSURE] = cycle_tick + plan.begins[block], cycle * plan.n_slots + plan.firsts[block]
+            continue
+        message[DUE], message[EXPOSURES] = end, facts[COUNT]
+        message[TICK], message[EXPOSURE] = cycle_tick + facts[BEGIN], cycle * plan.n_slots + facts[FIRST_SLOT]
         message[OBJECT] = NO_OBJECT
         if plan.cycles_per_object:
             message[OBJECT] = cycle // plan.cycles_per_object % NO_OBJECT
-        message[FIRST_WORD] = word
-        word += plan.counts[block]
-        at += 1
+        message[FIRST_WORD], message[HALF], message[PHOTONS] = word, 0, 0
+        word += facts[COUNT]
         block += 1
-        if block == plan.counts.size:
+        if block == plan.blocks.shape[0]:
             block = 0
             cycle += 1
 

@@ -18,7 +18,7 @@ from pans.runtime.wire_commands import PARALLEL
 from .changes import Changes
 from .detector import detector_model, first_click_probability, stream_key
 from .exposures import Exposures
-from .marks import Marks
+from .marks import mark_rows
 from .moving import Cells, SceneFile, Tape
 from .optics import expected_photoelectrons
 from .scene import Scene
@@ -47,8 +47,8 @@ class RunLight(Protocol):
 
     probability: F64 | None  # of all rows, where they are known beforehand
 
-    def take_marks(self, before_tick: int) -> Marks:
-        """Return the marks whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
+    def take_marks(self, before_tick: int) -> I64:
+        """Return the rows (marks.py) of marks whose tick after the start is below `before_tick`, and go on to those after."""
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """Expected photoelectrons float64 (rows, channels), and int64 (count,) of the row of each of exposures first..first+count-1."""
@@ -145,7 +145,7 @@ class StillObjects:
         """Go on to the mark after."""
         self._object += 1
 
-    def take_marks(self, before_tick: int) -> Marks:
+    def take_marks(self, before_tick: int) -> I64:
         """See `RunLight`."""
         exposures_per_object = self._program.cycles_per_object * self._program.n_slots
         begun = int(self._exposures.begun_by(np.array([before_tick - 1]))[0])
@@ -157,7 +157,7 @@ class StillObjects:
         if self._changes:
             photons = photons * self._changes.efficiency(ticks / self._exposures.tick_hz)
         truths = self._scene.labels[numbers % self._scene.n_objects].astype(np.int64)
-        return Marks(numbers, truths, passing * exposures_per_object, ticks, np.zeros_like(ticks), photons)
+        return mark_rows(numbers, truths, passing * exposures_per_object, ticks, np.zeros_like(ticks), photons)
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
         """See `RunLight`: parallel, an object is a row and the last one is dark; sequential, a row is an object under a pattern."""

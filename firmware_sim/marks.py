@@ -1,6 +1,6 @@
-"""What becomes messages many at a time: marks as columns, and the stamp that the device puts on all messages.
+"""What becomes messages many at a time: marks as rows, and the stamp that the device puts on all messages.
 
-Owns the columns and how a run takes from their front; never computes what stands in them (light.py, cells.py, tape.py) and never
+Owns the rows and how a run takes from their front; never computes what stands in them (light.py, cells.py, tape.py) and never
 encodes one (frame_writer.py). Ticks count from the start of the run and never decrease.
 """
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 I64 = NDArray[np.int64]
+MARK_OBJECT, MARK_TRUTH, MARK_EXPOSURE, MARK_TICK, MARK_HALF, MARK_PHOTONS, N_MARK_COLUMNS = range(7)
 
 
 class Stamp(NamedTuple):
@@ -22,35 +23,20 @@ class Stamp(NamedTuple):
     session: int
 
 
-class Marks(NamedTuple):
-    """Consecutive marks, all int64 (n,) but for float64 photons: the fields of `wire.Mark` without the sequence number."""
-
-    objects: I64
-    truths: I64
-    exposures: I64
-    ticks: I64
-    halves: I64
-    photons: NDArray[np.float64]
-
-    def split(self, n: int) -> tuple[Marks, Marks]:
-        """Return the first `n` and the rest."""
-        objects, truths, exposures, ticks, halves, photons = self
-        first = Marks(objects[:n], truths[:n], exposures[:n], ticks[:n], halves[:n], photons[:n])
-        return first, Marks(objects[n:], truths[n:], exposures[n:], ticks[n:], halves[n:], photons[n:])
-
-    def and_then(self, later: Marks) -> Marks:
-        """These and those that come after."""
-        return Marks(
-            np.concatenate([self.objects, later.objects]),
-            np.concatenate([self.truths, later.truths]),
-            np.concatenate([self.exposures, later.exposures]),
-            np.concatenate([self.ticks, later.ticks]),
-            np.concatenate([self.halves, later.halves]),
-            np.concatenate([self.photons, later.photons]),
-        )
+def mark_rows(objects: I64, truths: I64, exposures: I64, ticks: I64, halves: I64, photons: NDArray[np.float64]) -> I64:
+    """Consecutive marks, int64 (n, N_MARK_COLUMNS): `wire.Mark` without sequence number; photons as the bits of float64."""
+    rows = np.empty((len(ticks), N_MARK_COLUMNS), np.int64)
+    for column, values in enumerate((objects, truths, exposures, ticks, halves, photons.view(np.int64))):
+        rows[:, column] = values
+    return rows
 
 
-def no_marks() -> Marks:
-    """Columns without a row."""
-    none = np.zeros(0, np.int64)
-    return Marks(none, none, none, none, none, np.zeros(0))
+def no_marks() -> I64:
+    """No row."""
+    return np.zeros((0, N_MARK_COLUMNS), np.int64)
+
+
+def split_marks(rows: I64, before_tick: int) -> tuple[I64, I64]:
+    """Return the marks whose tick is below `before_tick`, and the rest."""
+    n = int(np.searchsorted(rows[:, MARK_TICK], before_tick))
+    return rows[:n], rows[n:]

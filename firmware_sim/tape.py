@@ -24,7 +24,7 @@ from .cells import MAX_HALF_EXPOSURES
 from .changes import Changes
 from .detector import uniform_numbers
 from .exposures import Exposures
-from .marks import Marks, no_marks
+from .marks import MARK_TICK, mark_rows, no_marks, split_marks
 from .moving import Tape
 from .optics import photons_per_level
 
@@ -80,12 +80,12 @@ class TapeFlow:
             exposures.longest_period_ticks / self._pitch_ticks
         )  # a window's exposure may begin so much earlier
 
-    def take_marks(self, before_tick: int) -> Marks:
-        """Return the marks of windows whose tick is below `before_tick`, counted from the start of the run, and go on to those after."""
-        while not len(self._marks.ticks) or self._marks.ticks[-1] < before_tick:
-            self._marks = self._marks.and_then(self._marks_of(self._n_marked, MARK_CHUNK))
+    def take_marks(self, before_tick: int) -> I64:
+        """Return the rows (marks.py) of windows whose tick after the start is below `before_tick`, and go on to those after."""
+        while not len(self._marks) or self._marks[-1, MARK_TICK] < before_tick:
+            self._marks = np.concatenate([self._marks, self._marks_of(self._n_marked, MARK_CHUNK)])
             self._n_marked += MARK_CHUNK
-        taken, self._marks = self._marks.split(int(np.searchsorted(self._marks.ticks, before_tick)))
+        taken, self._marks = split_marks(self._marks, before_tick)
         return taken
 
     def rows(self, first: int, count: int) -> tuple[F64, I64]:
@@ -141,7 +141,7 @@ class TapeFlow:
         self._bits = np.concatenate([self._bits[drop:], new])
         self._first_bar += drop
 
-    def _marks_of(self, first: int, count: int) -> Marks:
+    def _marks_of(self, first: int, count: int) -> I64:
         tape, exposures = self._tape, self._exposures
         self._reach(first + count + 2)
         pitches = np.arange(first, first + count + 3)
@@ -169,7 +169,7 @@ class TapeFlow:
         wanted = np.frombuffer(tape.target.encode(), np.uint8) - 48
         inside = np.lib.stride_tricks.sliding_window_view(windows, len(wanted), axis=1)
         truths = (inside == wanted).all(axis=2).any(axis=1).astype(np.int64)
-        return Marks(np.arange(first, first + count) % NO_OBJECT, truths, centred, begins, half, photons)
+        return mark_rows(np.arange(first, first + count) % NO_OBJECT, truths, centred, begins, half, photons)
 
 
 def warm_up() -> None:

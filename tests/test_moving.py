@@ -22,6 +22,7 @@ from pans.firmware_sim.drawing import ClickSource
 from pans.firmware_sim.exposures import Exposures
 from pans.firmware_sim.frame_run import FrameRun
 from pans.firmware_sim.light import StillObjects, begin, prepare
+from pans.firmware_sim.marks import MARK_PHOTONS
 from pans.firmware_sim.measurement import Measurement
 from pans.firmware_sim.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.optics import expected_photoelectrons, photons_per_level
@@ -75,9 +76,10 @@ def marks_of(run: Any, n: int) -> list[wire.Mark]:
     before = 0
     while len(marks) < n:
         before += 100_000
-        columns = [column.tolist() for column in run.take_marks(before)]
-        for number, truth, exposure, tick, half, photons in zip(*columns):
-            marks.append(wire.Mark(0, number, truth, exposure, tick, photons, half))
+        rows = run.take_marks(before)
+        photons = rows[:, MARK_PHOTONS].copy().view(np.float64).tolist()
+        for (number, truth, exposure, tick, half, _), light in zip(rows.tolist(), photons):
+            marks.append(wire.Mark(0, number, truth, exposure, tick, light, half))
     return marks[:n]
 
 
@@ -124,7 +126,14 @@ def test_a_cell_at_rest_in_the_middle_is_the_still_object(name: str) -> None:
     for image in range(5):
         cell = (np.array([100.0]), ones * 1e-300, np.array([image]), np.zeros(1, np.int64))
         used = cells_module._fill(
-            np.zeros(1, np.int64), np.ones(1, np.bool_), 200.0, cells_module.Arrivals(*cell), table, row_of, rows
+            np.zeros(1, np.int64),
+            np.ones(1, np.bool_),
+            200.0,
+            np.inf,
+            cells_module.Arrivals(*cell),
+            table,
+            row_of,
+            rows,
         )
         assert used == 3
         np.testing.assert_allclose(rows[row_of[0]], still[image], rtol=1e-12)
@@ -143,7 +152,7 @@ def test_light_during_an_exposure_is_the_mean_of_the_drawn_field(
     centre = 50 - start_px / speed
     cell = (np.array([centre]), np.array([speed]), np.array([image]), np.array([down + 2]))
     row_of, rows = np.zeros(1, np.int64), np.empty((3, 3))
-    cells_module._fill(begins, np.ones(1, np.bool_), 200.0, cells_module.Arrivals(*cell), table, row_of, rows)
+    cells_module._fill(begins, np.ones(1, np.bool_), 200.0, np.inf, cells_module.Arrivals(*cell), table, row_of, rows)
 
     def field_at(moment: float) -> np.ndarray:
         return shifted(PICTURES.images[image] / 255, min(max(moment, -8.0), 8.0), down, background)
@@ -165,7 +174,7 @@ def test_cells_that_overlap_add_up_to_the_open_field_at_most() -> None:
         n = len(images)
         cell = (np.full(n, 100.0), np.full(n, 0.01), np.array(images), np.zeros(n, np.int64))
         row_of, rows = np.zeros(1, np.int64), np.empty((3, 3))
-        cells_module._fill(begins, lit, 200.0, cells_module.Arrivals(*cell), table, row_of, rows)
+        cells_module._fill(begins, lit, 200.0, np.inf, cells_module.Arrivals(*cell), table, row_of, rows)
         return rows[row_of[0]]
 
     np.testing.assert_allclose(light([0, 1]), np.minimum(light([0]) + light([1]), table.full), rtol=1e-12)
