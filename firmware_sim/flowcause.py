@@ -9,7 +9,8 @@ decision on time before it had been made (`ON_TIME_SHARE` of the deadline), or `
     with the time for which its core was certainly away, clipped to this time; where gaps of both cores overlap, once.
 
     machine   without these gaps the decision would have been on time: they add up to no less than it was late
-    partly    there were gaps, and they add up to less: something else had a part in it
+    partly    there were gaps, and they add up to less: something else had a part in it, which may be working off what came meanwhile:
+              a host that is busy for a share b of the time needs b of a gap for that (`worked_off`)
     ours      there was none
 """
 
@@ -98,6 +99,11 @@ def united(pieces: Iterable[tuple[int, int]]) -> int:
             total += end - first
             reached = end
     return total
+
+
+def worked_off(late: LateDecision, busy_share: float) -> bool:
+    """Whether the gaps, and working off what came in them, explain a decision that the gaps alone explain in part."""
+    return late.whose == PARTLY and late.away_ns * (1 + min(busy_share, 1.0)) >= late.late_ns
 
 
 def gap_figures(watched: Watched, begin_ns: int, end_ns: int) -> dict[str, Any]:

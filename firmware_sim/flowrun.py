@@ -25,7 +25,18 @@ from pans.runtime.profile import load_profile
 from pans.runtime.record import read_recording
 
 from .canary import EVERY_US, Canary, Watched
-from .flowcause import MACHINE, OURS, PARTLY, LateDecision, attribute, gap_figures, late_table, told, verdict_of
+from .flowcause import (
+    MACHINE,
+    OURS,
+    PARTLY,
+    LateDecision,
+    attribute,
+    gap_figures,
+    late_table,
+    told,
+    verdict_of,
+    worked_off,
+)
 
 BARS = {"late": 1e-4, "missed": 0.005, "doubled": 0.001}
 TOLD = 200  # late decisions that the machine does not explain, in the report; all of them are in the recording
@@ -186,6 +197,7 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
         "late": len(late_numbers),
         "late_share": len(late_numbers) / max(len(timings), 1),
         "whose": {name: whose[name] for name in (MACHINE, PARTLY, OURS)},
+        "partly_worked_off": sum(worked_off(late, outcome.busy["host"]) for late in found),
         "machine_by_core": _by_core(found),
         "machine_queued": sum(late.queued for late in found if late.whose == MACHINE),
         "named": late_table(found, verdicts),
@@ -214,10 +226,9 @@ def broken_bars(result: dict[str, Any]) -> list[str]:
         for name, share in shares.items()
         if share is not None and share > BARS[name]
     ]
-    if whose[PARTLY] + whose[OURS]:
-        broken.append(
-            f"{whose[OURS]} late decisions without any gap of the machine, {whose[PARTLY]} with too short ones"
-        )
+    short = whose[PARTLY] - result["partly_worked_off"]
+    if short + whose[OURS]:
+        broken.append(f"{whose[OURS]} late decisions without any gap of the machine, {short} with too short ones")
     return broken
 
 
@@ -230,7 +241,8 @@ def show(result: dict[str, Any]) -> str:
         f"latency p50 {latency['p50']:.0f}, p99 {latency['p99']:.0f}, p99.9 {latency['p999']:.0f}, max {latency['max']:.0f} us; "
         f"processor time per second: host {result['busy']['host']:.2f}, simulator {result['busy']['simulator']:.2f}",
         f"late {result['late']} ({result['late_share']:.2e}): {whose[MACHINE]} the machine's (by core {result['machine_by_core']}, "
-        f"{result['machine_queued']} while the core ran something else), {whose[PARTLY]} partly, {whose[OURS]} ours",
+        f"{result['machine_queued']} while the core ran something else), {whose[PARTLY]} partly "
+        f"({result['partly_worked_off']} of these by no more than the gap and working off what came in it), {whose[OURS]} ours",
         "",
         f"{'named by the run':<18}" + "".join(f"{name:>9}" for name in (MACHINE, PARTLY, OURS)),
         *(f"{cause:<18}" + "".join(f"{row[name]:>9}" for name in (MACHINE, PARTLY, OURS)) for cause, row in result["named"].items()),

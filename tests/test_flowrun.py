@@ -26,6 +26,7 @@ from pans.firmware_sim.flowcause import (
     late_table,
     united,
     verdict_of,
+    worked_off,
 )
 from pans.firmware_sim.flowrun import Job, broken_bars, carry_out, report, show
 from pans.runtime.bundle import write_bundle
@@ -79,6 +80,15 @@ def test_a_gap_as_long_as_the_decision_was_late_is_the_machines() -> None:
     assert (found.whose, found.away_ns, found.late_ns, found.cores) == (MACHINE, 400 * US, 400 * US, (0,))
     assert judged(THREE, 2, gap(3100, 3499)).whose == PARTLY
     assert judged(THREE, 2).whose == OURS
+
+
+def test_a_gap_and_working_off_what_came_in_it() -> None:
+    found = judged(THREE, 2, gap(3100, 3400))  # 400 us late, away for 300
+    assert worked_off(found, 0.34)
+    assert not worked_off(found, 0.33)
+    assert not worked_off(judged(THREE, 2, gap(3100, 3280)), 5.0)  # nobody is busy for more than all of the time
+    assert not worked_off(judged(THREE, 2, gap(3100, 3500)), 0.5)  # explained already
+    assert not worked_off(judged(THREE, 2), 0.5)
 
 
 def test_gaps_of_both_cores_count_once_where_they_overlap() -> None:
@@ -173,9 +183,10 @@ def test_the_runs_own_verdicts_beside_whose_it_was() -> None:
 
 
 def test_each_bar_that_is_missed_is_said() -> None:
-    kept = {"late_share": 1e-4, "run": {"missed": 0.005, "doubled": 0.001}, "whose": {MACHINE: 9, PARTLY: 0, OURS: 0}}
-    assert broken_bars(kept) == []
-    missed = {"late_share": 2e-4, "run": {"missed": 0.006, "doubled": 0.002}, "whose": {MACHINE: 9, PARTLY: 1, OURS: 2}}
+    kept = {"late_share": 1e-4, "run": {"missed": 0.005, "doubled": 0.001}, "whose": {MACHINE: 9, PARTLY: 3, OURS: 0}}
+    assert broken_bars(kept | {"partly_worked_off": 3}) == []
+    whose = {MACHINE: 9, PARTLY: 3, OURS: 2}
+    missed = {"late_share": 2e-4, "run": {"missed": 0.006, "doubled": 0.002}, "whose": whose, "partly_worked_off": 2}
     assert [text.split(":")[0] for text in broken_bars(missed)[:3]] == ["late", "missed", "doubled"]
     assert "2 late decisions without any gap of the machine, 1 with too short ones" in broken_bars(missed)
 
