@@ -7,6 +7,7 @@ costs is not in them. Patterns are random, as dark as trained ones are.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pans.runtime.wire import SLOT_DTYPE, Opcode
 from pans.runtime.wire_commands import PARALLEL, Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
 
 from .device import Instrument
+from .frame_run import FrameRun
 from .moving import Cells
 from .scene_file import open_scene
 
@@ -36,37 +38,70 @@ CASES = (
 
 
 def flow_rows(quick: bool) -> list[Row]:
-    """Return one row for each case: microseconds of CPU time per block and per frame, and the cores that real pace would take."""
+    """Return one row for each case: microseconds of CPU time per block, and the cores that real pace would take.
+
+    `us_per_block`: blocks due one by one, drawing included; `in_bulk`: all blocks of a stretch due at once, nothing made before;
+    `made_ahead`: blocks due at once that were made while the device was idle, as after a pause of the machine.
+    """
     return [_row(*case, 0.1 if quick else 0.5) for case in CASES]
 
 
 def _row(name: str, n_patterns: int, exposure_us: float, block_frames: int, seconds: float) -> Row:
     device = _armed(name, n_patterns, exposure_us, block_frames)
-    decoder = wire.FrameDecoder()
-    decoder.use_kernels()
-    stretches = []
-    for number in range(REPEATS + 1):  # the first one warms up
-        end = START_TICK + round((number + 1) * seconds * device.profile.clock.tick_hz)
-        sent = []
-        began = time.thread_time_ns()
-        while (due := device.next_event_tick()) is not None and due < end:
-            sent.append(device.step(due, b""))
-        stretches.append((time.thread_time_ns() - began, b"".join(sent)))
-    spent_ns, data = min(stretches[1:], key=lambda stretch: stretch[0])
-    spent_us = spent_ns / 1e3
-    frames = decoder.feed(data)
-    blocks = [wire.decode_frames(frame.payload) for frame in frames if frame.type == wire.MessageType.FRAMES]
-    marks = sum(frame.type == wire.MessageType.MARK for frame in frames)
+    ticks = round(seconds * device.profile.clock.tick_hz)
+    one_by_one, in_bulk, made_ahead = [], [], []
+    for _ in range(REPEATS + 1):  # the first one warms up
+        one_by_one.append(_timed(device, lambda: _one_by_one(device, device.tick + ticks)))
+        device.step(_last_made(device), b"")
+        in_bulk.append(_timed(device, lambda: [device.step(device.tick + ticks, b"")]))
+        while device.draw_ahead():
+            pass
+        made_ahead.append(_timed(device, lambda: [device.step(_last_made(device), b"")]))
+    spent_us, blocks, marks = min(one_by_one[1:], key=lambda stretch: stretch[0] / len(stretch[1]))
     n_frames = sum(len(block.words) for block in blocks)
     return {
         "name": f"SIMULATED device, {name}, {n_patterns} patterns, frames of {exposure_us:g} us, {block_frames} a block",
         "us_per_block": round(spent_us / len(blocks), 2),
+        "us_per_block_in_bulk": round(_least(in_bulk), 2),
+        "us_per_block_made_ahead": round(_least(made_ahead), 2),
         "us_per_frame": round(spent_us / n_frames, 3),
         "cores_at_real_pace": round(spent_us / 1e6 / seconds, 3),
         "blocks": len(blocks),
         "marks": marks,
         "clicks_per_frame": round(sum(int(np.unpackbits(block.words).sum()) for block in blocks) / n_frames, 4),
     }
+
+
+def _one_by_one(device: Instrument, end: int) -> list[bytes]:
+    """As a shell does it: step to what is due, send, make a piece of what is to come."""
+    sent = []
+    while (due := device.next_event_tick()) is not None and due < end:
+        sent.append(device.step(due, b""))
+        device.draw_ahead()
+    return sent
+
+
+def _last_made(device: Instrument) -> int:
+    """The tick of the last message that is made: what a device is to send at once after a pause."""
+    run = device._run
+    assert isinstance(run, FrameRun)
+    return run.made_until
+
+
+def _timed(device: Instrument, work: Callable[[], list[bytes]]) -> tuple[float, list[wire.FrameBlock], int]:
+    """Microseconds of CPU time that `work` took, and the blocks and the number of marks that it sent."""
+    decoder = wire.FrameDecoder()
+    decoder.use_kernels()
+    began = time.thread_time_ns()
+    sent = work()
+    spent_us = (time.thread_time_ns() - began) / 1e3
+    frames = [frame for data in sent for frame in decoder.feed(data)]
+    blocks = [wire.decode_frames(frame.payload) for frame in frames if frame.type == wire.MessageType.FRAMES]
+    return spent_us, blocks, sum(frame.type == wire.MessageType.MARK for frame in frames)
+
+
+def _least(stretches: list[tuple[float, list[wire.FrameBlock], int]]) -> float:
+    return min(spent_us / len(blocks) for spent_us, blocks, _ in stretches[1:])
 
 
 def _armed(name: str, n_patterns: int, exposure_us: float, block_frames: int) -> Instrument:

@@ -102,6 +102,11 @@ class FrameRun(Timetable):
         stretch = self._ahead[0]
         return stretch.due[stretch.sent]
 
+    @property
+    def made_until(self) -> int:
+        """The tick at which the last message that is made is due; the start tick when none is."""
+        return self._ahead[-1].due[-1] if self._ahead else self._start_tick
+
     def draw_ahead(self) -> bool:
         """Make a stretch of what is to come, if there is room; whether it did."""
         return len(self._ahead) < AHEAD_STRETCHES and self._draw()
