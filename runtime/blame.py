@@ -232,6 +232,7 @@ class Incidents:
     causes: dict[str, int] = field(default_factory=dict)  # late decisions by cause
     missing: dict[str, int] = field(default_factory=dict)  # lost exposures by cause
     _waiting: deque[_Incident] = field(default_factory=deque)  # for their verdicts, the oldest first
+    _known: tuple[_Incident, Facts] | None = None  # to be judged next
 
     def late(self, work: LateWork) -> None:
         """Take one late decision.
@@ -252,7 +253,12 @@ class Incidents:
         latest.decisions += 1
 
     def verdict(self, now_ns: int, *, final: bool = False) -> dict[str, Any] | None:
-        """Return the event that closes the incident under way, None while there is none or it is not over."""
+        """Return the event that closes the incident under way, None while there is none or it is not over.
+
+        What is known is gathered in one call and judged in the next: a decision may be due between the two.
+        """
+        if self._known is not None:
+            return self._judged(*self._known)
         if not self._waiting:
             return None
         oldest = self._waiting[0]
@@ -262,8 +268,13 @@ class Incidents:
         if not final and quiet_ns < PATIENCE_NS and not self.evidence.heard_since(end_ns):
             return None
         self._waiting.popleft()
-        first, worst, last, decisions = oldest.first, oldest.worst, oldest.last, oldest.decisions
-        verdict = judge(self.evidence.facts(*worst[1:]))
+        self._known = oldest, self.evidence.facts(*oldest.worst[1:])
+        return self._judged(*self._known) if final else None
+
+    def _judged(self, incident: _Incident, facts: Facts) -> dict[str, Any]:
+        self._known = None
+        first, worst, last, decisions = incident.first, incident.worst, incident.last, incident.decisions
+        verdict = judge(facts)
         self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + decisions
         return {
             "kind": "blame",

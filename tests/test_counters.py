@@ -120,10 +120,13 @@ def test_a_verdict_waits_for_a_reading_and_not_for_ever() -> None:
     incidents.late(LateWork(1, 90 * MS, 91 * MS, 92 * MS, 0))
     assert incidents.verdict(150 * MS) is None
     now[0] = 300 * MS
-    assert incidents.verdict(now[0]) is not None  # the loop has read for itself
+    assert incidents.verdict(now[0]) is None  # gathered: the loop has read for itself
+    assert incidents.verdict(now[0]) is not None  # judged
     assert evidence.heard_since(300 * MS)
     incidents.late(LateWork(2, 290 * MS, 291 * MS, 299 * MS, 0))
-    assert incidents.verdict(349 * MS) is not None  # read since
+    assert incidents.verdict(348 * MS) is None  # not over
+    assert incidents.verdict(349 * MS) is None  # gathered, since it was read in time
+    assert incidents.verdict(350 * MS) is not None
 
 
 def test_a_starved_thread_is_stood_in_for() -> None:
