@@ -30,6 +30,7 @@ IDLE, OPEN, BLIND = 0, 1, 2
 # a passage, int64 (N_COLUMNS,): its frames, where it is centred (times 256), clicks, BROKEN or TOO_LONG, the exposure that settled it
 P_FIRST, P_LAST, P_CENTRE, P_CLICKS, P_FLAGS, P_RELEASE, N_COLUMNS = range(7)
 BROKEN, TOO_LONG = 1, 2
+N_EDGES = 5  # figures of count_edges
 DARK, NEVER_CAME = -1, -2
 # limits, int64: the first eight of flow_settings.FlowLimits, then the frames of a cycle that ends with a dark one (0: none does)
 W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2, DARK_CYCLE, N_LIMITS = range(10)
@@ -193,6 +194,29 @@ def window_clicks(words, counts, first, shots, out):  # type: ignore[no-untyped-
         _tally(words[exposure & mask], out)
         unlit += counts[exposure & mask] < 0
     return unlit
+
+
+@numba.njit(cache=True, nogil=True)
+def count_edges(words, counts, before, start, frames, out):  # type: ignore[no-untyped-def]
+    """Which bars change between the windows of `frames` exposures from `before` and from `start` on, and what was lit between them.
+
+    out int64 (N_EDGES,): channels that come on, that go off, clicks of the ones and of the others in the exposures in between, and
+    how many of all these exposures were dark or never came.
+    """
+    mask = len(words) - 1
+    out[:] = 0
+    first, then = numba.uint64(0), numba.uint64(0)
+    for k in range(frames):
+        first |= words[(before + k) & mask]
+        then |= words[(start + k) & mask]
+        out[4] += (counts[(before + k) & mask] < 0) + (counts[(start + k) & mask] < 0)
+    up, down = then & ~first, first & ~then
+    out[0], out[1] = popcount(up), popcount(down)
+    for exposure in range(before + frames, start):
+        word = words[exposure & mask]
+        out[2] += popcount(word & up)
+        out[3] += popcount(word & down)
+        out[4] += counts[exposure & mask] < 0
 
 
 @numba.njit(cache=True, nogil=True)

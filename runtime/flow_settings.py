@@ -44,6 +44,7 @@ class FlowSettings:
     sure: float = 0.0  # a posterior below is ambiguous: no label
     # tape
     bars_per_s: float = 10_000.0
+    track: int = 0  # follow phase and speed by the clicks: an edge corrects 2^-track of what it is off; 0: not at all
     first_bar: float = 1.0  # when the window of bar position 0 is aligned, in bar pitches from the start
     # gate
     gate_delay_us: float = 900.0  # from leaving to the pulse
@@ -65,6 +66,7 @@ class FlowSettings:
             "pool": (1, 64),
             "sure": (0, 1),
             "bars_per_s": (1e-3, 1e9),
+            "track": (0, 8),
             "first_bar": (0, 1e9),
             "gate_delay_us": (0, 1e6),
             "gate_us": (0.01, 1e6),

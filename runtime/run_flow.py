@@ -136,6 +136,7 @@ class FlowRun:
                 "kind": core.settings.kind,
                 "frames_per_decision": core.frames,
                 "pool": core.settings.pool,
+                "bars_per_s": getattr(core, "bars_per_s", None),  # of a tape: as said, or as last found
                 "onset_clicks": limits.onset_clicks,
                 "release_clicks": limits.release_clicks,
                 "onset_frames": limits.onset_frames,

@@ -19,6 +19,7 @@ from flows import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_flow import passages as naive_passages
+from numpy.typing import NDArray
 
 from pans.runtime import flow_kernels as kernels
 from pans.runtime import wire
@@ -33,6 +34,8 @@ from pans.runtime.wire import (
     StateReason,
     Status,
 )
+
+F64 = NDArray[np.float64]
 
 # -- the kernels ---------------------------------------------------------------------------------------------------------
 
@@ -241,10 +244,10 @@ def test_a_second_stream_goes_on_with_the_numbers() -> None:
     assert core.cycles_left(100) == 60
 
 
-@pytest.mark.parametrize("kind", ["cells", "tape"])
-def test_a_core_that_goes_on_from_a_part_gives_the_same_rows(kind: str) -> None:
+@pytest.mark.parametrize(("kind", "track"), [("cells", 0), ("tape", 0), ("tape", 3)])
+def test_a_core_that_goes_on_from_a_part_gives_the_same_rows(kind: str, track: int) -> None:
     words = scene((100, 60, 0), (300, 60, 1), (505, 60, 2), n=800)
-    changes = {"kind": kind, "bars_per_s": 20_000.0}
+    changes = {"kind": kind, "bars_per_s": 20_000.0, "track": track}
     whole = feed(make(**changes), words)
     first = make(**changes)
     before = feed(first, words[:500])
@@ -285,7 +288,88 @@ def test_bars_in_a_gap_abstain() -> None:
 
 def test_alignment_does_not_drift_over_a_million_bars() -> None:
     core = make(kind="tape", bars_per_s=20_000.0 / 1.0001, first_bar=31.0 / 50.005)
-    assert core._window_of(10**6) == round(15 + 25.0025 * 10**6)  # type: ignore[attr-defined]
+    middle = core._origin + 10**6 * core._pitch  # type: ignore[attr-defined]
+    assert core._window_of(middle) == round(15 + 25.0025 * 10**6)  # type: ignore[attr-defined]
+
+
+def moving_tape(edges_at: F64, bars: F64, n: int, seed: int, light: float = 8.0) -> NDArray[np.uint16]:
+    """Frames of three channels, channel i showing bar m + i from edge m to edge m + 1 (in frames); mixed frames click by their light."""
+    rng = np.random.default_rng(seed)
+    fine = 16
+    moments = (np.arange(n * fine) + 0.5) / fine
+    window = np.searchsorted(edges_at, moments, "right") - 1
+    words = np.zeros(n, np.uint16)
+    for channel in range(3):
+        share = bars[np.maximum(window, 0) + channel].reshape(n, fine).mean(axis=1)
+        words |= (rng.random(n) < 1 - np.exp(-light * share)).astype(np.uint16) << channel
+    return words
+
+
+@pytest.mark.parametrize("off", [-0.02, -0.01, 0.0, 0.01, 0.02])
+def test_a_tape_of_another_speed_is_followed(off: float) -> None:
+    """Windows must stay within the bars, to the end, and the speed must be found; without following they run away."""
+    rng = np.random.default_rng(5)
+    n, pitch = 20_000, 25.0 * (1 - off)
+    edges = 15.5 + pitch * (np.arange(n // 20) - 0.5)
+    words = moving_tape(edges, rng.integers(0, 2, n).astype(np.float64), n, 6)
+    cores = {track: make(kind="tape", bars_per_s=20_000.0, first_bar=31.0 / 50, track=track) for track in (0, 3)}
+    for track, core in cores.items():
+        rows = feed(core, words).decisions
+        middles = np.array([row.exposure_index + 0.5 for row in rows])
+        numbers = np.arange(len(middles))
+        beside = (middles - 15.5) / pitch - numbers  # in bars, from where bar `number` is aligned
+        if track:
+            assert np.abs(beside[len(beside) // 2 :]).max() < 0.1
+            assert np.abs(beside).max() < 0.4
+            assert core.bars_per_s == pytest.approx(20_000.0 / (1 - off), rel=0.004)  # type: ignore[attr-defined]
+        elif off:
+            assert np.abs(beside).max() > 2.0
+
+
+def test_a_tape_that_changes_its_speed_is_followed() -> None:
+    rng = np.random.default_rng(7)
+    pitches = 25.0 * (1 + 0.03 * np.sin(np.arange(1600) / 120.0))
+    edges = 15.5 - 12.5 + np.concatenate([[0.0], np.cumsum(pitches)])
+    n = int(edges[-2])
+    words = moving_tape(edges, rng.integers(0, 2, 2000).astype(np.float64), n, 8)
+    core = make(kind="tape", bars_per_s=20_000.0, first_bar=31.0 / 50, track=3)
+    middles = np.array([row.exposure_index + 0.5 for row in feed(core, words).decisions])
+    centres = (edges[:-1] + edges[1:]) / 2
+    assert len(middles) > 1500
+    assert (np.abs(middles - centres[: len(middles)]) / 25.0)[50:].max() < 0.4  # of a bar, with three channels to tell
+
+
+def test_edges_are_counted_as_in_plain_loops() -> None:
+    rng = np.random.default_rng(9)
+    out = np.zeros(kernels.N_EDGES, np.int64)
+    for _ in range(50):
+        words, counts = rng.integers(0, 1 << 12, 32).astype(np.uint64), rng.integers(-2, 4, 32).astype(np.int16)
+        before, frames, between = int(rng.integers(100)), int(rng.integers(1, 4)), int(rng.integers(0, 6))
+        start = before + frames + between
+        kernels.count_edges(words, counts, before, start, frames, out)
+        at = [int(words[e % 32]) for e in range(before, start + frames)]
+        first, then = at[:frames], at[-frames:]
+        wanted = [0, 0, 0, 0, sum(int(counts[e % 32]) < 0 for e in range(before, start + frames))]
+        for bit in range(12):
+            was, comes = any(w >> bit & 1 for w in first), any(w >> bit & 1 for w in then)
+            lit = sum(w >> bit & 1 for w in at[frames : frames + between])
+            if was != comes:
+                wanted[0 if comes else 1] += 1
+                wanted[2 if comes else 3] += lit
+        assert out.tolist() == wanted
+
+
+def test_nothing_is_learnt_over_a_gap() -> None:
+    """The loop goes through a gap as if nothing had been, and is locked behind it."""
+    rng = np.random.default_rng(10)
+    edges = 15.5 + 24.8 * (np.arange(900) - 0.5)
+    words = moving_tape(edges, rng.integers(0, 2, 1000).astype(np.float64), 20_000, 11)
+    whole = make(kind="tape", bars_per_s=20_000.0, first_bar=31.0 / 50, track=3)
+    output = feed(whole, words, drop=(100, 101))
+    beside = (np.array([row.exposure_index + 0.5 for row in output.decisions]) - 15.5) / 24.8
+    off = beside - np.arange(len(beside))
+    assert np.abs(off[300:]).max() < 0.1
+    assert any(row.flags & DecisionFlag.GAP for row in output.decisions)
 
 
 # -- what cannot be ------------------------------------------------------------------------------------------------------
