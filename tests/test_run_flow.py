@@ -188,6 +188,27 @@ def test_a_tape_is_read_as_well_as_the_exact_optimum(
     assert summary["clicks_mean"] < 5.3
 
 
+def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = PROFILE.text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
+    (tmp_path / "even.toml").write_text(text)
+    (tmp_path / "tape.toml").write_text(
+        'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = 50500.0\njitter_bars = 0.02\njitter_time_s = 0.01\n'
+    )
+    (tmp_path / "flow.toml").write_text('kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\ntrack = 3\n')
+    profile = load_profile(str(tmp_path / "even.toml"))
+    bundle, _ = tape_bundle(profile, photons=8.0, dark=0.0, pixels_per_bar=8, lit_px=2, exposure_us=5.0)
+    write_bundle(bundle, tmp_path / "tape.pans")
+    device = f"sim:{tmp_path / 'even.toml'}?scene={tmp_path / 'tape.toml'}&seed=9&pace=fast"
+    command = ["run", str(tmp_path / "tape.pans"), "--device", device, "--flow", str(tmp_path / "flow.toml")]
+    assert main([*command, "--seconds", "0.06", "--out", str(tmp_path), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["passages"]["alone"] > 3000
+    assert summary["accuracy"] > 0.995  # not followed it is lost within 50 bars
+    assert summary["flow"]["bars_per_s"] == pytest.approx(50_500.0, rel=0.005)
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]
+
+
 def test_the_exact_table_without_dark_counts_and_with_endless_light_is_the_truth() -> None:
     table, accuracy, clicks = exact_table(60.0, 0.0)
     assert accuracy == pytest.approx(1.0, abs=1e-12)
