@@ -57,13 +57,22 @@ class Stretch:
         words = self._words[rest[0] : rest[0] + (count if ended is None else ended)]
         return FrameBlock(0, 0, tick, exposure, self._period_ticks, number, words)
 
-    def take(self, n: int, stamp: Stamp) -> memoryview:
-        """Return the next `n` messages as frames, `stamp` on the first of them, and move on."""
-        wanted = stamp._replace(sequence=(stamp.sequence - self.sent) & _U32)
-        if self._stamp != wanted:
-            self._encode(wanted)
-        first, self.sent = self.sent, self.sent + n
-        return self._data[self._ends[first] : self._ends[self.sent]]
+    def due_by(self, tick: int) -> int:
+        """How many messages from the next one on are due before or at `tick`."""
+        return bisect_right(self.due, tick, self.sent) - self.sent
+
+    def take(self, n: int, sequence: int, drops: int, session: int) -> memoryview:
+        """Return the next `n` messages as frames, the first one with this sequence number, and move on."""
+        first = self.sent
+        if ((sequence - first) & _U32, drops, session) != self._stamp:
+            self._encode(Stamp((sequence - first) & _U32, drops, session))
+        self.sent = first + n
+        return self._data[self._ends[first] : self._ends[first + n]]
+
+    def skip(self) -> int:
+        """Leave out the next message; return how many exposures it holds."""
+        self.sent += 1
+        return int(self._messages[self.sent - 1, frame_writer.EXPOSURES])
 
     def _encode(self, stamp: Stamp) -> None:
         """Encode all messages again, sent ones included, as if they had been sent in one row."""
@@ -97,10 +106,15 @@ class FrameRun(Timetable):
     @property
     def next_tick(self) -> int | None:
         """See the class."""
-        if not self._ahead and not self._draw():
-            return None
-        stretch = self._ahead[0]
-        return stretch.due[stretch.sent]
+        stretch = self.stretch()
+        return None if stretch is None else stretch.due[stretch.sent]
+
+    def stretch(self) -> Stretch | None:
+        """The stretch that holds the next message, made now if it was not before; None after the last message."""
+        ahead = self._ahead
+        if ahead and ahead[0].sent == len(ahead[0].due):
+            ahead.popleft()
+        return ahead[0] if ahead or self._draw() else None
 
     @property
     def made_until(self) -> int:
@@ -114,33 +128,13 @@ class FrameRun(Timetable):
     def emit(self) -> FrameBlock | Mark:
         """Return the message that is due at `next_tick` and move on to the next one."""
         message = self._ahead[0].message()
-        self.skip()
-        return message
-
-    def due_by(self, tick: int) -> int:
-        """How many messages of the stretch at hand are due before or at `tick`; ask again when they are taken."""
-        if self.next_tick is None:
-            return 0
-        stretch = self._ahead[0]
-        return bisect_right(stretch.due, tick, stretch.sent) - stretch.sent
-
-    def take(self, n: int, stamp: Stamp) -> memoryview:
-        """Return the next `n` messages of the stretch at hand as frames, `stamp` on the first one, and move on."""
-        data = self._ahead[0].take(n, stamp)
-        self._forget()
-        return data
-
-    def skip(self) -> int:
-        """Leave out the next message; return how many exposures it holds."""
-        exposures = self._ahead[0].exposures()
         self._ahead[0].sent += 1
-        self._forget()
-        return exposures
+        return message
 
     def cut(self, tick: int) -> FrameBlock | None:
         """Return the finished exposures of the block under way when the run is broken off at `tick`; None without any."""
         while self.next_tick is not None and not self._ahead[0].exposures():
-            self.skip()  # marks of what is not to come
+            self._ahead[0].sent += 1  # marks of what is not to come
         if self.next_tick is None:
             return None
         block = self._ahead[0].message()
@@ -151,10 +145,6 @@ class FrameRun(Timetable):
         self._broken_off = True
         self._ahead.clear()
         return block._replace(words=block.words[:ended]) if ended else None
-
-    def _forget(self) -> None:
-        if self._ahead[0].sent == len(self._ahead[0].due):
-            self._ahead.popleft()
 
     def _draw(self) -> bool:
         """Make the stretch after those at hand; False when the run is over."""

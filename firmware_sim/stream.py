@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from pans.runtime import wire
 
-from .marks import Stamp
 from .measurement import Measurement, StreamMessage
 
 if TYPE_CHECKING:
@@ -58,17 +57,20 @@ class StreamBuffer:
         if isinstance(run, Measurement):
             return self.put_each(run, tick, session)
         sent: list[bytes | memoryview] = []
-        while due := run.due_by(tick):
-            if not self._held and self._open() >= due:
-                sent.append(run.take(due, self._stamp(session)))
+        while (stretch := run.stretch()) is not None and (due := stretch.due_by(tick)):
+            if not self._held and due <= (self.limit - self.sequence) & U32 < 1 << 31:
+                sent.append(stretch.take(due, self.sequence, self.dropped_exposures & U32, session))
                 self.sequence = (self.sequence + due) & U32
+                if stretch.sent < len(stretch.due):
+                    break  # as a rule: the rest is not due
                 continue
             for _ in range(due):
                 if len(self._held) >= self.capacity:
                     self.dropped_messages += 1
-                    self.dropped_exposures += run.skip()
+                    self.dropped_exposures += stretch.skip()
                     continue
-                self._held.append((self.sequence, bytes(run.take(1, self._stamp(session)))))
+                frame = stretch.take(1, self.sequence, self.dropped_exposures & U32, session)
+                self._held.append((self.sequence, bytes(frame)))
                 self.sequence = (self.sequence + 1) & U32
                 sent += self._released()
         return sent
@@ -77,14 +79,6 @@ class StreamBuffer:
         """Move the receive window: messages with a sequence below `limit` may leave; return those that now do."""
         self.limit = limit
         return self._released()
-
-    def _open(self) -> int:
-        """How many messages from `sequence` on the window lets out, modulo 2^32."""
-        ahead = (self.limit - self.sequence) & U32
-        return ahead if ahead < 1 << 31 else 0
-
-    def _stamp(self, session: int) -> Stamp:
-        return Stamp(self.sequence, self.dropped_exposures & U32, session)
 
     def _released(self) -> list[bytes]:
         released = []
