@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.encoders import CoherentField
-from pans.trainer.field_basis import discriminant_basis, in_pixels
+from pans.trainer.field_basis import discriminant_basis, in_pixels, principal_fields
 
 
 def scenes(n=3000, side=8):
@@ -62,3 +62,19 @@ def test_an_encoder_of_coordinates_is_one_of_pixels(complex_field):
     x, basis = torch.rand(20, 30, generator=rng), torch.rand(30, 5, generator=rng)
     encoder = CoherentField(3, 5, rng, complex_field=complex_field)
     torch.testing.assert_close(in_pixels(encoder, basis)(x), encoder(x @ basis), rtol=1e-4, atol=1e-5)
+
+
+def test_principal_fields_hold_the_light_and_conserve_it():
+    rng = torch.Generator().manual_seed(2)
+    of_two = torch.rand(50, 2, generator=rng) @ torch.rand(2, 64, generator=rng)
+    basis = principal_fields(of_two, (8, 8), 2)
+    torch.testing.assert_close(basis.T @ basis, torch.eye(2), rtol=0, atol=1e-5)
+    torch.testing.assert_close((of_two @ basis).square().sum(), of_two.square().sum(), rtol=1e-4, atol=0)
+    cut = principal_fields(torch.rand(300, 45 * 41, generator=rng), (45, 41), 9)
+    assert float(torch.linalg.matrix_norm(cut, ord=2)) <= 1 + 1e-5
+    binned = principal_fields(torch.rand(300, 44 * 40, generator=rng), (44, 40), 9)
+    encoder = CoherentField(3, 9, rng, light=50.0, conserving=True)
+    whole = in_pixels(encoder, binned)
+    fields = torch.rand(10, 44 * 40, generator=rng)
+    torch.testing.assert_close(whole(fields), encoder(fields @ binned), rtol=1e-3, atol=1e-4)
+    assert bool((whole(fields).sum(dim=1) <= fields.square().sum(dim=1)).all())

@@ -40,7 +40,7 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     assert equal.equal_table(tmp_path, None, True, print)["rows"] == []
     found = equal.equal_table(tmp_path, None, False, lambda _line: None)
     rows = {row["way"]: row for row in found["rows"]}
-    assert set(rows) == set(equal.WAYS)
+    assert set(rows) == {"PANS", "posterior", "network"}  # light is made for an active task
     for way in ("posterior", "network"):
         assert rows[way]["photons"] == pytest.approx(3.0, rel=1e-5)
     assert rows["PANS"]["value"] > 45  # by chance a third
@@ -66,7 +66,22 @@ def test_the_page_says_where_we_are_not_ahead():
     assert "ahead at every level measured (no network at 3)" in equal.markdown([row("PANS", 80), row("posterior", 70)])
     behind = equal.markdown([row("PANS", 80), row("posterior", 70), row("network", 81)])
     assert "**not ahead at 3 photons (80.0 % at 3.00, network 81.0 %)**" in behind
+    light = equal.markdown([row("equal light", 60, photons=1.0), row("posterior", 70)])
+    assert "- fiber, equal light: **not ahead at 3 photons (60.0 % at 1.00, posterior 70.0 %)**" in light
     assert "not ahead" in equal.markdown([row("PANS", 80, photons=3.1), row("posterior", 70)])  # bought with photons
+
+
+def test_at_equal_light_no_light_is_made(monkeypatch):
+    small = Options(
+        features=3, alpha=0.0, photons=9.0, epochs=3, hidden=8, batch=50, head_rate=1e-2, encoder="coherent"
+    )
+    monkeypatch.setattr(equal, "recipe", lambda *_: small)
+    monkeypatch.setattr(equal, "LIGHT_SIZE", 8)
+    found = equal._pans(columns(600, 12, 2, light="field"), "equal light", 20.0)
+    assert found["options"]["conserving"] is True
+    assert found["options"]["input_photons"] == 20.0
+    assert 0.1 < found["photons"] <= 20.5
+    assert found["value"] > 60  # by chance a half
 
 
 def test_light_shots_and_dark_counts_are_swept_each_alone(tmp_path, monkeypatch):

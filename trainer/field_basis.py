@@ -63,13 +63,30 @@ def turns(image_shape: tuple[int, int]) -> list[Tensor]:
 
 
 def in_pixels(encoder: Encoder, basis: Tensor) -> CoherentField:
-    """Return the coherent encoder W = C B^T of one whose inputs are the coordinates in `basis` (pixels, size)."""
+    """Return the coherent encoder W = C B^T of one whose inputs are the coordinates in `basis` (pixels, size).
+
+    One that conserves light keeps doing so: its basis must be orthonormal, so that W has the singular values of C.
+    """
     assert isinstance(encoder, CoherentField)
     parts, n_features, _ = encoder.weight.shape
-    whole = CoherentField(n_features, len(basis), torch.Generator(), complex_field=parts == 2)
+    whole = CoherentField(
+        n_features, len(basis), torch.Generator(), complex_field=parts == 2, conserving=encoder.conserving
+    )
     with torch.no_grad():
         whole.weight.copy_(encoder.weight @ basis.T)
     return whole
+
+
+def principal_fields(fields: Tensor, image_shape: tuple[int, int], size: int) -> Tensor:
+    """Return the `size` fields that hold most of the light of `fields` (n, pixels), float32 (pixels, size).
+
+    They are orthonormal (no more than that where the last bins are cut), so that an encoder of these coordinates may be held
+    to conserve light: it then does so in pixels.
+    """
+    side = _binning(image_shape)
+    moment = _second_moment(_binned(fields, image_shape, side).double())
+    vectors = torch.linalg.eigh(moment).eigenvectors[:, -size:].flip(1)
+    return _spread(vectors, image_shape, side).float() / side
 
 
 def _binning(image_shape: tuple[int, int]) -> int:

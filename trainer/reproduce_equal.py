@@ -21,12 +21,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from pans.runtime.incident import incident_field
 from pans.runtime.profile import load_profile
 
 from .baseline_bayes import bayes
 from .baseline_direct import aware_cnn
 from .baselines import measure as measure_frames
 from .baselines import run_trials
+from .field_basis import principal_fields
 from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
 from .reproduce_passive import PROFILE, measure
@@ -47,7 +51,10 @@ FLOOR = (
 )
 TRIALS = 2
 BOUND = 30.0  # photons below which PANS is meant to be ahead
-WAYS = ("PANS", "posterior", "network")
+WAYS = ("PANS", "equal light", "posterior", "network")
+DIRECT = WAYS[2:]
+LIGHT_SIZE = 100  # fields in which an encoder that conserves light is sought: those that hold most of it
+LIGHT_RATE = 1e-2
 
 
 def recipe(name: str, photons: float) -> Options:
@@ -62,14 +69,21 @@ def recipe(name: str, photons: float) -> Options:
     return replace(shared, estimator="local", epochs=44, polish=0.0, hidden=256)
 
 
+def light_recipe(name: str, photons: float) -> Options:
+    """Return what PANS is trained with when that many photoelectrons' worth of light reach its optics, and none is made."""
+    fields = replace(recipe(name, photons), photons=None, front_rate=LIGHT_RATE, light=0.2)
+    return replace(fields, conserving=True, input_photons=photons)
+
+
 def equal_table(cache: Path, data_dir: str | None, collect: bool, report: Callable[[str], None]) -> dict[str, Any]:
     """Return one row per task, way and level, and the Markdown; with `collect` only what is finished."""
     rows = []
-    for ways in (WAYS[:2], WAYS[2:]):  # the networks last: they take longest
+    for ways in (WAYS[:3], WAYS[3:]):  # the networks last: they take longest
         for name in TASKS:
             task = None
-            for way, photons in ((way, photons) for way in ways for photons in PHOTONS):
-                path = cache / f"equal-{name}-{way}-{photons:g}.json"
+            wanted = [way for way in ways if way != "equal light" or name in FIELD_RATES]
+            for way, photons in ((way, photons) for way in wanted for photons in PHOTONS):
+                path = cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
                 found = _finished(path, name, way, photons)
                 if found is None and not collect:
                     task = task or load_task(name, data_dir)
@@ -84,8 +98,9 @@ def _finished(path: Path, name: str, way: str, photons: float) -> dict[str, Any]
     if not path.is_file():
         return None
     found: dict[str, Any] = json.loads(path.read_text())
-    if way == "PANS" and not same_options(found["options"], recipe(name, photons)):
-        return None
+    if way not in DIRECT:
+        wanted = (recipe if way == "PANS" else light_recipe)(name, photons)
+        return found if same_options(found["options"], wanted) else None
     return found if way != "network" or found.get("epochs", 4) == network_epochs(name) else None
 
 
@@ -96,7 +111,7 @@ def network_epochs(name: str) -> int:
 
 def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
     started = time.process_time()
-    figures = _pans(task, photons) if way == "PANS" else _direct(task, way, photons)
+    figures = _direct(task, way, photons) if way in DIRECT else _pans(task, way, photons)
     row = {"task": task.name, "way": way, "asked": photons, "cpu_seconds": time.process_time() - started, **figures}
     beside = path.with_suffix(".part")
     beside.write_text(json.dumps(row, indent=1))
@@ -104,9 +119,15 @@ def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
     return row
 
 
-def _pans(task: Task, photons: float) -> dict[str, Any]:
-    options, profile = recipe(task.name, photons), load_profile(PROFILE)
-    trained = train(task, profile, options, basis=basis_of(task.name, task, options))
+def _pans(task: Task, way: str, photons: float) -> dict[str, Any]:
+    if way == "PANS":
+        options = recipe(task.name, photons)
+        basis = basis_of(task.name, task, options)
+    else:
+        options = light_recipe(task.name, photons)
+        x = torch.from_numpy(incident_field(task.train.images, task.light, task.optics)).flatten(1)
+        basis = principal_fields(x, task.image_shape, LIGHT_SIZE)
+    trained = train(task, load_profile(PROFILE), options, basis=basis)
     return measure(task.name, task, trained) | {"options": plain_options(options)}
 
 
@@ -151,14 +172,11 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         *_says(rows),
         "",
         "The images are drawn by our generators (docs/TASKS.md), which were set with the paper's accuracies in view. **Equal "
-        "photons are equal photons detected, "
-        "not equal light.** A passive W is unconstrained, as in the paper: it dims a bright background by interference before "
-        "anything is detected, and may amplify "
-        "what is left. An event changes the power of a transient frame by 1 % (median), so that for each photon of it that is "
-        "detected some hundred must reach "
-        "the instrument: at equal light PANS stands against direct imaging of hundreds of photons or more, which is not measured "
-        "here. The network is small and "
-        "trained for minutes: a lower bound.",
+        "photons detected are not equal light.** The W of `PANS` is unconstrained, as in the paper: it dims a bright background "
+        "by interference before anything is detected, and may amplify what is left; for each photon that it detects of an event "
+        "that changes a frame's power by 1 % some hundred must reach it. `equal light` is the fair comparison for passive "
+        "sensing: the light that reaches its optics is the light of the camera's frame, W makes none, and `photons` is what it "
+        "detects of the N. The network is small and trained for minutes: a lower bound.",
         "",
     ]
     return "\n".join(lines)
@@ -175,21 +193,25 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _says(rows: list[dict[str, Any]]) -> list[str]:
-    """Where PANS is ahead of the better of the two, and where it is not."""
+    """Where PANS is ahead of the better of the two, and where it is not; then the same at equal light."""
     of = {(row["task"], row["asked"], row["way"]): row for row in rows}
     lines = []
-    for name in TASKS:
-        levels = [n for n in PHOTONS if n < BOUND and (name, n, "PANS") in of and (name, n, "posterior") in of]
-        behind = []
-        for n in levels:
-            direct = max((of[name, n, way]["value"], way) for way in WAYS[1:] if (name, n, way) in of)
-            ours = of[name, n, "PANS"]
-            if ours["value"] <= direct[0] or ours["photons"] > n:
-                behind.append(
-                    f"{n:g} photons ({ours['value']:.1f} % at {ours['photons']:.2f}, {direct[1]} {direct[0]:.1f} %)"
-                )
-        if levels:
-            words = "ahead at every level measured" if not behind else f"**not ahead at {'; '.join(behind)}**"
-            without = [f"{n:g}" for n in levels if (name, n, "network") not in of]
-            lines.append(f"- {name}: {words}" + (f" (no network at {', '.join(without)})" if without else ""))
+    for way in ("PANS", "equal light"):
+        for name in TASKS:
+            levels = [n for n in PHOTONS if n < BOUND and (name, n, way) in of and (name, n, "posterior") in of]
+            behind = [words for n in levels if (words := _behind(of, name, n, way))]
+            if levels:
+                words = "ahead at every level measured" if not behind else f"**not ahead at {'; '.join(behind)}**"
+                without = [f"{n:g}" for n in levels if (name, n, "network") not in of]
+                missing = f" (no network at {', '.join(without)})" if without else ""
+                lines.append(f"- {name}{'' if way == 'PANS' else ', equal light'}: {words}{missing}")
     return lines
+
+
+def _behind(of: dict[tuple[str, float, str], dict[str, Any]], name: str, n: float, way: str) -> str:
+    """The better of the direct ways beside ours, where ours is not ahead or takes more photons; else nothing."""
+    direct = max((of[name, n, other]["value"], other) for other in DIRECT if (name, n, other) in of)
+    ours = of[name, n, way]
+    if ours["value"] > direct[0] and ours["photons"] <= n:
+        return ""
+    return f"{n:g} photons ({ours['value']:.1f} % at {ours['photons']:.2f}, {direct[1]} {direct[0]:.1f} %)"
