@@ -180,10 +180,12 @@ def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callab
             # A new host must not wait for what the last one never read; the delimiter ends a frame cut in its middle.
             session = device.session
             backlog[:] = b"\0"
-        if len(backlog) + len(sent) <= MAX_BACKLOG_BYTES:
-            backlog += sent
-        if backlog:
+        if backlog or len(sent) > MAX_BACKLOG_BYTES:
+            if len(backlog) + len(sent) <= MAX_BACKLOG_BYTES:
+                backlog += sent
             del backlog[: port.write(bytes(backlog))]
+        elif sent:
+            backlog += sent[port.write(sent) :]
         due = device.next_event_tick()
         wait_s = LONGEST_WAIT_S
         if due is not None:
