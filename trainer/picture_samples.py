@@ -83,7 +83,7 @@ def draw_samples(path: Path, name: str, cells: list[tuple[str, Samples]]) -> Non
             axis.imshow(picture, cmap="gray", vmin=0, vmax=brightest)
             axis.set(xticks=[], yticks=[])
             if counts is not None:
-                axis.set_title(f"{int(counts[i])} clicks", fontsize=7, pad=2)
+                axis.set_title(f"clicks: {int(counts[i])}", fontsize=7, pad=2)
         line[0].set_ylabel(title, rotation=0, ha="right", va="center", fontsize=8)
     figure.suptitle(
         f"{name}: the first held-out digit of every class, {SAMPLES} single shots each (SIMULATED)", fontsize=9
