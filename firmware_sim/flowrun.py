@@ -43,6 +43,7 @@ TOLD = 200  # late decisions that the machine does not explain, in the report; a
 LONGER_S = 120.0
 LATE_EXIT = 4  # of `pans run`: finished, with late or lost work
 PROGRESS_S = 10.0
+KERNEL_PARENT = 2  # kthreadd
 KEPT = (
     "decisions", "accuracy", "accuracy_ci", "missed", "missed_ci", "doubled", "doubled_ci", "purity", "yield",
     "clicks_mean", "photons_mean", "aborted", "gates", "passages", "latency_us", "late", "late_blame", "late_cause",
@@ -75,6 +76,7 @@ class Outcome(NamedTuple):
     watched: tuple[Watched, ...]
     busy: dict[str, float]
     stolen_s: dict[int, float]  # by core, as the hypervisor tells in /proc/stat, while the canaries were there
+    others: tuple[str, ...]  # further programs of real-time priority on this computer: then it was not quiet
 
 
 def carry_out(job: Job, folder: Path) -> Outcome:
@@ -100,14 +102,14 @@ def carry_out(job: Job, folder: Path) -> Outcome:
         words += [word for name in job.gate_classes for word in ("--gate-class", name)]
         words += ["--deadline-us", str(job.deadline_us)] if job.deadline_us else []
         host = _start([*words, *job.more], None if job.pin is None else job.pin[0], folder / "host.txt")
-        busy = _wait(host, simulator, job.seconds)
+        busy, others = _wait(host, simulator, job.seconds, {canary.process.pid for canary in canaries})
         out, _ = host.communicate()
         if host.returncode not in (0, LATE_EXIT):
             raise RuntimeError(f"the host ended with {host.returncode}: {_tail(folder / 'host.txt')}")
         stolen_s = {core: since - stolen_s[core] for core, since in _stolen_s(cores).items()}
         watched = tuple(canary.end() for canary in canaries)
         summary = json.loads(out)
-        return Outcome(summary, Path(summary["recording"]), watched, busy, stolen_s)
+        return Outcome(summary, Path(summary["recording"]), watched, busy, stolen_s, others)
     finally:
         for canary in canaries:
             canary.kill()
@@ -133,8 +135,11 @@ def _start(words: list[str], core: int | None, errors: Path) -> subprocess.Popen
         )
 
 
-def _wait(host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds: float) -> dict[str, float]:
-    """Wait for the host's end; return the processor seconds per second that both took between a fifth of the run and its end."""
+def _wait(
+    host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds: float, canaries: set[int]
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Wait for the host's end; return what `Outcome` calls `busy`, between a fifth of the run and its end, and `others`."""
+    others: set[str] = set()
     began = time.monotonic()
     samples: list[tuple[float, float, float]] = []
     while host.poll() is None:
@@ -145,6 +150,7 @@ def _wait(host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds
             samples.append((elapsed, _processor_s(host.pid), _processor_s(simulator.pid)))
         except OSError:  # it has just ended
             break
+        others |= real_time_programs(canaries | {host.pid, simulator.pid})
         if len(samples) % round(PROGRESS_S) == 0:
             print(f"{elapsed:6.0f} s", file=sys.stderr, flush=True)
         time.sleep(min(1.0, max(seconds / 10, 0.05)))
@@ -152,12 +158,28 @@ def _wait(host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds
     last = samples[-2] if len(samples) > 1 else samples[-1]
     first = next(sample for sample in samples if sample[0] >= 0.2 * last[0])
     lasted = max(last[0] - first[0], 1e-9)
-    return {"host": (last[1] - first[1]) / lasted, "simulator": (last[2] - first[2]) / lasted}
+    busy = {"host": (last[1] - first[1]) / lasted, "simulator": (last[2] - first[2]) / lasted}
+    return busy, tuple(sorted(others))
 
 
 def _processor_s(pid: int) -> float:
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def real_time_programs(known: set[int]) -> set[str]:
+    """Return the programs of real-time priority now, but for those of the pids `known` and for threads of the kernel: "name (priority)"."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, _, rest = path.read_text().partition("(")[2].rpartition(")")
+        except OSError:  # it has just ended
+            continue
+        fields = rest.split()
+        parent, priority = int(fields[1]), int(fields[37])
+        if priority and parent not in (0, KERNEL_PARENT) and int(path.parent.name) not in known:
+            found.add(f"{name} ({priority})")
+    return found
 
 
 def _stolen_s(cores: list[int]) -> dict[int, float]:
@@ -206,6 +228,7 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
             for watched in outcome.watched
         ],
         "busy": outcome.busy,
+        "other_real_time_programs": list(outcome.others),
         "run": summary,
         "explained": [entry for entry in entries if entry["whose"] == MACHINE][:TOLD],
         "unexplained": unexplained[:TOLD],

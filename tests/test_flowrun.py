@@ -28,7 +28,7 @@ from pans.firmware_sim.flowcause import (
     verdict_of,
     worked_off,
 )
-from pans.firmware_sim.flowrun import Job, broken_bars, carry_out, report, show
+from pans.firmware_sim.flowrun import Job, broken_bars, carry_out, real_time_programs, report, show
 from pans.runtime.bundle import write_bundle
 from pans.runtime.profile import load_profile
 from pans.runtime.record import TIMING_DTYPE
@@ -202,9 +202,11 @@ def test_a_canary_that_is_kept_from_its_core_notes_from_when_to_when() -> None:
         continued_ns = time.perf_counter_ns()
         os.kill(canary.process.pid, signal.SIGCONT)
         time.sleep(0.1)
+        programs = real_time_programs({os.getpid()})
         watched = canary.end()
     finally:
         canary.kill()
+    assert any(name.endswith("(30)") for name in programs)
     longest = max(watched.gaps, key=lambda one: one.length_ns)
     assert longest.seen_ns < stopped_ns
     assert longest.end_ns > continued_ns
