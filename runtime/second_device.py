@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .connection import NS_PER_S, Connection, plan_chunks
-from .errors import DeviceError, UsageError
+from .errors import DeviceError, LinkError, UsageError
 from .link import Link, open_link
 from .plan import NO_SHOT, Plan, ticks_of
 from .profile import Profile
@@ -43,8 +43,8 @@ class SecondInstrument:
         if link.virtual:
             link.close()
             raise UsageError(f"{url}: a second instrument needs the host's real time", remedy="pace=real")
-        self.url, self.profile = url, profile
-        self.connection = Connection(link)
+        self.url, self.profile, self._link = url, profile, link
+        self._connection: Connection | None = None
         self.worst_uncertainty_ns = 0
         self._probe_due_ns = self._lease_due_ns = self._look_due_ns = 0
         self._last_pulse_ns = 0
@@ -56,13 +56,22 @@ class SecondInstrument:
         scheme, _, rest = url.partition(":")
         return SecondInstrument(url, open_link(f"serial:socket://{rest}" if scheme == "tcp" else url), profile)
 
+    @property
+    def connection(self) -> Connection:
+        """Its session; LinkError before `connect`."""
+        if self._connection is None:
+            raise LinkError(f"{self.url}: the second instrument is not connected")
+        return self._connection
+
     def now_ns(self) -> int:
         """The host's clock."""
-        return self.connection.link.now_ns()
+        return self._link.now_ns()
 
     def connect(self) -> None:
         """Shake hands, measure its clock and arm it; DeviceError if it is not of the profile, LinkError if it is silent."""
-        connection, profile = self.connection, self.profile
+        # not before: its reader's thread shares the interpreter with the loop, and has its priority only if it starts after the loop got it
+        connection = self._connection = Connection(self._link)
+        profile = self.profile
         facts = connection.handshake().facts
         found = (facts["mode"], int(facts["tick_hz"]))
         if found != (profile.mode, profile.clock.tick_hz):
@@ -128,16 +137,21 @@ class SecondInstrument:
 
     def close(self) -> None:
         """Close its port."""
-        self.connection.close()
+        if self._connection is None:
+            self._link.close()
+        else:
+            self._connection.close()
 
     def facts(self) -> dict[str, Any]:
         """What the summary says about it."""
+        if self._connection is None:
+            return {"url": self.url}
         welcome = self.connection.session.welcome
         fit = None if self.connection.clock is None else self.connection.clock.fit
         return {
             "url": self.url,
             "serial": None if welcome is None else welcome.facts.get("serial"),
-            "simulated": self.connection.link.simulated or bool(welcome and welcome.facts.get("simulated")),
+            "simulated": self._link.simulated or bool(welcome and welcome.facts.get("simulated")),
             "drift_ppm": None if fit is None else fit.drift_ppm,
             "uncertainty_us": None if fit is None else fit.uncertainty_ns / 1000,
             "worst_uncertainty_us": self.worst_uncertainty_ns / 1000,  # of a pulse, both clocks together
