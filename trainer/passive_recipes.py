@@ -99,7 +99,8 @@ def _picture(shared: Options) -> Options:
 def _digits(shared: Options, row: PassiveRow) -> Options:
     digits = replace(_plain(shared), clicks=CLICKS_AIM_MMF * row.clicks)
     if row.features > EXACT_FEATURES_MAX:
-        return replace(digits, clicks=1.03 * row.clicks, epochs=80, polish=0.4, front_rate=2e-2)
+        hidden = 128 if row.features <= 16 else 256
+        return replace(digits, clicks=CLICKS_AIM * row.clicks, epochs=40, warm=0.15, polish=0.4, hidden=hidden)
     return replace(digits, starts=4) if row.features == 5 else digits
 
 
