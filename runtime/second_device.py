@@ -95,7 +95,8 @@ class SecondInstrument:
         """Read what came and send what is due; `waits` for an answer: look soon. LinkError when it is gone."""
         session = self.connection.session
         if now_ns >= self._probe_due_ns:
-            session.probe(now_ns)
+            session.probe(self.now_ns())
+            self.connection.flush()  # its round trip begins now, not at the next look
             self._probe_due_ns = now_ns + PROBE_EVERY_NS
         if now_ns >= self._lease_due_ns:
             session.grant(0, LEASE_MS)

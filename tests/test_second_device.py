@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pans.firmware_sim.clockwork import DeviceClock
@@ -133,6 +134,9 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
         assert abs(off_ns) <= row["uncertainty_us"] * 1000
         assert (pulse.end_tick - pulse.tick) / PULSER.clock.tick_hz == pytest.approx(20e-6, rel=0.05)
     facts = second.facts()
+    kept = second.connection.known_clock().history()
+    quickest = np.sort(kept["round_trip_ns"][-10:])  # of those while it ran: none had to wait for the next look
+    assert quickest[2] < 15 * MS
     assert facts["worst_uncertainty_us"] == max(row["uncertainty_us"] for row in rows) < 50_000
     assert facts["drift_ppm"] is not None
     assert other.device.state == DeviceState.IDLE  # told to stop
