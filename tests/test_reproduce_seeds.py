@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer import reproduce_active as active
+from pans.trainer import reproduce_time as race
 from pans.trainer.options import Options, plain_options
 from pans.trainer.paper_tables import ACTIVE, ActiveRow
 from pans.trainer.report_active import markdown
@@ -58,3 +59,30 @@ def test_the_seeds_of_the_tables_are_not_restarts_of_one_another():
         options = active.recipe(name, row)
         assert plain_options(options)["seed"] == 0
         assert min(seeds) > (options.restarts + 1) * options.starts
+
+
+def test_the_papers_recipe_is_given_ten_times_the_seconds_of_all_our_tries(tmp_path, monkeypatch):
+    given = []
+
+    class Judge:
+        def __init__(self, row, _data_dir):
+            self.row = row
+
+        def train(self, options, *, each_epoch, cap):
+            given.append((options, cap))
+            seconds = cap if each_epoch else float(options.epochs)
+            figures = {"seconds": seconds, "epochs": options.epochs, "reached": not each_epoch and options.epochs >= 18}
+            numbers = ("accuracy", "best_accuracy", "accuracy_all", "clicks", "photons", "illumination")
+            return figures | dict.fromkeys(numbers, 1.0)
+
+    monkeypatch.setattr(race, "_Judge", Judge)
+    found = race.time_table(tmp_path, [32], None, lambda _line: None)
+    *ours, (paper, cap) = given
+    assert [options.epochs for options, _ in ours] == [8, 12, 18]  # from short to long, until one reaches the goal
+    assert all((options.shots, options.mix, options.restarts) == (1, 0.0, 1) for options, _ in ours)
+    assert paper.estimator == "ste"
+    assert (paper.front_rate, paper.head_rate, paper.batch) == (1e-3, 1e-4, 128)
+    assert cap == pytest.approx(race.CAP * (8 + 12 + 18))
+    assert "more than 10.1 times, if the shorter schedules" in found["markdown"]
+    race.time_table(tmp_path, [32], None, lambda _line: None)
+    assert len(given) == 4  # kept
