@@ -64,7 +64,7 @@ def keep_samples(path: Path, samples: Samples) -> None:
 
 def read_samples(path: Path) -> Samples:
     """Return what `keep_samples` wrote."""
-    with np.load(path) as archive:
+    with np.load(path, allow_pickle=False) as archive:
         return Samples(*(archive[part] for part in PARTS))
 
 
