@@ -43,6 +43,7 @@ FEATURES = 10
 # ten clicks cannot tell what ten photons and more could: chosen on other draws of the generator (data seed 101)
 MORE_FEATURES = {"cells-3": {10.0: 32, 25.0: 64}, "cells": {10.0: 32, 25.0: 64}}
 AIM = 0.97  # of the photons, so that the held-out objects give no more than N
+AIM_TISSUE = 0.82  # a speckle not seen before gives up to 18 % more than those trained on
 NETWORK_EPOCHS = {"cells-3": 4, "cells": 4}  # 10 000 pixels; of the other tasks:
 NETWORK_EPOCHS_ELSE = 12
 FRAMES = 1000  # held-out objects whose frames are read out
@@ -60,7 +61,8 @@ LIGHT_RATE = 1e-2
 def recipe(name: str, photons: float) -> Options:
     """Return what PANS is trained with at a photon level."""
     features = MORE_FEATURES.get(name, {}).get(photons, FEATURES)
-    shared = Options(features=features, alpha=0.0, photons=AIM * photons, epochs=30, polish=0.4, head_rate=3e-3)
+    aim = AIM_TISSUE if name == "tissue" else AIM
+    shared = Options(features=features, alpha=0.0, photons=aim * photons, epochs=30, polish=0.4, head_rate=3e-3)
     if name in FIELD_RATES:
         return replace(shared, encoder="coherent", hidden=64, batch=256, front_rate=FIELD_RATES[name])
     shared = replace(shared, warm=0.4, front_rate=CELLS_RATE)
