@@ -75,6 +75,6 @@ def test_more_photons_get_more_patterns_where_ten_would_saturate():
     assert options[3.0].estimator == "exact"
     for photons in (10.0, 25.0):
         assert options[photons].features > equal.FEATURES
-        assert options[photons].estimator == "local"  # too many words to enumerate
+        assert options[photons].estimator in ("local", "ste")  # too many words to enumerate
         check_options(options[photons], load_profile("ideal"))
     assert all(option.photons < photons and option.clicks is None for photons, option in options.items())
