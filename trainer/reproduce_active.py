@@ -47,7 +47,7 @@ def recipe(name: str, row: ActiveRow) -> Options:
         return replace(small, starts=8) if row.features > 4 else replace(small, starts=5, restarts=2)
     if row.features <= EXACT_FEATURES_MAX:
         exact = replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
-        return exact if name != "mnist" else replace(exact, epochs=40, starts=2, restarts=3, alpha=1e-4, mix=0.5)
+        return exact if name != "mnist" else replace(exact, epochs=56, starts=3, restarts=2, alpha=1e-4, mix=0.6)
     local = replace(shared, estimator="local", warm=0.4, head_rate=2e-3, epochs=32, hidden=256)
     if row.features == 32:  # several shots gain least where the patterns were trained for one alone
         return replace(local, mix=0.5)
