@@ -15,6 +15,7 @@ import time
 from types import FrameType
 from typing import NoReturn
 
+from pans.runtime.awake import check_core
 from pans.runtime.cli import Command, emit, say
 
 from .clockwork import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS
@@ -40,6 +41,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--buffer", type=int, default=256, help="stream messages that the device can hold back (default 256)"
     )
+    parser.add_argument("--core", type=int, metavar="N", help="bind it to processor core N and keep that awake")
     parser.add_argument(
         "--echo", type=int, metavar="BYTES", help="no instrument: answer each frame with BYTES bytes (for benchmarks)"
     )
@@ -60,6 +62,7 @@ def _run(args: argparse.Namespace) -> int:
             changes=args.changes,
         )
     )
+    check_core(args.core)
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
     instrument, clock = build_instrument(options, time.perf_counter_ns())
     if args.echo is not None:
@@ -73,7 +76,7 @@ def _run(args: argparse.Namespace) -> int:
         if not args.until_stdin_closes:
             say(f"SIMULATED instrument {args.profile} before scene {args.scene}; Ctrl-C ends it")
         gc.freeze()  # what was made so far is never collected: hardware has no pauses
-        serve(instrument, clock, port, orphaned.is_set)
+        serve(instrument, clock, port, orphaned.is_set, args.core)
     finally:
         port.close()
     return 0

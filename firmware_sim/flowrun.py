@@ -66,6 +66,7 @@ class Job(NamedTuple):
     pin: tuple[int, int] | None = (0, 1)
     more: tuple[str, ...] = ()  # further words for `pans run`
     canary_us: int = EVERY_US  # how often the canaries wake, and how late they must be to note it
+    awake: bool = False  # bind the loops alone, and keep their cores awake
 
 
 class Outcome(NamedTuple):
@@ -85,8 +86,8 @@ def carry_out(job: Job, folder: Path) -> Outcome:
     canaries: list[Canary] = []
     simulator = _start(
         ["simulate", "--profile", job.profile, "--scene", job.scene, "--seed", str(job.seed), "--until-stdin-closes",
-         "--listen", "pty" if job.link == "pty" else "tcp:127.0.0.1:0"],
-        None if job.pin is None else job.pin[1],
+         "--listen", "pty" if job.link == "pty" else "tcp:127.0.0.1:0", *_awake_on(job, 1)],
+        _bound_to(job, 1),
         folder / "simulator.txt",
     )  # fmt: skip
     host: subprocess.Popen[str] | None = None
@@ -101,7 +102,7 @@ def carry_out(job: Job, folder: Path) -> Outcome:
         words += ["--seconds", str(job.seconds), "--out", str(folder / "out"), "--json"]
         words += [word for name in job.gate_classes for word in ("--gate-class", name)]
         words += ["--deadline-us", str(job.deadline_us)] if job.deadline_us else []
-        host = _start([*words, *job.more], None if job.pin is None else job.pin[0], folder / "host.txt")
+        host = _start([*words, *_awake_on(job, 0), *job.more], _bound_to(job, 0), folder / "host.txt")
         busy, others = _wait(host, simulator, job.seconds, {canary.process.pid for canary in canaries})
         out, _ = host.communicate()
         if host.returncode not in (0, LATE_EXIT):
@@ -117,6 +118,16 @@ def carry_out(job: Job, folder: Path) -> Outcome:
             if process is not None:
                 process.kill()
                 process.communicate()
+
+
+def _awake_on(job: Job, which: int) -> list[str]:
+    """Words that bind the loop of host (0) or instrument (1) to its core and keep that awake; their other threads are free."""
+    return ["--core", str(job.pin[which])] if job.awake and job.pin is not None else []
+
+
+def _bound_to(job: Job, which: int) -> int | None:
+    """The core that the whole process of host (0) or instrument (1) is bound to."""
+    return None if job.awake or job.pin is None else job.pin[which]
 
 
 def _start(words: list[str], core: int | None, errors: Path) -> subprocess.Popen[str]:
@@ -303,7 +314,7 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         job = Job(
             args.bundle, args.profile, args.scene, args.flow, args.seconds, args.seed, args.link,
-            classes, args.deadline_us, args.pin, tuple(args.more), args.canary_us,
+            classes, args.deadline_us, args.pin, tuple(args.more), args.canary_us, args.awake,
         )  # fmt: skip
         try:
             result = report(job, carry_out(job, folder))
@@ -342,6 +353,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=5, help="of the simulated instrument (default 5)")
     parser.add_argument("--link", default="tcp", choices=("tcp", "pty"), help="between the two (default tcp)")
+    parser.add_argument(
+        "--awake", action="store_true", help="bind the two loops alone to their cores, and keep these awake (--core)"
+    )
     parser.add_argument(
         "--pin", type=_cores, default="0,1", metavar="HOST,SIM", help="cores of the two, or none (default 0,1)"
     )

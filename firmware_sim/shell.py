@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from pans.runtime.awake import kept_awake
 from pans.runtime.errors import LinkError, UsageError
 
 from .clockwork import DeviceClock, SteppedDevice
@@ -164,9 +165,16 @@ def ask_for_priority() -> str:
     return "granted"
 
 
-def serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool]) -> None:
-    """Step `device` in real time and carry its bytes over `port` until `stopped()`."""
+def serve(
+    device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool], core: int | None = None
+) -> None:
+    """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given."""
     ask_for_priority()
+    with kept_awake(core):
+        _serve(device, clock, port, stopped)
+
+
+def _serve(device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool]) -> None:
     backlog = bytearray()
     session = device.session
     readable = True

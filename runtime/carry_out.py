@@ -109,7 +109,7 @@ def _prepare(args: argparse.Namespace, job: Job, started_ns: int) -> _Prepared:
         n_cycles = n_objects * plan.cycles_per_object
         core = Core(plan, decider, job.shots, n_cycles, honest.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
-    config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns)
+    config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
     job.out.mkdir(parents=True, exist_ok=True)
     header = recording_header(job, bundle_sha256, decider, n_objects)
     header["config"]["dark"] = honest.header()

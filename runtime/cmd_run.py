@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from .awake import check_core
 from .carry_out import carry_out
 from .cli import Command
 from .continuous import Continuous, add_continuous_options, continuous_of
@@ -56,6 +57,7 @@ class Job:
     dark_slots: int
     backend: str
     realtime: bool
+    core: int | None
     record: Path | None
     reconnect_s: float
     trace: Path | None
@@ -79,6 +81,9 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
     parser.add_argument("--backend", default="auto", choices=BACKENDS, help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
+    parser.add_argument(
+        "--core", type=int, metavar="N", help="bind the loop to processor core N and keep that awake; takes all of it"
+    )
     parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
     parser.add_argument(
         "--reconnect-s", type=float, default=10.0, help="how long to look for a lost device (default 10, 0: not at all)"
@@ -132,6 +137,7 @@ def _job(
             raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
     if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
         raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
+    check_core(args.core)
     loaded, flow = load_profile(profile), settings_of(args)
     if flow is not None and (decisions or args.trials != 1):
         raise UsageError(
@@ -151,6 +157,7 @@ def _job(
         dark_slots=args.dark_slots,
         backend=args.backend,
         realtime=not args.no_realtime,
+        core=args.core,
         record=record,
         reconnect_s=args.reconnect_s,
         trace=args.trace,

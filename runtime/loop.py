@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from .awake import kept_awake
 from .bundle import Bundle
 from .clicks import click_law, click_probability
 from .connection import Connection, check_device
@@ -53,6 +54,7 @@ class RunConfig:
     lease_ms: int = 1000
     realtime: bool = True
     started_ns: int = 0
+    core: int | None = None  # that the loop is bound to, and kept awake
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +135,12 @@ def run_live(
     try:
         core.warm_up()
         reader = connection.reader.thread_id
-        with arm_realtime(config.realtime and not link.virtual, [] if reader is None else [reader]) as granted:
-            run.realtime = granted
+        wanted = config.realtime and not link.virtual
+        with (
+            kept_awake(None if link.virtual else config.core) as awake,
+            arm_realtime(wanted, [] if reader is None else [reader]) as granted,
+        ):
+            run.realtime = granted | awake
             try:
                 if onlookers.prepared is not None:
                     onlookers.prepared(run)
