@@ -28,7 +28,7 @@ from .moving import Cells
 from .shifts import ShiftTable
 
 ARRIVAL_STREAM = 16  # five numbers per arrival: waiting time, picture, offset, two for the velocity
-CHUNK = 256  # arrivals drawn at a time
+CHUNK = 32  # arrivals drawn at a time: more would hold a block up
 CUT_SIGMA = 4.0
 MAX_HALF_EXPOSURES = 0xFFFF
 

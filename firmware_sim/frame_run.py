@@ -26,9 +26,10 @@ from .marks import Stamp
 from .measurement import Timetable
 from .upload import Program, word_bytes
 
-STRETCH_EXPOSURES = 2048  # made at a time, in whole blocks,
+STRETCH_EXPOSURES = 2048  # made at a time, in whole blocks, where time is virtual,
+AHEAD_EXPOSURES = 256  # and where it is real, between one block and the next: making them must not hold that one up
 STRETCH_NUMBERS = 1 << 15  # but not more clicks than these
-AHEAD_STRETCHES = 8
+AHEAD_STRETCHES = 16
 _U32 = 0xFFFFFFFF
 
 
@@ -97,8 +98,11 @@ class FrameRun(Timetable):
         self._word_bytes = word_bytes(program.channels)
         self._drawn_blocks = 0
         self._n_blocks = None if self._n_cycles is None else self._n_cycles * len(program.blocks)
-        exposures = max(1, min(STRETCH_EXPOSURES, STRETCH_NUMBERS // program.channels))
-        self._stretch_blocks = max(1, exposures * len(program.blocks) // program.n_slots)
+        self._due_blocks, self._ahead_blocks = (
+            max(1, min(most, STRETCH_NUMBERS // program.channels) * len(program.blocks) // program.n_slots)
+            for most in (STRETCH_EXPOSURES, AHEAD_EXPOSURES)
+        )
+        self._at_once = self._due_blocks  # how many to make; fewer as soon as somebody makes them ahead
         self._before = np.zeros(program.channels, np.uint8)
         self._ahead: deque[Stretch] = deque()
         self._broken_off = False
@@ -123,6 +127,7 @@ class FrameRun(Timetable):
 
     def draw_ahead(self) -> bool:
         """Make a stretch of what is to come, if there is room; whether it did."""
+        self._at_once = self._ahead_blocks
         return len(self._ahead) < AHEAD_STRETCHES and self._draw()
 
     def emit(self) -> FrameBlock | Mark:
@@ -148,7 +153,7 @@ class FrameRun(Timetable):
 
     def _draw(self) -> bool:
         """Make the stretch after those at hand; False when the run is over."""
-        n = self._stretch_blocks
+        n = self._at_once
         if self._n_blocks is not None:
             n = min(n, self._n_blocks - self._drawn_blocks)
         if n <= 0 or self._broken_off:

@@ -70,7 +70,8 @@ def warm_up() -> None:
 def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no-untyped-def]
     """Fill messages int64 (n, N_COLUMNS) with blocks from `block` of `cycle` on and all `marks` (marks.py) among them, in order.
 
-    A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first.
+    A block is due at its end, a mark at its tick or, of what passes by, with the block that holds its tick; a block that ends at
+    that tick goes first.
     """
     taken = word = 0
     photons = marks.view(np.float64)
@@ -80,7 +81,9 @@ def lay_out(plan, cycle, block, marks, start_tick, messages):  # type: ignore[no
         end = cycle_tick + facts[END]
         if taken < marks.shape[0] and start_tick + marks[taken, MARK_TICK] < end:
             mark = marks[taken]
-            message[DUE] = message[TICK] = start_tick + mark[MARK_TICK]
+            message[TICK] = start_tick + mark[MARK_TICK]
+            # what passes by is told with the block in which it stands: one reading less for the host
+            message[DUE] = message[TICK] if plan.cycles_per_object else end
             message[EXPOSURES] = 0
             message[EXPOSURE], message[OBJECT] = mark[MARK_EXPOSURE], mark[MARK_OBJECT]
             message[TRUTH], message[HALF] = mark[MARK_TRUTH], mark[MARK_HALF]

@@ -22,7 +22,7 @@ READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20
 FIFO_PRIORITY = 20  # above the host's loop: light does not wait for a computer
 LONGEST_WAIT_S = 0.25  # how late a stop request may be noticed
-DRAW_S = 200e-6  # when nothing is due for so long, there is time to make a piece of what is due later
+DRAW_S = 100e-6  # with nothing due for so long, what comes is made ahead
 
 
 class Port(Protocol):

@@ -97,7 +97,7 @@ class GateDesk:
             if self.actuator is None and target.in_flight >= COMMAND_WINDOW - FREE_COMMANDS:
                 break
             if first and self._recorder is not None:
-                self._recorder.flush()
+                self._recorder.flush_decisions()
             first = False
             self._do(self._waiting.popleft(), session, clock)
         return not first

@@ -179,7 +179,7 @@ class LiveRun:
         What is acted upon must be on record first, so the recording is flushed before the command leaves.
         """
         if self._recorder is not None:
-            self._recorder.flush()
+            self._recorder.flush_decisions()
         body = pack_gate(Gate(tick, duration_ticks, channel))
         return self.connection.session.submit(Opcode.GATE, body, may_be_refused=True)
 

@@ -227,8 +227,14 @@ class Recorder:
 
     def flush(self) -> None:
         """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
+        self._flush(self._commands, self._messages, self._decisions, self._timings, self._events)
+
+    def flush_decisions(self) -> None:
+        """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
+        self._flush(self._messages, self._decisions)
+
+    def _flush(self, *buffers: _Rows | _Bytes) -> None:
         n_decisions = self._decisions.used
-        buffers = (self._commands, self._messages, self._decisions, self._timings, self._events)
         blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
         if blocks:
             self._write(b"".join(blocks))

@@ -167,6 +167,10 @@ class PartedRecorder:
         """See `Recorder`."""
         self._now.add_clock(samples)
 
+    def flush_decisions(self) -> None:
+        """See `Recorder`."""
+        self._now.flush_decisions()
+
     def flush(self) -> None:
         """See `Recorder`."""
         self._now.flush()

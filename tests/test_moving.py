@@ -351,18 +351,22 @@ def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.Monkey
 def test_messages_come_in_the_order_of_ticks() -> None:
     run = run_of(SceneFile("x", CELLS), program(), cycles=200)
     last, marks, next_exposure = 0, 0, 0
+    together: int | None = None
     while run.next_tick is not None:
         due, message = run.next_tick, run.emit()
         assert due >= last
         last = due
         if isinstance(message, wire.Mark):
-            assert due == message.tick == 1000 + 250 * message.exposure_index
+            assert message.tick == 1000 + 250 * message.exposure_index
+            together = due
             assert message.object_index == marks
             assert next_exposure <= message.exposure_index < next_exposure + 16  # before the block that holds it
             marks += 1
         else:
             assert message.object_index == wire.NO_OBJECT
             assert message.exposure_index == next_exposure
+            assert together in (None, due)  # a mark leaves with the block that holds its exposure
+            together = None
             next_exposure += len(message.words)
     assert next_exposure == 200 * 16
     assert marks > 300
