@@ -34,7 +34,8 @@ def test_the_judge_sees_a_decision_that_is_missing(tmp_path: Path, monkeypatch: 
         pass
 
     acted: list[int] = []
-    monkeypatch.setattr(Recorder, "flush", lambda self: None)
+    for name in ("flush", "flush_decisions"):
+        monkeypatch.setattr(Recorder, name, lambda self: None)
     monkeypatch.setattr(killrun.os, "write", lambda pipe, data: acted.append(killrun.ACTED.unpack(data)[0]))
     original = LiveRun.gate
 
