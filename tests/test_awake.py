@@ -11,7 +11,9 @@ import pytest
 from pans.runtime.awake import check_core, kept_awake
 from pans.runtime.errors import UsageError
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind threads to cores")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="this system does not bind threads to cores"
+)
 
 
 def spinners() -> list[threading.Thread]:
