@@ -122,7 +122,8 @@ _NOTES: dict[str, tuple[str, ...]] = {
         "= 16, dark counts 0.01, on the last 10 000 training objects, the others being trained on: 86.7 % there against 86.1 % "
         "before (24 epochs). A higher rate and decay of W made no difference, whitened inputs were far worse (74.6 %). These rows "
         "were trained again after held-out results short by up to 0.6 points; so were "
-        "d_f = 4 and 5 (four starts instead of two, then twice that with twice the epochs and 1.01 of the paper's clicks), and d_f = 32 once more, 0.03 points short, with 1.035 of the paper's clicks.",
+        "d_f = 4 and 5 (four starts instead of two, then twice that with twice the "
+        "epochs and 1.01 of the paper's clicks), and d_f = 32 once more, 0.03 points short, with 1.035 of the paper's clicks.",
     ),
 }
 _NOTES["mmf-mnist-image"] = (
