@@ -231,7 +231,7 @@ class Recorder:
 
     def flush_decisions(self) -> None:
         """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
-        self._flush(self._messages, self._decisions)
+        self._flush(self._commands, self._messages, self._decisions)
 
     def _flush(self, *buffers: _Rows | _Bytes) -> None:
         n_decisions = self._decisions.used

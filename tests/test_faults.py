@@ -351,13 +351,13 @@ def test_a_refusal_that_is_not_reported_is_found(monkeypatch: pytest.MonkeyPatch
 
 def test_memory_that_grows_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     hoard: list[bytearray] = []
-    frames = itertools.count()
-    original = session_module.HostSession.on_frame
+    turns = itertools.count()
+    original = session_module.HostSession.poll
 
-    def hoarding(self: session_module.HostSession, frame: wire.Frame, now_ns: int) -> bool:
-        if next(frames) % 32 == 0:  # pieces so large that each takes new pages, however much was freed before
+    def hoarding(self: session_module.HostSession, now_ns: int) -> None:
+        if next(turns) % 32 == 0:  # pieces so large that each takes new pages, however much was freed before
             hoard.append(bytearray(b"x" * (1 << 20)))
-        return original(self, frame, now_ns)
+        original(self, now_ns)
 
-    monkeypatch.setattr(session_module.HostSession, "on_frame", hoarding)
+    monkeypatch.setattr(session_module.HostSession, "poll", hoarding)
     assert found("none", "the process grew")

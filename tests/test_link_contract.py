@@ -468,8 +468,8 @@ class FifoPort:
         except BlockingIOError:
             return 0
 
-    def wait(self, timeout_s: float, wants_to_write: bool) -> None:
-        select.select([self._in], [self._out] if wants_to_write else [], [], timeout_s)
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
+        return bool(select.select([self._in], [self._out] if wants_to_write else [], [], timeout_s)[0])
 
     def hang_up(self) -> None:
         pass
