@@ -108,6 +108,7 @@ class LiveRun:
         self.start_ns = self.last_data_ns = 0
         self._counted: Connection | None = None
         self._recorder = recorder
+        self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
@@ -228,6 +229,9 @@ class LiveRun:
             self._book(output, arrival_ns, decoded_ns, outputs)
             if what.type == MessageType.STATUS and self.connection.session.status is not None:
                 self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
+        if self._broken is not None:
+            broken, self._broken = self._broken, None
+            raise broken
         return outputs
 
     def _take_messages(self, arrival_ns: int, messages: Messages, outputs: list[Output]) -> None:
@@ -249,8 +253,11 @@ class LiveRun:
             self.last_data_ns = arrival_ns
             self.outage_ns = None
             self.lateness.block_came(arrival_ns)
-        if output.actions:
-            self._act(self.now_ns())
+        if output.actions and self._broken is None:
+            try:
+                self._act(self.now_ns())
+            except LinkError as error:
+                self._broken = error
         outputs.append(output)
 
     def settle(self, output: Output) -> None:
