@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.trainer.heads import ConvHead, MlpHead, PictureHead, new_head
+from pans.trainer.heads import ConvHead, DecoderHead, MlpHead, PictureHead, new_head
 from pans.trainer.options import Options
 
 
@@ -24,13 +24,14 @@ def test_the_convolutional_head_is_valid_for_every_number_of_patterns(d_f):
     assert all(bool((parameter.grad != 0).any()) for parameter in head.convolutions.parameters())
 
 
-def test_the_picture_head_gives_pictures_of_the_wanted_shape():
-    head = head_of("picture", 4)
-    assert isinstance(head, PictureHead)
+@pytest.mark.parametrize(("kind", "made"), [("picture", PictureHead), ("decoder", DecoderHead)])
+def test_the_picture_heads_give_pictures_of_the_wanted_shape(kind, made):
+    head = head_of(kind, 4)
+    assert isinstance(head, made)
     assert head(torch.zeros(3, 4)).shape == (3, 54)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "conv", "picture"])
+@pytest.mark.parametrize("kind", ["mlp", "conv", "picture", "decoder"])
 def test_flipped_is_a_pass_of_every_flipped_word(kind):
     head = head_of(kind, 4).double()
     clicks = torch.randint(0, 2, (6, 4), generator=torch.Generator().manual_seed(2)).double()
@@ -43,7 +44,7 @@ def test_flipped_is_a_pass_of_every_flipped_word(kind):
             assert torch.allclose(found[:, i], head(other, mean), atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "conv", "picture"])
+@pytest.mark.parametrize("kind", ["mlp", "conv", "picture", "decoder"])
 def test_heads_start_from_the_generator_alone(kind):
     torch.manual_seed(1)
     first = head_of(kind, 6)

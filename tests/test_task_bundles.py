@@ -62,9 +62,11 @@ def made(tmp_path, name, **changed):
     return task, trained, path, export_trained(path, trained, task, PROFILE, name=name, provenance={})
 
 
-@pytest.mark.parametrize("name", task_names())
-def test_every_task_gives_a_bundle_that_decides_as_its_model(name, tmp_path):
-    task, trained, path, exported = made(tmp_path, name)
+@pytest.mark.parametrize(
+    ("name", "changed"), [*((name, {}) for name in task_names()), ("mmf-mnist-image", {"head": "decoder"})]
+)
+def test_every_task_gives_a_bundle_that_decides_as_its_model(name, changed, tmp_path):
+    task, trained, path, exported = made(tmp_path, name, **changed)
     bundle, digest = load_bundle(path)
     assert digest == exported.sha256
     assert exported.words_compared == 8

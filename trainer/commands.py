@@ -222,13 +222,13 @@ def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task:
 
 def _options(args: argparse.Namespace, task: Task) -> Options:
     """What the arguments mean for this task: its physics chooses the encoder, its question the head."""
-    from .options import DEFAULT_ALPHA, EXACT_FEATURES_MAX, Options
+    from .options import DEFAULT_ALPHA, EXACT_FEATURES_MAX, PICTURE_HEADS, Options
     from .tasks import physical_encoder
 
     encoder = args.encoder or physical_encoder(task)
     is_picture = task.target == "image"
     head = args.head or ("picture" if is_picture else "mlp")
-    if (head == "picture") != is_picture:
+    if (head in PICTURE_HEADS) != is_picture:
         raise UsageError(
             f"--head {head}: the task {task.name} asks for {'a picture' if is_picture else 'a class'}",
             remedy="leave --head out",

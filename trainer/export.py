@@ -32,7 +32,7 @@ from pans.runtime.profile import Profile
 
 from .conv_onnx import conv_nodes
 from .encoders import ActiveIllumination
-from .heads import EPSILON, ConvHead, Heads, MlpHead, PictureHead
+from .heads import EPSILON, ConvHead, Decoders, Heads, MlpHead, PictureHead
 from .int8_onnx import int8_onnx
 from .picture_onnx import picture_nodes
 from .tasks import Objects, Task
@@ -92,7 +92,7 @@ def head_onnx(head: Heads, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
         one = np.eye(len(click_mean))
         scale, offset, dead = fold_normalisation(one, np.zeros(len(click_mean)), gain, shift, click_mean)
         nodes, constants = conv_nodes(head, np.diag(scale), offset)
-    elif isinstance(head, PictureHead):
+    elif isinstance(head, Decoders):
         first, first_bias = (np.asarray(part.detach().double().numpy()) for part in head.hidden.parameters())
         weight, bias, dead = fold_normalisation(first, first_bias, gain, shift, click_mean)
         nodes, constants = picture_nodes(head, weight, bias)
@@ -143,14 +143,14 @@ def export(
     A head that gives back pictures has no `classes`. `check` may refuse what was read, by PansError.
     """
     graph, dead = head_onnx(head, click_mean)
-    is_picture = isinstance(head, PictureHead)
-    layers = None if is_picture else read_layers(graph, len(click_mean), len(classes))
+    picture_shape = head.image_shape if isinstance(head, Decoders) else None
+    layers = None if picture_shape else read_layers(graph, len(click_mean), len(classes))
     int8 = None if layers is None else quantise_head(layers)
     bundle = make_bundle(
         name=name,
         task=task,
-        classes=() if is_picture else classes,
-        picture_shape=head.image_shape if isinstance(head, PictureHead) else None,
+        classes=() if picture_shape else classes,
+        picture_shape=picture_shape,
         image_shape=image_shape,
         head_onnx=graph,
         int8_head=int8,

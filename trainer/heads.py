@@ -6,6 +6,7 @@ Owns the digital back end in torch; never samples. A head takes click means (n, 
 - `MlpHead`: one hidden layer, the paper's (512 units).
 - `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
 - `PictureHead`: an image decoder, from clicks to a coarse picture and by transposed convolutions to the full one.
+- `DecoderHead`: an image decoder of two hidden layers, the paper's (512 and 512 units); a tenth of the other's time per picture.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from .options import Options
+from .options import PICTURE_HEADS, Options
 
 KERNEL = 15
 CHANNELS = (32, 64)
@@ -61,12 +62,8 @@ class MlpHead(nn.Module):
         return scores
 
     def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return scores (n, d_f, classes): in column i click i is inverted. The hidden sums are made once and corrected."""
-        scale = self.norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
-        sums = self.hidden((clicks - mean) * scale + self.norm.bias)
-        columns = (self.hidden.weight * scale).T  # (d_f, hidden)
-        changed = torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0))
-        scores: Tensor = self.output(changed.relu_())
+        """Return scores (n, d_f, classes): in column i click i is inverted."""
+        scores: Tensor = self.output(_flipped_hidden(self.norm, self.hidden, clicks, mean))
         return scores
 
 
@@ -129,15 +126,52 @@ class PictureHead(nn.Module):
         return _flipped_one_by_one(self, clicks, mean)
 
 
-Heads = MlpHead | ConvHead | PictureHead
+class DecoderHead(nn.Module):
+    """Normalisation, two hidden layers with ReLU, pixels (paper: d_f, 512, 512, 784)."""
+
+    def __init__(
+        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        self.image_shape = image_shape
+        self.hidden = nn.Linear(n_features, n_hidden)
+        self.second = nn.Linear(n_hidden, n_hidden)
+        self.output = nn.Linear(n_hidden, image_shape[0] * image_shape[1])
+        _start(generator, self.hidden, self.second, self.output)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f); `mean` as in `ClickNorm`."""
+        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
+        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
+        return pixels
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
+        hidden = _flipped_hidden(self.norm, self.hidden, clicks, mean)
+        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
+        return pixels
+
+
+Decoders = PictureHead | DecoderHead  # what gives back pictures
+Heads = MlpHead | ConvHead | Decoders
 
 
 def new_head(options: Options, n_outputs: int, image_shape: tuple[int, int], random: torch.Generator) -> Heads:
     """Return the untrained head that `options` ask for; `image_shape` is that of the picture to give back."""
-    if options.head == "picture":
-        return PictureHead(options.features, options.hidden, image_shape, random)
+    if options.head in PICTURE_HEADS:
+        decoder = PictureHead if options.head == "picture" else DecoderHead
+        return decoder(options.features, options.hidden, image_shape, random)
     kind = ConvHead if options.head == "conv" else MlpHead
     return kind(options.features, options.hidden, n_outputs, random)
+
+
+def _flipped_hidden(norm: ClickNorm, layer: nn.Linear, clicks: Tensor, mean: Tensor) -> Tensor:
+    """Return the first hidden layer (n, d_f, hidden) with one click inverted each: its sums are made once and corrected."""
+    scale = norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
+    sums = layer((clicks - mean) * scale + norm.bias)
+    columns = (layer.weight * scale).T  # (d_f, hidden)
+    return torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0)).relu_()
 
 
 def _flipped_one_by_one(head: nn.Module, clicks: Tensor, mean: Tensor) -> Tensor:

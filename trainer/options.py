@@ -15,7 +15,8 @@ from pans.runtime.profile import Profile
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
-HEADS = ("mlp", "conv", "picture")
+PICTURE_HEADS = ("picture", "decoder")  # heads.py
+HEADS = ("mlp", "conv", *PICTURE_HEADS)
 # (gain on the relative excess, least weight). Firm: the full rate from an excess of 20 % on, and a weight never so small that it
 # would not be back in time; it meets tight budgets. Gentle: the light is spent first and given back late, which found better patterns.
 BUDGETS = {"firm": (5.0, 3e-4), "gentle": (1.0, 1e-5)}
