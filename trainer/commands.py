@@ -127,6 +127,13 @@ def _configure_details(parser: argparse.ArgumentParser) -> None:
         help="move training images by up to X along the rows (default 0)",
     )
     parser.add_argument("--offset-px", type=int, default=0, metavar="Y", help="and by up to Y across them (default 0)")
+    parser.add_argument(
+        "--copies",
+        type=int,
+        default=0,
+        metavar="N",
+        help="add N distorted copies of every training image: turned, stretched, bent a little (default 0)",
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
     parser.add_argument("--hidden", type=int, default=512, metavar="H", help="hidden units of the head (default 512)")
     parser.add_argument(
@@ -241,7 +248,7 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     same = (
         "features photons clicks epochs restarts starts warm polish mix shots seed hidden batch slope clamp dark budget"
     )
-    same += " similarity complex_field conserving input_photons shift_px offset_px"
+    same += " similarity complex_field conserving input_photons shift_px offset_px copies"
     return Options(
         alpha=alpha,
         estimator=estimator,

@@ -60,6 +60,7 @@ class Options:
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
     shift_px: int = 0  # training images are moved by up to that much along the rows, for objects that pass by
     offset_px: int = 0  # and across them
+    copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
 
 
 def check_options(options: Options, profile: Profile) -> None:
@@ -81,6 +82,7 @@ def check_options(options: Options, profile: Profile) -> None:
         "mix": (0, 1),
         "shift_px": (0, 65536),
         "offset_px": (0, 65536),
+        "copies": (0, 1000),
     }
     for name, (low, high) in limits.items():
         if not low <= getattr(options, name) <= high:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.incident import incident_field
@@ -166,9 +167,9 @@ def load(name: str, data_dir: str | None, data_seed: int = 0) -> Task:
     task = load_task(TASKS.get(name, name), data_dir, data_seed=data_seed)
     if task.optics != "mmf":
         return task
-    return replace(task, light="field", optics="none", train=_speckle(task.train), test=_speckle(task.test))
+    train, test = (Objects(_speckle(part.images), part.labels, behind=part.images) for part in (task.train, task.test))
+    return replace(task, light="field", optics="none", train=train, test=test, imaged=_speckle)
 
 
-def _speckle(objects: Objects) -> Objects:
-    speckle = task_mmf.release_intensity(objects.images)
-    return Objects(np.rint(255 * speckle).astype(np.uint8), objects.labels, behind=objects.images)
+def _speckle(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.rint(255 * task_mmf.release_intensity(images)).astype(np.uint8)

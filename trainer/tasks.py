@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,7 @@ class Task:
     optics: Optics = "none"  # between the scene and a passive encoder
     target: str = "class"  # what is asked for: the class, or the `image`
     source: str = ""  # of drawn images: whose generator, which seed
+    imaged: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None  # makes images of what is behind them
 
     @property
     def image_shape(self) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from pans.runtime.incident import incident_field, incident_intensity
 from pans.runtime.profile import Profile
 
 from .device import here
+from .distort import with_copies
 from .options import Options
 from .shifts import shifted
 from .tasks import Objects, Task
@@ -33,11 +34,13 @@ class TrainingData:
 
     def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
-        placed = shifted(task.train, options.shift_px, options.offset_px, options.seed)
+        n_validation = max(1, len(task.train) // VALIDATION_PART)
+        objects = with_copies(task.train, n_validation, options.copies, options.seed, task.imaged)
+        placed = shifted(objects, options.shift_px, options.offset_px, options.seed)
         self.shown = encoder_input(task, placed, profile, options)
         if basis is not None:
             self.shown = self.shown @ basis
-        self.labels = torch.from_numpy(task.train.labels)
+        self.labels = torch.from_numpy(placed.labels)
         self.image_shape = task.image_shape
         self.is_image = task.target == "image"
         if self.is_image:
@@ -47,7 +50,7 @@ class TrainingData:
             self.target, self.n_outputs = self.labels, len(task.classes)
         self.shown, self.labels, self.target = here(self.shown), here(self.labels), here(self.target)
         self.picture_shape = self.image_shape if self.is_image else None  # of what is to be given back
-        self.n_fit = len(self.labels) - max(1, len(self.labels) // VALIDATION_PART)
+        self.n_fit = len(self.labels) - n_validation
 
 
 def encoder_input(task: Task, objects: Objects, profile: Profile, options: Options) -> Tensor:
