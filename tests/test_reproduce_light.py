@@ -16,6 +16,7 @@ from pans.trainer.options import Options
 from pans.trainer.paper_tables import UNPRINTED
 from pans.trainer.passive_recipes import basis_of, recipe
 from pans.trainer.report_passive import markdown as passive_page
+from pans.trainer.reproduce_page import Asked
 from pans.trainer.tasks import Objects, Task
 
 
@@ -37,8 +38,8 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     monkeypatch.setattr(equal, "load_task", lambda *_: loaded.append(1) or columns(900, 6, 3))
     small = Options(features=3, alpha=0.0, photons=2.9, epochs=12, hidden=16, batch=50, front_rate=3e-2, head_rate=1e-2)
     monkeypatch.setattr(equal, "recipe", lambda *_: small)
-    assert equal.equal_table(tmp_path, None, True, print)["rows"] == []
-    found = equal.equal_table(tmp_path, None, False, lambda _line: None)
+    assert equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"] == []
+    found = equal.equal_table(Asked("equal-photons", tmp_path, report=lambda _line: None))
     rows = {row["way"]: row for row in found["rows"]}
     assert set(rows) == {"PANS", "posterior", "network"}  # light is made for an active task
     for way in ("posterior", "network"):
@@ -47,7 +48,7 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     assert rows["posterior"]["value"] > 45
     assert rows["PANS"]["illumination"] > 0
     assert len(loaded) == 2
-    again = equal.equal_table(tmp_path, None, False, print)
+    again = equal.equal_table(Asked("equal-photons", tmp_path))
     assert json.dumps(again["rows"]) == json.dumps(found["rows"])
     assert len(loaded) == 2
 
@@ -91,7 +92,7 @@ def test_light_shots_and_dark_counts_are_swept_each_alone(tmp_path, monkeypatch)
     monkeypatch.setattr(sweeps, "DARKS", (1e-3, 1.0))
     monkeypatch.setattr(sweeps, "TRIALS_OF_ALL", 2)
     monkeypatch.setattr(sweeps, "TRIALS", {})
-    found = sweeps.sweep_table(None, lambda _line: None)
+    found = sweeps.sweep_table(Asked("sweeps", tmp_path, report=lambda _line: None))
     of = {(row["sweep"], row["setting"]): row["all"] for row in found["rows"]}
     one = of["eta", 1.0]
     assert of["K", 1.0] == one
@@ -113,7 +114,7 @@ def test_information_of_frames_and_words_stands_at_the_same_photons(tmp_path, mo
     monkeypatch.setattr(information, "PHOTONS", (1.0, 30.0, 300.0))
     monkeypatch.setattr(information, "POSTERIOR_MAX", 30.0)
     monkeypatch.setattr(information, "FRAMES", 300)
-    found = information.information_table(None, lambda _line: None)
+    found = information.information_table(Asked("fig-2c", tmp_path, report=lambda _line: None))
     of = {(row["way"], row["photons"]): row for row in found["rows"]}
     assert of["frames", 30.0]["bits"] > of["frames", 1.0]["bits"] > 0.05
     assert 0.1 < of["click words", 1.0]["bits"] < np.log2(10)

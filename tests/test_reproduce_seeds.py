@@ -13,6 +13,7 @@ from pans.trainer import reproduce_time as race
 from pans.trainer.options import Options, plain_options
 from pans.trainer.paper_tables import ACTIVE, ActiveRow
 from pans.trainer.report_active import markdown
+from pans.trainer.reproduce_page import Asked
 from pans.trainer.tasks import Objects, Task
 
 ROW = ActiveRow(3, (40.0,) * 4, (40.0,) * 4, 1.5, 9.0)
@@ -76,7 +77,7 @@ def test_the_papers_recipe_is_given_ten_times_the_seconds_of_all_our_tries(tmp_p
             return figures | dict.fromkeys(numbers, 1.0)
 
     monkeypatch.setattr(race, "_Judge", Judge)
-    found = race.time_table(tmp_path, [32], None, lambda _line: None)
+    found = race.time_table(Asked("time", tmp_path, rows=(32,), report=lambda _line: None))
     *ours, (paper, cap) = given
     assert [options.epochs for options, _ in ours] == [8, 12, 18]  # from short to long, until one reaches the goal
     assert all((options.shots, options.mix, options.restarts) == (1, 0.0, 1) for options, _ in ours)
@@ -84,5 +85,5 @@ def test_the_papers_recipe_is_given_ten_times_the_seconds_of_all_our_tries(tmp_p
     assert (paper.front_rate, paper.head_rate, paper.batch) == (1e-3, 1e-4, 128)
     assert cap == pytest.approx(race.CAP * (8 + 12 + 18))
     assert "more than 10.1 times, if the shorter schedules" in found["markdown"]
-    race.time_table(tmp_path, [32], None, lambda _line: None)
+    race.time_table(Asked("time", tmp_path, rows=(32,), report=lambda _line: None))
     assert len(given) == 4  # kept

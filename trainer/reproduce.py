@@ -7,9 +7,9 @@ Finished rows lie in a cache folder: a killed run goes on, and several processes
 from __future__ import annotations
 
 import argparse
-import json
-import os
+import importlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
 
 from .paper_tables import ACTIVE, PASSIVE, UNPRINTED
+from .reproduce_page import Asked, Draw, write_page
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
-NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -35,7 +35,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="another draw of a drawn task (default 0); the page of draw 0 names the finished cells of others beside its own",
     )
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
-    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and NAME.png there")
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and the pictures there")
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
     parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
@@ -56,6 +56,8 @@ def _run(args: argparse.Namespace) -> int:
     try:
         for name in NAMES if args.name == "all" else (args.name,):
             results[name] = NAMES[name](name, args)
+            if args.out:
+                write_page(args.out, name, results[name])
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
         return EXIT_INTERRUPTED
@@ -84,10 +86,9 @@ def _active(name: str, args: argparse.Namespace) -> dict[str, Any]:
         ahead, clicks_fine = active.passed(row, figures)
         say(f"{name} d_f={row.features}: {ahead:+.2f} points, clicks {'fine' if clicks_fine else 'above +5 %'}")
     text = markdown(name, done)
-    result = {"rows": [{"task": name, "paper": _facts(row), **figures} for row, figures in done], "markdown": text}
-    if args.out:
-        _write(args.out, name, result, lambda path: accuracy_against_photons(path, name, done))
-    return result
+    rows = [{"task": name, "paper": _facts(row), **figures} for row, figures in done]
+    pictures = {"": partial(accuracy_against_photons, name=name, done=done)}
+    return {"rows": rows, "markdown": text, "pictures": pictures}
 
 
 def _facts(row: Any) -> dict[str, Any]:
@@ -125,84 +126,33 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
             if not args.data_seed:
                 others += [(row, other) for other in passive.other_draws(args.cache, name, row, dark)]
     text = markdown(name, done, others)
-    result = {"rows": [figures for _, figures in done + others], "markdown": text}
-    if args.out:
-        _write(args.out, name, result, lambda path: measure_over_patterns(path, name, done))
-        if samples := passive.samples_of(args.cache, name, done):
-            draw_samples(args.out / f"{name}-pictures.png", name, samples)
-    return result
+    pictures: dict[str, Draw] = {"": partial(measure_over_patterns, name=name, done=done)}
+    if samples := passive.samples_of(args.cache, name, done):
+        pictures["-pictures"] = partial(draw_samples, name=name, cells=samples)
+    return {"rows": [figures for _, figures in done + others], "markdown": text, "pictures": pictures}
 
 
-def _estimators(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from .reproduce_estimators import estimator_table
-
-    result = estimator_table(args.cache, args.data_dir, say)
-    if args.out:
-        _write(args.out, name, result, None)
-    return result
-
-
-def _time(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from .reproduce_time import time_table
-
-    result = time_table(args.cache, args.rows, args.data_dir, say)
-    if args.out:
-        _write(args.out, name, result, None)
-    return result
+def _page(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Measure a page of `PAGES`."""
+    module, _, function = PAGES[name].partition(":")
+    measure = getattr(importlib.import_module(f".{module}", __package__), function)
+    rows = None if args.rows is None else tuple(args.rows)
+    page: dict[str, Any] = measure(Asked(name, args.cache, rows, args.data_dir, args.collect, say))
+    return page
 
 
-def _equal(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from .reproduce_equal import equal_table
-
-    result = equal_table(args.cache, args.data_dir, args.collect, say)
-    if args.out:
-        _write(args.out, name, result, None)
-    return result
-
-
-def _sweeps(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from .figures_light import sweeps
-    from .reproduce_sweeps import sweep_table
-
-    result = sweep_table(args.data_dir, say)
-    if args.out:
-        _write(args.out, name, result, lambda path: sweeps(path, result["rows"]))
-    return result
-
-
-def _information(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from .figures_light import information
-    from .reproduce_information import information_table
-
-    result = information_table(args.data_dir, say)
-    if args.out:
-        _write(args.out, name, result, lambda path: information(path, result["rows"]))
-    return result
-
-
-def _write(folder: Path, name: str, result: dict[str, Any], draw: Callable[[Path], None] | None) -> None:
-    """Write NAME.json, NAME.md and, where `draw` is given, NAME.png, each whole or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    texts = {"json": json.dumps({"rows": result["rows"], "simulated": True}, indent=1) + "\n", "md": result["markdown"]}
-    for suffix, text in texts.items():
-        beside = folder / f"{name}.{suffix}.part"
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, folder / f"{name}.{suffix}")
-    if draw is not None:
-        try:
-            draw(folder / f"{name}.png")
-        except ModuleNotFoundError as error:
-            raise UsageError("the picture needs matplotlib, which is not installed", remedy=NEEDS_PLOT) from error
-
+PAGES = {  # name: module and function that measure it (imported when asked for)
+    "estimators": "reproduce_estimators:estimator_table",
+    "time": "reproduce_time:time_table",
+    "equal-photons": "reproduce_equal:equal_table",
+    "sweeps": "reproduce_sweeps:sweep_table",
+    "fig-2c": "reproduce_information:information_table",
+}
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
     **dict.fromkeys(ACTIVE, _active),
     **dict.fromkeys([*PASSIVE, *UNPRINTED], _passive),
-    "estimators": _estimators,
-    "time": _time,
-    "equal-photons": _equal,
-    "sweeps": _sweeps,
-    "fig-2c": _information,
+    **dict.fromkeys(PAGES, _page),
 }
 
 REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)

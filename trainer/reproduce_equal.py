@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from .baselines import run_trials
 from .field_basis import principal_fields
 from .options import EXACT_FEATURES_MAX, Options, plain_options, same_options
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
+from .reproduce_page import Asked
 from .reproduce_passive import PROFILE, measure
 from .tasks import Objects, Task, load_task
 from .train import train
@@ -80,7 +80,7 @@ def light_recipe(name: str, photons: float) -> Options:
     return replace(fields, conserving=True, input_photons=photons)
 
 
-def equal_table(cache: Path, data_dir: str | None, collect: bool, report: Callable[[str], None]) -> dict[str, Any]:
+def equal_table(asked: Asked) -> dict[str, Any]:
     """Return one row per task, way and level, and the Markdown; with `collect` only what is finished."""
     rows = []
     for ways in (WAYS[:3], WAYS[3:]):  # the networks last: they take longest
@@ -88,12 +88,12 @@ def equal_table(cache: Path, data_dir: str | None, collect: bool, report: Callab
             task = None
             wanted = [way for way in ways if way != "equal light" or name in FIELD_RATES]
             for way, photons in ((way, photons) for way in wanted for photons in PHOTONS):
-                path = cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
+                path = asked.cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
                 found = _finished(path, name, way, photons)
-                if found is None and not collect:
-                    task = task or load_task(name, data_dir)
+                if found is None and not asked.collect:
+                    task = task or load_task(name, asked.data_dir)
                     found = _made(path, task, way, photons)
-                    report(f"{name}, {way}, {photons:g} photons: {found['value']:.2f} %")
+                    asked.report(f"{name}, {way}, {photons:g} photons: {found['value']:.2f} %")
                 if found is not None:
                     rows.append(found)
     return {"rows": rows, "markdown": markdown(rows)}

@@ -26,6 +26,7 @@ from .detection import click_probability, click_words
 from .estimators import ESTIMATORS, cross_entropy
 from .head_fit import joint_distribution
 from .options import Options
+from .reproduce_page import Asked
 from .tasks import load_task
 from .train import Trained, train
 
@@ -81,8 +82,9 @@ def gradient_rows(trained: Trained, images: Tensor, labels: Tensor, epochs: int)
     return rows
 
 
-def estimator_table(cache: Path, data_dir: str | None, report: Callable[[str], None]) -> dict[str, Any]:
-    """Return rows and Markdown; finished parts lie in `cache`."""
+def estimator_table(asked: Asked) -> dict[str, Any]:
+    """Return rows and Markdown; finished parts lie in the cache."""
+    cache, data_dir, report = asked.cache, asked.data_dir, asked.report
     task, profile = load_task("fashion-mnist", data_dir), load_profile("ideal")
     shown = torch.from_numpy(object_transmission(profile, task.test.images.reshape(len(task.test), -1), "float32"))
     labels = torch.from_numpy(task.test.labels)

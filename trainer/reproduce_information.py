@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,12 @@ import numpy as np
 from pans.runtime.clicks import ClickLaw, click_probability
 from pans.runtime.profile import load_profile
 
+from . import figures_light
 from .baseline_bayes import log_joint
 from .baselines import Measurement, detect, measure
 from .evaluate import light_of
 from .information import fisher, fisher_of_frames, posterior_information, word_information
+from .reproduce_page import Asked
 from .reproduce_sweeps import shipped_bundle
 from .tasks import Objects, Task, load_task
 
@@ -32,13 +35,14 @@ FISHER_OBJECTS = 6000
 PAPER = "falls below 10^4 to 10^5 photons"
 
 
-def information_table(data_dir: str | None, report: Callable[[str], None]) -> dict[str, Any]:
+def information_table(asked: Asked) -> dict[str, Any]:
     """Return one row per way and photon level, and the Markdown."""
     bundle = shipped_bundle()
-    task = load_task(bundle.task, data_dir)
+    task = load_task(bundle.task, asked.data_dir)
     test = Objects(task.test.images[:FRAMES], task.test.labels[:FRAMES])
-    rows = _frames(replace(task, test=test), report)
-    return {"rows": (whole := rows + _words(task, report)), "markdown": markdown(whole, bundle.name)}
+    rows = _frames(replace(task, test=test), asked.report) + _words(task, asked.report)
+    pictures = {"": partial(figures_light.information, rows=rows)}
+    return {"rows": rows, "markdown": markdown(rows, bundle.name), "pictures": pictures}
 
 
 def _frames(task: Task, report: Callable[[str], None]) -> list[dict[str, Any]]:

@@ -7,8 +7,8 @@ Owns which settings are measured and the page; the figures come from evaluate.py
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ import numpy as np
 from pans.runtime.bundle import Bundle, load_bundle
 from pans.runtime.profile import load_profile
 
+from . import figures_light
 from .evaluate import Light, Measured, evaluate_exactly, evaluate_sampled, light_of
 from .paper_tables import FIRST_OBJECTS
+from .reproduce_page import Asked
 from .tasks import Objects, load_task
 
 SHOTS = (1, 2, 3, 5, 8, 13, 21)
@@ -34,10 +36,10 @@ def shipped_bundle() -> Bundle:
     return load_bundle(Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans")))[0]
 
 
-def sweep_table(data_dir: str | None, report: Callable[[str], None]) -> dict[str, Any]:
+def sweep_table(asked: Asked) -> dict[str, Any]:
     """Return one row per setting (`sweep`, `setting`, `first_200`, `all`) and the Markdown."""
     bundle = shipped_bundle()
-    profile, test = load_profile(str(bundle.provenance["profile"])), load_task(bundle.task, data_dir).test
+    profile, test = load_profile(str(bundle.provenance["profile"])), load_task(bundle.task, asked.data_dir).test
     parts = {f"first_{FIRST_OBJECTS}": Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS]), "all": test}
     settings = [("K", float(k)) for k in SHOTS] + [("eta", eta) for eta in ETAS] + [("dark", dark) for dark in DARKS]
     rows = []
@@ -52,9 +54,10 @@ def sweep_table(data_dir: str | None, report: Callable[[str], None]) -> dict[str
                 dark=setting if sweep == "dark" else None,
             )
             row[part] = asdict(_measured(bundle, light, objects, int(setting) if sweep == "K" else 1))
-        report(f"{SWEEPS[sweep]} {setting:.3g}: {100 * row['all']['accuracy_mean']:.2f} %")
+        asked.report(f"{SWEEPS[sweep]} {setting:.3g}: {100 * row['all']['accuracy_mean']:.2f} %")
         rows.append(row)
-    return {"rows": rows, "markdown": markdown(rows, bundle.name, profile.name)}
+    pictures = {"": partial(figures_light.sweeps, rows=rows)}
+    return {"rows": rows, "markdown": markdown(rows, bundle.name, profile.name), "pictures": pictures}
 
 
 def _measured(bundle: Bundle, light: Light, objects: Objects, shots: int) -> Measured:

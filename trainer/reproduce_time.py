@@ -18,7 +18,6 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,6 +29,7 @@ from .detection import click_probability, sample_clicks
 from .options import Options
 from .paper_tables import ACTIVE, CLICKS_TOLERANCE, FIRST_OBJECTS, ActiveRow
 from .reproduce_active import recipe
+from .reproduce_page import Asked
 from .tasks import load_task
 from .train import Run
 from .training_data import TrainingData, encoder_input
@@ -41,16 +41,14 @@ CAP = 10.1
 TRIALS = 100
 
 
-def time_table(
-    cache: Path, rows: list[int] | None, data_dir: str | None, report: Callable[[str], None]
-) -> dict[str, Any]:
-    """Return rows and Markdown; finished rows lie in `cache`."""
+def time_table(asked: Asked) -> dict[str, Any]:
+    """Return rows and Markdown; finished rows lie in the cache."""
     found = []
     for row in ACTIVE[TASK]:
-        if row.features in (rows or ROWS):
-            path = cache / f"time-{row.features}.json"
+        if row.features in (asked.rows or ROWS):
+            path = asked.cache / f"time-{row.features}.json"
             if not path.is_file():
-                made = _race(row, data_dir, report)
+                made = _race(row, asked.data_dir, asked.report)
                 beside = path.with_suffix(".part")
                 beside.write_text(json.dumps(made, indent=1))
                 os.replace(beside, path)
