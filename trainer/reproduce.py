@@ -147,6 +147,10 @@ PAGES = {  # name: module and function that measure it (imported when asked for)
     "equal-photons": "reproduce_equal:equal_table",
     "sweeps": "reproduce_sweeps:sweep_table",
     "fig-2c": "reproduce_information:information_table",
+    "fig-3": "reproduce_shots:fig_3_page",
+    "multi-shot": "reproduce_shots:multi_shot_page",
+    "alpha": "reproduce_alpha:alpha_page",
+    "evolution": "reproduce_alpha:evolution_page",
 }
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
