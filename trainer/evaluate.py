@@ -91,6 +91,14 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
 
     `accuracy_std` is then the exact spread that trials over these objects would show.
     """
+    right = decision_shares(bundle, light, shots=shots)[np.arange(len(labels)), labels]
+    n = len(labels)
+    over_trials = math.sqrt(float((right * (1 - right)).sum())) / n
+    return _measured(light, right, over_trials, trials=0, shots=shots)
+
+
+def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
+    """Return P(decided class | object), float64 (n, classes), by enumeration of all (shots + 1)**d_f count vectors."""
     outcomes = (shots + 1) ** bundle.n_features
     if outcomes > EXACT_OUTCOMES_MAX:
         raise UsageError(
@@ -100,18 +108,22 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
     digits = (shots + 1) ** np.arange(bundle.n_features)
     counts = (np.arange(outcomes)[:, None] // digits) % (shots + 1)
     decided = make_decider(bundle, shots=shots).decide_batch(counts, shots)
-    right = np.empty(len(labels))
+    of_class = np.eye(bundle.n_classes)[decided]
+    shares = np.empty((len(light.probability), bundle.n_classes))
     step = max(1, _CHUNK_NUMBERS // outcomes)
-    for start in range(0, len(labels), step):
-        chance = outcome_probabilities(light.probability[start : start + step], shots)
-        wanted = labels[start : start + step]
-        for label in np.unique(wanted):
-            rows = np.flatnonzero(wanted == label)
-            right[start + rows] = chance[rows][:, decided == label].sum(axis=1)
-    right = np.clip(right, 0.0, 1.0)
-    n = len(labels)
-    over_trials = math.sqrt(float((right * (1 - right)).sum())) / n
-    return _measured(light, right, over_trials, trials=0, shots=shots)
+    for start in range(0, len(shares), step):
+        shares[start : start + step] = outcome_probabilities(light.probability[start : start + step], shots) @ of_class
+    return np.clip(shares, 0.0, 1.0)
+
+
+def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int, seed: int) -> F64:
+    """Return the share of `trials` decisions per object and class, float64 (n, classes)."""
+    decider, rng = make_decider(bundle, shots=shots), np.random.default_rng(seed)
+    objects = np.arange(len(light.probability))
+    shares = np.zeros((len(objects), bundle.n_classes))
+    for _ in range(trials):
+        shares[objects, decider.decide_batch(rng.binomial(shots, light.probability), shots)] += 1 / trials
+    return shares
 
 
 def outcome_probabilities(probability: F64, shots: int) -> F64:

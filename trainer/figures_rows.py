@@ -101,3 +101,31 @@ def fig_3(path: Path, rows: list[dict[str, Any]]) -> None:
         axis.legend(loc="lower right", fontsize=9)
     figure.suptitle("bars: spread of one trial; numbers: our clicks per decision, all images (SIMULATED)", fontsize=10)
     save_figure(figure, path)
+
+
+def robustness(path: Path, rows: list[dict[str, Any]], sweep: str) -> None:
+    """Draw accuracy over the light or the dark counts, one curve per d_f: the paper's images, and all."""
+    label, mark = {"eta": ("light, times the trained (eta)", 1.0), "dark": ("dark counts of an exposure", 0.1)}[sweep]
+    figure, panels = new_figure(width=11.0, height=4.8)
+    swept = [row for row in rows if row["setting"] != "trained"]
+    for axis, (part, words) in zip(panels, ((FIRST, f"first {FIRST_OBJECTS}"), ("all", "all 10 000"))):
+        for i, row in enumerate(ACTIVE["fashion-mnist"]):
+            curve = [point for point in swept if point["features"] == row.features]
+            axis.errorbar(
+                [point["setting"] for point in curve],
+                [100 * point[part]["accuracy_mean"] for point in curve],
+                [100 * point[part]["accuracy_std"] for point in curve],
+                fmt="o-",
+                ms=3,
+                lw=1.1,
+                capsize=2,
+                color=f"C{i}",
+                label=f"d_f = {row.features}",
+            )
+        axis.axvline(mark, color="grey", lw=0.8, ls=":")
+        axis.axhline(10, color="grey", lw=0.8, ls="--")
+        axis.set(xscale="log", xlabel=label, ylabel="accuracy, %", title=f"FashionMNIST, {words}, K = 1", ylim=(0, 90))
+        axis.grid(alpha=0.3)
+    panels[1].legend(fontsize=8, loc="lower center" if sweep == "eta" else "lower left")
+    figure.suptitle("bars: spread of one trial; dashed: guessing (SIMULATED)", fontsize=10)
+    save_figure(figure, path)

@@ -147,10 +147,15 @@ PAGES = {  # name: module and function that measure it (imported when asked for)
     "equal-photons": "reproduce_equal:equal_table",
     "sweeps": "reproduce_sweeps:sweep_table",
     "fig-2c": "reproduce_information:information_table",
+    "dark-counts": "reproduce_robust:dark_page",
+    "eta": "reproduce_robust:eta_page",
     "fig-3": "reproduce_shots:fig_3_page",
     "multi-shot": "reproduce_shots:multi_shot_page",
     "alpha": "reproduce_alpha:alpha_page",
     "evolution": "reproduce_alpha:evolution_page",
+    "fig-2e": "reproduce_paradigms:fig_2e_page",
+    "end-to-end": "reproduce_paradigms:end_to_end_page",
+    "compressive": "reproduce_sensing:compressive_page",
 }
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {

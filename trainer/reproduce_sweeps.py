@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle import Bundle, load_bundle
-from pans.runtime.profile import load_profile
+from pans.runtime.profile import Profile, load_profile
 
 from . import figures_light
 from .evaluate import Light, Measured, evaluate_exactly, evaluate_sampled, light_of
@@ -28,6 +28,7 @@ ETAS = tuple(10.0 ** (exponent / 4) for exponent in range(-8, 9))
 DARKS = tuple(10.0 ** (exponent / 4) for exponent in range(-12, 1))
 TRIALS = {FIRST_OBJECTS: 100}
 TRIALS_OF_ALL = 10
+EXACT_WORK_MAX = 1 << 25  # objects times click words
 SWEEPS = {"K": "shots", "eta": "all light times", "dark": "dark counts of an exposure"}
 
 
@@ -40,28 +41,39 @@ def sweep_table(asked: Asked) -> dict[str, Any]:
     """Return one row per setting (`sweep`, `setting`, `first_200`, `all`) and the Markdown."""
     bundle = shipped_bundle()
     profile, test = load_profile(str(bundle.provenance["profile"])), load_task(bundle.task, asked.data_dir).test
-    parts = {f"first_{FIRST_OBJECTS}": Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS]), "all": test}
     settings = [("K", float(k)) for k in SHOTS] + [("eta", eta) for eta in ETAS] + [("dark", dark) for dark in DARKS]
     rows = []
     for sweep, setting in settings:
-        row: dict[str, Any] = {"sweep": sweep, "setting": setting}
-        for part, objects in parts.items():
-            light = light_of(
-                bundle,
-                profile,
-                objects.images,
-                eta=setting if sweep == "eta" else 1.0,
-                dark=setting if sweep == "dark" else None,
-            )
-            row[part] = asdict(_measured(bundle, light, objects, int(setting) if sweep == "K" else 1))
+        row = measure_setting(bundle, profile, test, sweep, setting)
         asked.report(f"{SWEEPS[sweep]} {setting:.3g}: {100 * row['all']['accuracy_mean']:.2f} %")
         rows.append(row)
     pictures = {"": partial(figures_light.sweeps, rows=rows)}
     return {"rows": rows, "markdown": markdown(rows, bundle.name, profile.name), "pictures": pictures}
 
 
+def measure_setting(bundle: Bundle, profile: Profile, test: Objects, sweep: str, setting: float) -> dict[str, Any]:
+    """Return what `bundle` does where one thing of `SWEEPS` is set otherwise: `sweep`, `setting`, `first_200`, `all`."""
+    row: dict[str, Any] = {"sweep": sweep, "setting": setting}
+    eta, dark = setting if sweep == "eta" else 1.0, setting if sweep == "dark" else None
+    for part, objects in parts_of(test).items():
+        light = light_of(bundle, profile, objects.images, eta=eta, dark=dark)
+        row[part] = asdict(_measured(bundle, light, objects, int(setting) if sweep == "K" else 1))
+    return row
+
+
+def parts_of(test: Objects) -> dict[str, Objects]:
+    """Return the first test objects, which the paper takes, and all of them."""
+    first = Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS])
+    return {f"first_{FIRST_OBJECTS}": first, "all": test}
+
+
+def enumerable(bundle: Bundle, objects: int) -> bool:
+    """Return whether a page enumerates all click words of one shot for that many objects, or samples them."""
+    return objects << bundle.n_features <= EXACT_WORK_MAX
+
+
 def _measured(bundle: Bundle, light: Light, objects: Objects, shots: int) -> Measured:
-    if shots == 1:
+    if shots == 1 and enumerable(bundle, len(objects)):
         return evaluate_exactly(bundle, light, objects.labels)
     trials = TRIALS.get(len(objects), TRIALS_OF_ALL)
     return evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=1)

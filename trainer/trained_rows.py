@@ -14,10 +14,9 @@ from typing import Any
 from pans.runtime.bundle import Bundle, load_bundle
 
 from .kept import kept
-from .paper_tables import ACTIVE, FIRST_OBJECTS, ActiveRow
+from .paper_tables import ACTIVE, ActiveRow
 from .reproduce_active import PROFILE, finished_row, row_files
 from .reproduce_page import Asked
-from .tasks import Objects
 
 SPREADS_SAY = (
     "`trials` is the spread of one trial, `objects` the standard error from having few images; accuracies in %. Clicks, photons and "
@@ -70,12 +69,6 @@ def measured_on(
 
     path = asked.cache / f"{asked.name}-{row.table}-{row.features}.json"
     return kept(path, {"sha256": row.sha256, **facts}, measured, collect=asked.collect)
-
-
-def parts_of(test: Objects) -> dict[str, Objects]:
-    """Return the first test objects, which the paper takes, and all of them."""
-    first = Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS])
-    return {f"first_{FIRST_OBJECTS}": first, "all": test}
 
 
 def rows_say(table: str, rows: list[TrainedRow]) -> list[str]:
