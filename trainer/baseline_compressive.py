@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
 
-from .baseline_nets import decider, feature_net, fit, poisson, seeded
-from .baselines import Decide, Measurement, Report, silent
+from .baseline_nets import EpochOfFit, decider, feature_net, fit, poisson, seeded
+from .baselines import Decide, Measurement, Report, named, silent
 
 FAMILIES = ("binary", "hadamard")
 EPOCHS = 10
 
 F64 = NDArray[np.float64]
+Watch = Callable[[EpochOfFit, Decide], None]
 
 
 def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) -> F64:
@@ -74,23 +75,29 @@ def aware_mlp(
         shown = measurement.photoelectrons(measurement.train[which.numpy()], photons)
         return poisson(torch.from_numpy(shown), detector, generator, dark)
 
-    what = f"noise-aware MLP at {photons:g} photons"
-    return decider(_fitted(measurement, readouts, seed, epochs, what, report))
+    return decider(
+        _fitted(measurement, readouts, seed, epochs, named(f"noise-aware MLP at {photons:g} photons", report))
+    )
 
 
 def clean_mlp(
-    measurement: Measurement, *, seed: int, epochs: int = EPOCHS, report: Report = silent
+    measurement: Measurement,
+    *,
+    seed: int,
+    epochs: int = EPOCHS,
+    report: Report = silent,
+    watch: Watch = lambda _epoch, _decide: None,
 ) -> Callable[[float, str], Decide]:
     """Return (photons, detector) -> decision, by one feature network that was trained on noiseless features.
 
     Counts are divided by the exposure, clicks by their mean over that of the clean features: the network then sees features
-    of the size that it knows.
+    of the size that it knows. `watch` is called after every epoch, with what the network decides then on noiseless features.
     """
 
     def features(which: torch.Tensor, _generator: torch.Generator) -> torch.Tensor:
         return torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], 1.0))
 
-    decide = decider(_fitted(measurement, features, seed, epochs, "MLP on clean features", report))
+    decide = decider(_fitted(measurement, features, seed, epochs, named("MLP on clean features", report), watch))
     return lambda photons, detector: lambda readouts: decide(readouts / size(measurement, photons, detector))
 
 
@@ -107,10 +114,11 @@ def _fitted(
     inputs: Callable[[torch.Tensor, torch.Generator], torch.Tensor],
     seed: int,
     epochs: int,
-    what: str,
     report: Report,
+    watch: Watch = lambda _epoch, _decide: None,
 ) -> torch.nn.Module:
     net = seeded(lambda: feature_net(measurement.train.shape[1], measurement.n_classes), seed)
     labels = torch.from_numpy(measurement.train_labels)
-    fit(net, inputs, labels, epochs=epochs, seed=seed, what=what, report=report)
+    decide = decider(net)
+    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
     return net

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from .baseline_nets import FrameNet, decider, fit, poisson, seeded
-from .baselines import Decide, Measurement, Report, silent
+from .baselines import Decide, Measurement, Report, named, silent
 
 EPOCHS = 5
 
@@ -43,7 +43,7 @@ def aware_cnn(
         return poisson(torch.from_numpy(shown), detector, generator, dark)
 
     labels = torch.from_numpy(measurement.train_labels)
-    fit(net, frames, labels, epochs=epochs, seed=seed, what=f"noise-aware CNN at {photons:g} photons", report=report)
+    fit(net, frames, labels, epochs=epochs, seed=seed, report=named(f"noise-aware CNN at {photons:g} photons", report))
     return decider(net)
 
 
@@ -55,7 +55,7 @@ def clean_cnn(measurement: Measurement, *, seed: int, epochs: int = EPOCHS, repo
         return torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], 1e6))
 
     labels = torch.from_numpy(measurement.train_labels)
-    fit(net, frames, labels, epochs=epochs, seed=seed, what="CNN on clean frames", report=report)
+    fit(net, frames, labels, epochs=epochs, seed=seed, report=named("CNN on clean frames", report))
     return decider(net)
 
 

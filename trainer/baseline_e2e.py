@@ -25,7 +25,7 @@ from pans.runtime.errors import UsageError
 
 from .baseline_compressive import size
 from .baseline_nets import decider, feature_net, fit, seeded
-from .baselines import Decide, Measurement, Report, measure, silent
+from .baselines import Decide, Measurement, Report, measure, named, silent
 from .tasks import Task
 
 EPOCHS = 15
@@ -95,7 +95,7 @@ def train_conventionally(
 
     labels = torch.from_numpy(task.train.labels)
     rates = {"weight": PATTERN_RATE, "head": 1e-3}
-    fit(model, objects, labels, epochs=epochs, seed=seed, batch=512, rates=rates, what="end-to-end", report=report)
+    fit(model, objects, labels, epochs=epochs, seed=seed, batch=512, rates=rates, report=named("end-to-end", report))
     return model
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -65,6 +66,14 @@ def _convolution(before: int, after: int, kernel: int, stride: int = 1) -> tuple
     return layer, nn.BatchNorm2d(after), nn.ReLU()
 
 
+@dataclass(frozen=True, slots=True)
+class EpochOfFit:
+    """Means over the objects of one epoch, while the network learnt from them."""
+
+    loss: float
+    accuracy: float
+
+
 def feature_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
     """Return the paper's digital back end behind continuous features: batch normalisation, one hidden layer, scores."""
     hidden = nn.Linear(n_features, n_hidden)
@@ -87,12 +96,13 @@ def fit(
     seed: int,
     batch: int = 256,
     rates: dict[str, float] | None = None,
-    what: str = "training",
     report: Report = silent,
+    watch: Callable[[EpochOfFit], None] = lambda _: None,
 ) -> None:
     """Train `net` on fresh `inputs` of every batch by cross-entropy, Adam and one cycle of the learning rate.
 
-    `rates` gives parameters whose name begins with a key a peak rate of their own; the others have `RATE`.
+    `rates` gives parameters whose name begins with a key a peak rate of their own; the others have `RATE`. `watch` is called after
+    every epoch, with `net` as for use.
     """
     generator = torch.Generator().manual_seed(seed)
     of_rate = _by_rate(net, rates or {})
@@ -100,22 +110,27 @@ def fit(
     optimiser = torch.optim.Adam([{"params": parameters} for parameters in of_rate.values()])
     n_batches = max(1, len(labels) // batch)
     step, steps = 0, epochs * n_batches
-    net.train()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # dropout
         for _ in range(epochs):
+            net.train()
+            sums = torch.zeros(2)  # of the loss and of right decisions
             order = torch.randperm(len(labels), generator=generator)
             for which in order.tensor_split(n_batches):
                 for group, peak in zip(optimiser.param_groups, peaks):
                     group["lr"] = peak * _one_cycle(step / steps)
-                loss = nn.functional.cross_entropy(net(inputs(which, generator)), labels[which])
+                scores = net(inputs(which, generator))
+                loss = nn.functional.cross_entropy(scores, labels[which])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
+                right = (scores.argmax(dim=1) == labels[which]).sum()
+                sums += torch.stack([loss.detach() * len(which), right])
                 step += 1
                 if step % 20 == 0 or step == steps:
-                    report(f"{what}, loss {float(loss.detach()):.3f}", step / steps)
-    net.eval()
+                    report(f"loss {float(loss.detach()):.3f}", step / steps)
+            net.eval()
+            watch(EpochOfFit(*(sums / len(labels)).tolist()))
 
 
 def _by_rate(net: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:

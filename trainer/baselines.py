@@ -46,6 +46,11 @@ def silent(_what: str, _done: float) -> None:
     """A `Report` for nobody."""
 
 
+def named(what: str, report: Report) -> Report:
+    """Return a `Report` that passes on what it is told with `what` before it."""
+    return lambda words, done: report(f"{what}, {words}", done)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
     """Linear measurements of all objects of a task at unit light: rows (objects, m), times `unit`, are sums of transmission.

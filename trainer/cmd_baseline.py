@@ -11,7 +11,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
@@ -81,7 +81,6 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     from .tasks import load_task
 
-    args.method = args.method or DEFAULT_METHOD[args.paradigm]
     _check(args)
     if not (args.paradigm == "direct" and args.method == "bayes"):
         _torch().set_num_threads(args.threads)
@@ -103,7 +102,17 @@ def _run(args: argparse.Namespace) -> int:
     return code
 
 
+def rows_of_words(words: Sequence[str], task: Task, report: Report) -> Iterator[dict[str, Any]]:
+    """Yield what `pans baseline WORDS` measures on `task`, which stands for the one that they name."""
+    parser = argparse.ArgumentParser(prog="pans baseline")
+    _configure(parser)
+    args = parser.parse_args(words)
+    _check(args)
+    yield from rows_of(_shortened(task, args.train_objects, args.objects), args, report)
+
+
 def _check(args: argparse.Namespace) -> None:
+    args.method = args.method or DEFAULT_METHOD[args.paradigm]
     if args.method not in METHODS[args.paradigm]:
         raise UsageError(
             f"--method is {args.method!r}, allowed with {args.paradigm}: {', '.join(METHODS[args.paradigm])}"

@@ -193,6 +193,14 @@ UNPRINTED: dict[str, PassiveTable] = {
 
 CLICKS_TOLERANCE = 1.05  # a row counts at no more than this times the paper's clicks
 
+# Of the paper's text on the alternatives, FashionMNIST: accuracy in % at photons as the paper counts them.
+E2E_FEW = (5.0, 15.0, 20.0)  # conventional end-to-end at about so many photons: from, to
+E2E_MANY = (5000.0, 83.0)  # from about so many on
+PANS_FEW = (5.0, 70.0)  # PANS where conventional end-to-end has E2E_FEW
+SENSING_MANY = (64, 1e6, 75.0)  # compressive sensing: patterns, photons
+SENSING_FEW = (100.0, 10.0)  # and up to so many photons, with any number of patterns
+PATTERN_PEAKS = (18, 100)  # brightest pixel over the mean of all, first and last stage of a training
+
 # Not the paper's: direct imaging by the exact Poisson likelihood of all 60 000 training objects, all 10 000 test images, 2 trials
 # (docs/BASELINES.md). Photons -> accuracy in %. The paper's own direct imaging is a network trained on clean frames.
 DIRECT: dict[str, dict[float, float]] = {

@@ -21,6 +21,7 @@ from . import figures_training
 from .course import FIRST, TRAINING_OBJECTS, follow
 from .kept import kept
 from .options import Options, plain_options
+from .paper_tables import PATTERN_PEAKS
 from .reproduce_page import Asked
 from .reproduce_passive import PROFILE, TRIALS, measure
 from .tasks import load_task
@@ -32,7 +33,6 @@ EPOCHS = 30
 SHOWN = (10, 1e-4)  # d_f and alpha of the paper's evolution of patterns
 STAGES = (1, 3, 10, EPOCHS)  # epochs after which it is shown
 LATE = 10  # epochs at the end, over which the growth of the light is told
-PAPER_PEAKS = (18, 100)  # brightest pixel over the mean: its first and its last stage
 SETTLED = 3.0  # percent of growth over the last epochs, up to which the light counts as settled
 
 
@@ -221,14 +221,14 @@ def evolution_markdown(rows: list[dict[str, Any]], row: dict[str, Any]) -> str:
     features, alpha = SHOWN
     first, last = rows[0], rows[-1]
     final = row["final"]
-    said = "the same course, further" if last["peak"] > PAPER_PEAKS[1] else "the same course, not as far"
+    said = "the same course, further" if last["peak"] > PATTERN_PEAKS[1] else "the same course, not as far"
     lines = [
         "# Patterns in the course of a training",
         "",
         f"SIMULATED on the profile `{PROFILE}`, FashionMNIST, K = 1, d_f = {features}, alpha = {alpha:g}. Command: "
         f"`pans reproduce evolution` (seed 0, {row['cpu_seconds'] / 60:.1f} processor minutes; the training is that row of "
-        "[alpha](alpha.md)). As in the paper all pixels are divided by the mean of all pixels of all patterns, so that this mean is 1; the number above a pattern is its own "
-        "mean. The paper does not name the epochs of its stages; ours were fixed beforehand.",
+        "[alpha](alpha.md)). As in the paper all pixels are divided by the mean of all pixels of all patterns, so that this mean is 1; "
+        "the number above a pattern is its own mean. The paper does not name the epochs of its stages; ours were fixed beforehand.",
         "",
         "![patterns](evolution.png)",
         "",
@@ -241,7 +241,7 @@ def evolution_markdown(rows: list[dict[str, Any]], row: dict[str, Any]) -> str:
         f"from the objects {final['error_objects']:.1f}, of the first 200 about 3); clicks, photons and illumination are means over the "
         "epoch's batches.",
         "",
-        f"- The paper: the largest value rises from about {PAPER_PEAKS[0]} to about {PAPER_PEAKS[1]} times the mean. Ours: from "
+        f"- The paper: the largest value rises from about {PATTERN_PEAKS[0]} to about {PATTERN_PEAKS[1]} times the mean. Ours: from "
         f"{first['peak']:.0f} after epoch {first['epoch']} to {last['peak']:.0f} after epoch {last['epoch']}: {said}. Uniform random "
         "weights, squared, begin at 3.",
         "- The paper: intensity concentrates while most of the image becomes dark. Ours: half of the light lies in "
