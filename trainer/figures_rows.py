@@ -129,3 +129,38 @@ def robustness(path: Path, rows: list[dict[str, Any]], sweep: str) -> None:
     panels[1].legend(fontsize=8, loc="lower center" if sweep == "eta" else "lower left")
     figure.suptitle("bars: spread of one trial; dashed: guessing (SIMULATED)", fontsize=10)
     save_figure(figure, path)
+
+
+def confusions(path: Path, rows: list[dict[str, Any]], table: str) -> None:
+    """Draw one matrix per row of a table, all images: true class down, decision across, numbers in % of the true class."""
+    figure, panels = new_figure(width=13.5, height=7.6, panels=4, rows=2)
+    axes = panels.ravel()
+    shown = None
+    for place, (axis, row) in enumerate(zip(axes, rows)):
+        matrix, classes = row["all"]["matrix"], row["classes"]
+        shown = axis.imshow(matrix, cmap="Blues", vmin=0, vmax=1)
+        for i, line in enumerate(matrix):
+            for j, share in enumerate(line):
+                if share >= 0.01:
+                    ink = "white" if share > 0.55 else "black"
+                    axis.text(j, i, f"{100 * share:.0f}", ha="center", va="center", fontsize=6.5, color=ink)
+        ticks = range(len(classes))
+        axis.set_xticks(ticks, classes, rotation=90, fontsize=7)
+        axis.set_yticks(ticks, classes if place % 4 == 0 else [""] * len(classes), fontsize=7)
+        whole, first = row["all"], row[FIRST]
+        axis.set_title(
+            f"d_f = {row['features']}: {100 * whole['accuracy_mean']:.1f} % (first {FIRST_OBJECTS}: "
+            f"{100 * first['accuracy_mean']:.1f} %)\n{whole['clicks_mean']:.1f} clicks, {whole['photons_mean']:.0f} photons",
+            fontsize=8.5,
+        )
+        if place % 4 == 0:
+            axis.set_ylabel("true class")
+    for axis in axes[len(rows) :]:
+        axis.set_axis_off()
+    if shown is not None:
+        figure.colorbar(shown, ax=axes[-1], label="share of the true class", location="left", shrink=0.8)
+    figure.suptitle(
+        f"{TITLES[table]}, K = 1, all 10 000 test images; decision across, numbers in % from 1 % on (SIMULATED)",
+        fontsize=10,
+    )
+    save_figure(figure, path)

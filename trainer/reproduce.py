@@ -147,6 +147,7 @@ PAGES = {  # name: module and function that measure it (imported when asked for)
     "equal-photons": "reproduce_equal:equal_table",
     "sweeps": "reproduce_sweeps:sweep_table",
     "fig-2c": "reproduce_information:information_table",
+    "confusion": "reproduce_confusion:confusion_page",
     "dark-counts": "reproduce_robust:dark_page",
     "eta": "reproduce_robust:eta_page",
     "fig-3": "reproduce_shots:fig_3_page",
