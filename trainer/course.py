@@ -23,7 +23,7 @@ from .tasks import Task
 from .train import EpochReport, Run, Trained
 from .training_data import CHUNK, TrainingData, encoder_input
 
-TRAINING_OBJECTS = 10_000  # by which the accuracy on training objects is judged: the first ones
+TRAINING_OBJECTS = 5000  # by which the accuracy on training objects is judged: the first ones
 FIRST = 200
 
 

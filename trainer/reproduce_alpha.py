@@ -29,7 +29,7 @@ from .tasks import load_task
 TASK = "fashion-mnist"
 FEATURES = (10, 16, 24, 32)
 ALPHAS = (0.0, 1e-5, 1e-4, 1e-3, 1e-2)
-EPOCHS = 30
+EPOCHS = 24
 SHOWN = (10, 1e-4)  # d_f and alpha of the paper's evolution of patterns
 STAGES = (1, 3, 10, EPOCHS)  # epochs after which it is shown
 LATE = 10  # epochs at the end, over which the growth of the light is told
