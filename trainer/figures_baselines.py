@@ -121,23 +121,20 @@ def sensing_map(path: Path, rows: Rows) -> None:
 
 def frames(path: Path, classes: tuple[str, ...], shown: dict[float, NDArray[np.floating]]) -> None:
     """Draw frames, `shown` being photons -> (classes, draws, height, width): a row per class, a column per draw."""
-    columns = [(photons, draw) for photons, drawn in shown.items() for draw in range(drawn.shape[1])]
-    figure, axes = new_figure(
-        width=0.86 * len(columns) + 1.0, height=0.88 * len(classes) + 0.6, panels=len(columns), rows=len(classes)
-    )
-    for row, name in enumerate(classes):
-        for column, (photons, draw) in enumerate(columns):
-            axis = axes[row, column]
-            frame = shown[photons][row, draw]
-            axis.imshow(frame, cmap="gray", vmin=0, vmax=max(1.0, float(frame.max())))
-            axis.set(xticks=[], yticks=[])
-            if row == 0:
-                axis.set_title(f"{photons:g}" if draw == 0 else "", fontsize=9)
-        axes[row, 0].set_ylabel(name, fontsize=8)
-    figure.suptitle(
-        "photon counts of single frames; photons per frame on average, above the first of equal columns (SIMULATED)",
-        fontsize=9,
-    )
+    places = [(photons, draw) for photons, drawn in shown.items() for draw in range(drawn.shape[1])]
+    height, width = next(iter(shown.values())).shape[2:]
+    canvas = np.ones((len(classes) * (height + 2), len(places) * (width + 2)))
+    for column, (photons, draw) in enumerate(places):
+        for row, frame in enumerate(shown[photons][:, draw]):
+            top, left = row * (height + 2) + 1, column * (width + 2) + 1
+            canvas[top : top + height, left : left + width] = frame / max(1.0, float(frame.max()))
+    figure, axis = new_figure(width=7.6, height=7.4, panels=1)
+    axis.imshow(canvas, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axis.set_yticks([(row + 0.5) * (height + 2) for row in range(len(classes))], classes, fontsize=8)
+    titles = [f"{photons:g}" for photons, _ in places]
+    axis.set_xticks([(column + 0.5) * (width + 2) for column in range(len(places))], titles, fontsize=8)
+    axis.tick_params(length=0, top=False, labeltop=True, bottom=False, labelbottom=False)
+    axis.set_title("photon counts of single frames; above: photons per frame, on average (SIMULATED)", fontsize=9)
     save_figure(figure, path)
 
 

@@ -157,6 +157,7 @@ PAGES = {  # name: module and function that measure it (imported when asked for)
     "fig-2e": "reproduce_paradigms:fig_2e_page",
     "end-to-end": "reproduce_paradigms:end_to_end_page",
     "compressive": "reproduce_sensing:compressive_page",
+    "direct-frames": "reproduce_frames:frames_page",
 }
 
 NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {

@@ -123,14 +123,17 @@ def fig_2e_markdown(rows: Rows) -> str:
     lines = [
         "# Accuracy against photons: PANS and the alternatives (paper, Fig. 2E)",
         "",
-        "SIMULATED, FashionMNIST, K = 1, seed 0, ideal shot noise, no dark counts. Command: `pans reproduce fig-2e`; the rows of PANS are "
-        f"those of `pans reproduce {TASK}` in the same cache folder (profile `ideal`, thresholded detectors: a click at most each). **The "
+        "SIMULATED, FashionMNIST, K = 1, seed 0, ideal shot noise, no dark counts. Command: `pans reproduce fig-2e`; the rows "
+        "of PANS are "
+        f"those of `pans reproduce {TASK}` in the same cache folder (profile `ideal`, thresholded detectors: a click at most "
+        "each). **The "
         "baselines count photons**: their detectors are perfect counters, which is more than PANS is given. All ways are trained on the "
         "60 000 training objects and judged on all 10 000 test images; the first 200 are the paper's.",
         "",
         "![accuracy](fig-2e.png)",
         "",
-        "Left, as the paper draws it: PANS over its **clicks** (first 200 images), the baselines over their photons. Middle: everything over "
+        "Left, as the paper draws it: PANS over its **clicks** (first 200 images), the baselines over their photons. Middle: "
+        "everything over "
         "the **photons detected**. Right: over the **illumination**, all light that is thrown at the object.",
         "",
         *([f"Not finished yet: {'; '.join(missing)}.", ""] if missing else []),
@@ -142,7 +145,8 @@ def fig_2e_markdown(rows: Rows) -> str:
         "",
         "## Everything",
         "",
-        "`trials` is the spread of one trial, `objects` the error from having few images (of all, then of the first 200). `clicks` are readouts with at least one "
+        "`trials` is the spread of one trial, `objects` the error from having few images (of all, then of the first 200). "
+        "`clicks` are readouts with at least one "
         "photon; `photons` are detected photoelectrons, mean over the test images.",
         "",
         *table_lines(rows),
@@ -210,7 +214,8 @@ def _claims(rows: Rows) -> list[str]:
     (few, few_low, few_high), (many, many_value) = E2E_FEW, E2E_MANY
     inside = few_low <= best[few] <= few_high
     lines = [
-        f"- The paper: conventional end-to-end reaches only {few_low:g} to {few_high:g} % at about {few:g} photons. Ours: {best[few]:.1f} %"
+        f"- The paper: conventional end-to-end reaches only {few_low:g} to {few_high:g} % at about {few:g} photons. Ours: "
+        f"{best[few]:.1f} %"
         + (", the same." if inside else ": the claim is weaker than it sounds, since few patterns do better there.")
         + f" The paper: about {many_value:g} % from {many:g} photons. Ours: {best[many]:.1f} % there."
     ]
@@ -219,7 +224,8 @@ def _claims(rows: Rows) -> list[str]:
         one = row["first_200"]
         lines.append(
             f'- The paper sets about {PANS_FEW[1]:g} % of PANS at about {PANS_FEW[0]:g} "photons" against that. These are '
-            f"clicks: our ten patterns have {one['clicks_mean']:.2f} clicks ({100 * one['accuracy_mean']:.1f} % of the first 200) and detect "
+            f"clicks: our ten patterns have {one['clicks_mean']:.2f} clicks ({100 * one['accuracy_mean']:.1f} % of the first "
+            "200) and detect "
             f"{one['photons_mean']:.0f} photons for them; the envelope has {best[30.0]:.1f} % at 30 photons."
         )
     return lines
@@ -237,7 +243,8 @@ def end_to_end_markdown(rows: Rows) -> str:
     lines = [
         "# Conventional end-to-end optimisation, without photons in training",
         "",
-        "SIMULATED, FashionMNIST, perfect photon counters, seed 0, all 10 000 test images. Command: `pans reproduce end-to-end`. Patterns and "
+        "SIMULATED, FashionMNIST, perfect photon counters, seed 0, all 10 000 test images. Command: `pans reproduce "
+        "end-to-end`. Patterns and "
         "head (512 hidden units, as in PANS) are trained on expected values with quantisation-aware training (4 bits of a value, 5 of a "
         "pattern: the paper names the technique and no numbers), 15 epochs each; then all light is scaled to the photons of the column.",
         "",
@@ -246,7 +253,8 @@ def end_to_end_markdown(rows: Rows) -> str:
         *([f"Not finished yet: {'; '.join(f'`{curve.command()}`' for curve in missing)}.", ""] if missing else []),
         *matrix_lines(rows, [curve.way for curve in done] + ([ENVELOPE] if top else [])),
         "",
-        f"The envelope is of d_f = {', '.join(f'{d} (at {n:g})' for n, d in top.items())}; it is chosen by the test images, as the paper's is."
+        f"The envelope is of d_f = {', '.join(f'{d} (at {n:g})' for n, d in top.items())}; it is chosen by the test images, "
+        "as the paper's is."
         if top
         else "",
         *_claims(rows),

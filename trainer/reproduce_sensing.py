@@ -76,9 +76,12 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Compressive sensing: training, and accuracy over patterns and photons",
         "",
-        "SIMULATED, FashionMNIST, perfect photon counters, ideal shot noise, K = 1, seed 0. Command: `pans reproduce compressive`. Random "
-        f"binary patterns (a fair coin per pixel); one hidden layer of 512 trained on **clean** measurements for {EPOCHS} epochs (the paper: a "
-        f"convolutional classifier); then {TRIALS} trials of all 10 000 test images at every photon level, the readouts divided by the exposure.",
+        "SIMULATED, FashionMNIST, perfect photon counters, ideal shot noise, K = 1, seed 0. Command: `pans reproduce "
+        "compressive`. Random "
+        f"binary patterns (a fair coin per pixel); one hidden layer of 512 trained on **clean** measurements for {EPOCHS} "
+        "epochs (the paper: a "
+        f"convolutional classifier); then {TRIALS} trials of all 10 000 test images at every photon level, the readouts "
+        "divided by the exposure.",
         "",
         "![accuracy](compressive.png)",
         "![training](compressive-training.png)",
@@ -130,7 +133,8 @@ def _says(rows: list[dict[str, Any]]) -> list[str]:
     if (features, many) in cells:
         best = max((cells[row["features"], many], row["features"]) for row in rows)
         lines.append(
-            f"- The paper: about {value:g} % with {features} patterns at {many:g} photons. Ours: {cells[features, many]:.1f} %; the best is "
+            f"- The paper: about {value:g} % with {features} patterns at {many:g} photons. Ours: {cells[features, many]:.1f} "
+            "%; the best is "
             f"{best[0]:.1f} % with {best[1]}."
         )
     few, chance = SENSING_FEW
@@ -139,7 +143,8 @@ def _says(rows: list[dict[str, Any]]) -> list[str]:
         (highest, photons), accuracy = max(low.items(), key=lambda item: item[1])
         holds = accuracy <= chance + CHANCE_MARGIN
         lines.append(
-            f"- The paper: near {chance:g} % up to {few:g} photons, whatever d_f. Ours: {min(low.values()):.1f} to {accuracy:.1f} % (d_f = "
+            f"- The paper: near {chance:g} % up to {few:g} photons, whatever d_f. Ours: {min(low.values()):.1f} to "
+            f"{accuracy:.1f} % (d_f = "
             f"{highest} at {photons:g} photons)" + (": the same." if holds else ": not chance, though far from useful.")
         )
     lines.append(
