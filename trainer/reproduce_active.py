@@ -32,6 +32,7 @@ PROFILE = "ideal"
 TRIALS = {FIRST_OBJECTS: 100, 10_000: 10}  # where the outcomes are too many to enumerate
 # Times the paper's clicks, which it counted on the first 200 test images: these of MNIST are 9 % darker than the training images.
 CLICKS_AIM = {"fashion-mnist": 1.02, "mnist": 1.085}
+CLICKS_AIM_NINE = 1.11  # of MNIST's nine patterns, which no other row comes so close to the tolerance with
 # Trained once more from another seed, to see how far a seed moves a row. Never chosen from: the table keeps seed 0.
 OTHER_SEEDS = {("fashion-mnist", 10): (1000,), ("mnist", 9): (1000,)}  # far from 0, + 1, ...: those are its restarts
 
@@ -47,7 +48,10 @@ def recipe(name: str, row: ActiveRow) -> Options:
         return replace(small, starts=8) if row.features > 4 else replace(small, starts=5, restarts=2)
     if row.features <= EXACT_FEATURES_MAX:
         exact = replace(shared, epochs=36, warm=0.3, starts=2, polish=0.4, hidden=128, head_rate=3e-3)
-        return exact if name != "mnist" else replace(exact, epochs=56, starts=3, restarts=2, alpha=1e-4, mix=0.6)
+        if name != "mnist":
+            return exact
+        clicks = CLICKS_AIM_NINE * row.clicks
+        return replace(exact, epochs=100, starts=3, alpha=1e-4, mix=0.66, clicks=clicks)
     local = replace(shared, estimator="local", warm=0.4, head_rate=2e-3, epochs=32, hidden=256)
     if row.features == 32:  # several shots gain least where the patterns were trained for one alone
         return replace(local, mix=0.5)
