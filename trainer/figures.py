@@ -14,10 +14,15 @@ from .paper_tables import PASSIVE, UNPRINTED, ActiveRow, PassiveRow
 DPI = 90
 
 
-def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2, rows: int = 1) -> tuple[Any, Any]:
+def use_files_alone() -> None:
+    """Choose the back end of matplotlib that needs no screen."""
     import matplotlib
 
     matplotlib.use("Agg")
+
+
+def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2, rows: int = 1) -> tuple[Any, Any]:
+    use_files_alone()
     from matplotlib import pyplot
 
     return pyplot.subplots(rows, panels, figsize=(width, height), layout="constrained")

@@ -158,7 +158,7 @@ def confusions(path: Path, rows: list[dict[str, Any]], table: str) -> None:
     for axis in axes[len(rows) :]:
         axis.set_axis_off()
     if shown is not None:
-        figure.colorbar(shown, ax=axes[-1], label="share of the true class", location="left", shrink=0.8)
+        figure.colorbar(shown, ax=list(axes), label="share of the true class", shrink=0.5, aspect=40)
     figure.suptitle(
         f"{TITLES[table]}, K = 1, all 10 000 test images; decision across, numbers in % from 1 % on (SIMULATED)",
         fontsize=10,

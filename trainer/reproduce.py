@@ -152,6 +152,7 @@ PAGES = {  # name: module and function that measure it (imported when asked for)
     "eta": "reproduce_robust:eta_page",
     "fig-3": "reproduce_shots:fig_3_page",
     "multi-shot": "reproduce_shots:multi_shot_page",
+    "single-shot": "reproduce_single:single_shot_page",
     "alpha": "reproduce_alpha:alpha_page",
     "evolution": "reproduce_alpha:evolution_page",
     "fig-2e": "reproduce_paradigms:fig_2e_page",

@@ -80,10 +80,10 @@ def _head() -> list[str]:
         "# Confusion matrices, single shot",
         "",
         f"{profile_says()} Command: `pans reproduce confusion`; nothing is trained, seed 1 of the trials. The paper shows the matrices "
-        f"of its experiment (first {FIRST_OBJECTS} test images, 30 trials, K = 1, FashionMNIST d_f = 4 to 32, MNIST d_f = 4 to 64), without "
-        f"numbers in the text. Ours are of all 10 000 test images (pictures, tables) and of the first {FIRST_OBJECTS} (JSON), K = 1: exact "
-        f"expectations over all click words where these can be enumerated, else {TRIALS_OF_ALL} trials ({TRIALS[FIRST_OBJECTS]} of the "
-        f"first {FIRST_OBJECTS}). Rows are true classes, columns decisions. {SPREADS_SAY}",
+        f"of its experiment (first {FIRST_OBJECTS} test images, 30 trials, K = 1, FashionMNIST d_f = 4 to 32, MNIST d_f = 4 to 64), "
+        f"without numbers in the text. Ours are of all 10 000 test images (pictures, tables) and of the first {FIRST_OBJECTS} (JSON), "
+        f"K = 1: exact expectations over all click words where these can be enumerated, else {TRIALS_OF_ALL} trials "
+        f"({TRIALS[FIRST_OBJECTS]} of the first {FIRST_OBJECTS}). Rows are true classes, columns decisions. {SPREADS_SAY}",
         "",
     ]
 
