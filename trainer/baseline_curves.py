@@ -20,8 +20,8 @@ from .tasks import load_task
 
 TASK = "fashion-mnist"
 LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 5e3, 1e4, 1e6)
-POSTERIOR_LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 1e4)  # at more it is a nearest neighbour
-SENSING_LEVELS = (5.0, 17.0, 100.0, 1e4)
+POSTERIOR_LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3)  # at more it is a nearest neighbour
+SENSING_LEVELS = (5.0, 100.0, 1e4)
 NETWORK_LEVELS = (100.0, 1e4)  # a training each
 E2E_FEATURES = (3, 4, 6, 8, 10, 16, 24, 32, 64)  # the paper's
 ENVELOPE = "end-to-end, envelope"
@@ -49,7 +49,7 @@ _SENSING = "compressive --features 64 --patterns"
 DIRECT = (
     _curve("direct, network of clean frames", "direct --method clean-cnn --epochs 2 --trials 2", LEVELS),
     _curve("direct, exact posterior", "direct --method bayes --trials 2", POSTERIOR_LEVELS),
-    _curve("direct, network of each level", "direct --method cnn --epochs 3 --trials 2", NETWORK_LEVELS),
+    _curve("direct, network of each level", "direct --method cnn --epochs 2 --trials 2", NETWORK_LEVELS),
 )
 COMPRESSIVE = (
     _curve("random binary, clean features", f"{_SENSING} binary --method clean-mlp --trials 5", LEVELS),

@@ -29,17 +29,17 @@ from .tasks import load_task
 TASK = "fashion-mnist"
 FEATURES = (10, 16, 24, 32)
 ALPHAS = (0.0, 1e-5, 1e-4, 1e-3, 1e-2)
-EPOCHS = 24
+EPOCHS = 16
 SHOWN = (10, 1e-4)  # d_f and alpha of the paper's evolution of patterns
-STAGES = (1, 3, 10, EPOCHS)  # epochs after which it is shown
-LATE = 10  # epochs at the end, over which the growth of the light is told
+STAGES = (1, 3, 8, EPOCHS)  # epochs after which it is shown
+LATE = 5  # epochs at the end, over which the growth of the light is told
 SETTLED = 3.0  # percent of growth over the last epochs, up to which the light counts as settled
 
 
 def recipe(features: int, alpha: float) -> Options:
     """Return what a course is trained with: straight-through from first to last and constant rates, as the paper trains."""
     as_the_paper = Options(features, alpha=alpha, estimator="ste", constant=True, hidden=512)
-    return replace(as_the_paper, epochs=EPOCHS, batch=512, front_rate=3e-3, head_rate=5e-4)
+    return replace(as_the_paper, epochs=EPOCHS, batch=512, front_rate=5e-3, head_rate=1e-3)
 
 
 def course_of(asked: Asked, features: int, alpha: float) -> dict[str, Any] | None:
