@@ -115,8 +115,8 @@ def _fiber(shared: Options, row: PassiveRow) -> Options:
 
 
 def _picture(shared: Options) -> Options:
-    few = shared.features <= EXACT_FEATURES_MAX  # the bias of `ste` costs most there, and `local` a pass per detector
-    return replace(shared, estimator="local" if few else "ste", epochs=16, warm=0.5, hidden=512, similarity=0.9)
+    decoder = replace(shared, head="decoder", estimator="disarm", warm=0.5, hidden=512, similarity=0.9)
+    return replace(decoder, epochs=30) if shared.features <= 10 else replace(decoder, epochs=24, copies=2)
 
 
 def _digits(shared: Options, row: PassiveRow) -> Options:
