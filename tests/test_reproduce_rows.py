@@ -93,10 +93,10 @@ def test_points_meet_where_the_curves_of_more_patterns_reach():
     assert found[0].ahead == pytest.approx(5.0)
     between = 65 + (61 - 65) * np.log(9 / 6) / np.log(2)
     assert found[1].ahead == pytest.approx(between - 62)
-    lost = shots._exact_says("t", found, [found[0]._replace(ahead=-1.0)])
-    assert "3 x 2 beats 6 patterns by 1.00" in lost[2]
+    lost = shots._exact_says("t", found, found[:2], [found[0]._replace(ahead=-1.0)])
+    assert "3 x 2 beats 6 patterns by 1.00" in lost[3]
     assert "the claim fails: 3 x 5 beats 6 patterns by 0.25" in lost[1]
-    assert "holds in all 2 comparisons" in shots._exact_says("t", found[:2], found[:1])[1]
+    assert "holds in all 2 comparisons" in lost[2]
 
 
 def test_shots_and_fig_3_stand_on_the_figures_of_the_table(asked, cache, tmp_path):
