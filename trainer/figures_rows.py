@@ -96,6 +96,7 @@ def fig_3(path: Path, rows: list[dict[str, Any]]) -> None:
                 fontsize=8,
                 color="C2",
             )
+        axis.margins(x=0.1)
         axis.set(xlabel="patterns, d_f", ylabel="accuracy, %", title=f"{TITLES[table]}, K = 1")
         axis.grid(alpha=0.3)
         axis.legend(loc="lower right", fontsize=9)
