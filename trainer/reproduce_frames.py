@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from . import figures_baselines
 from .baseline_bayes import log_joint
-from .baseline_curves import DIRECT, TASK, curve_rows
+from .baseline_curves import CLEAN, POSTERIOR, TASK, curve_rows
 from .baselines import Measurement, Trials, detect, measure
 from .kept import kept
 from .reproduce_page import Asked
@@ -33,7 +33,7 @@ def frames_page(asked: Asked) -> dict[str, Any]:
     """Return the page `direct-frames`: one row per photon level."""
     task = load_task(TASK, asked.data_dir)
     maps = [found for photons in MAPPED if (found := _map(asked, task, photons)) is not None]
-    curves = {curve.way: curve_rows(replace(asked, collect=True), curve) for curve in DIRECT[:2]}
+    curves = {curve.way: curve_rows(replace(asked, collect=True), curve) for curve in (CLEAN, POSTERIOR)}
     rows = [_row(photons, maps, curves) for photons in SHOWN]
     pictures = {"": partial(figures_baselines.frames, classes=task.classes, shown=drawn_frames(task))}
     if maps:
