@@ -48,7 +48,10 @@ def test_the_papers_rows_are_all_there_and_plausible():
 def test_recipes_can_be_trained_and_aim_at_the_papers_clicks(name, row):
     options = active.recipe(name, row)
     check_options(options, load_profile("ideal"))
-    assert row.clicks <= options.clicks <= 1.09 * row.clicks
+    darker = {"fashion-mnist": 1.0, "mnist": 1.07}[
+        name
+    ]  # the first 200 images, by which the clicks are counted, click less
+    assert row.clicks <= options.clicks <= 1.05 * darker * row.clicks
 
 
 def test_recipes_of_the_other_tasks_can_be_trained():

@@ -57,7 +57,7 @@ def cache(tmp_path_factory):
 
 def small(_name, row):
     return Options(
-        features=row.features, clicks=1.5, epochs=3, hidden=8, batch=50, front_rate=5e-2, head_rate=2e-2, shots=2
+        features=row.features, clicks=1.5, epochs=3, hidden=8, batch=50, front_rate=5e-2, head_rate=2e-2, shots=1
     )
 
 
