@@ -46,7 +46,19 @@ def confusion_page(asked: Asked) -> dict[str, Any]:
             measured = {part: row.figures[part]["1"] | {"matrix": made[part]} for part in (FIRST, "all")}
             mine.append({"table": table, "features": row.features, "classes": made["classes"], **measured})
         there = [row for row in trained if any(row.features == found["features"] for found in mine)]
-        lines += [f"## {table}", "", *rows_say(table, there), "", *_table(mine), "", *_SAYS[table](mine), ""]
+        picture = f"![confusion matrices, {table}](confusion-{table}.png)"
+        lines += [
+            f"## {table}",
+            "",
+            picture,
+            "",
+            *rows_say(table, there),
+            "",
+            *_table(mine),
+            "",
+            *_SAYS[table](mine),
+            "",
+        ]
         pictures[f"-{table}"] = partial(figures_rows.confusions, rows=mine, table=table)
         rows += mine
     return {"rows": rows, "markdown": "\n".join(lines), "pictures": pictures}

@@ -36,6 +36,8 @@ def eta_page(asked: Asked) -> dict[str, Any]:
         "",
         *_head(asked.name, "All light times eta, K = 1. The head stays as it was trained, at eta = 1."),
         "",
+        "![accuracy over the light, one curve per number of patterns](eta.png)",
+        "",
         *said,
         "",
         "The paper (appendix, *photon level scaling*; a plot without numbers, first 200 images, 100 trials) says: *all models achieve peak "
@@ -57,6 +59,8 @@ def dark_page(asked: Asked) -> dict[str, Any]:
         "# Accuracy against dark counts",
         "",
         *_head(asked.name, "Expected dark counts of a detector and exposure, K = 1, with heads that were not told."),
+        "",
+        "![accuracy over dark counts, one curve per number of patterns](dark-counts.png)",
         "",
         *said,
         "",

@@ -103,6 +103,8 @@ def _multi_shot_head() -> list[str]:
         "higher accuracy*. A detection is one exposure, d_f x K of them make a decision; they are not photons, which stand beside. One "
         f"head per d_f serves all K. {SPREADS_SAY}",
         "",
+        "![accuracy over detections, one curve per number of patterns](multi-shot.png)",
+        "",
     ]
 
 
@@ -200,6 +202,8 @@ def _fig_3_head() -> list[str]:
         "`pans reproduce fashion-mnist` and `mnist` (seed 1 of the trials). K = 1. The paper's experiment is 30 trials of the first "
         f"{FIRST_OBJECTS} test images (mean ± spread), its simulation 100 trials of them, drawn as a band of three spreads. "
         f"{SPREADS_SAY} The paper does not print that error: about 3 points at {FIRST_OBJECTS} images.",
+        "",
+        "![accuracy over the number of patterns](fig-3.png)",
         "",
     ]
 

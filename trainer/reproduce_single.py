@@ -196,6 +196,8 @@ def _head() -> list[str]:
         f"- [pipeline](single-shot-pipeline.png): image, patterns, and the first six trials of the {PIPELINE_CLASS}; "
         f"[outputs](single-shot-outputs.png): the outputs (softmax) of all {TRIALS} trials, and the share of trials per decision",
         "",
+        "![clicks of single shots](single-shot-frames.png)",
+        "",
     ]
 
 
