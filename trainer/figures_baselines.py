@@ -27,9 +27,11 @@ def paradigms(path: Path, rows: Rows, paper: tuple[ActiveRow, ...]) -> None:
             mine = [row for row in rows if row["way"] == way]
             of = (lambda row: row["first_200"]) if panel == 0 else (lambda row: row)
             key = "illumination" if panel == 2 else "clicks_mean" if panel == 0 and way == PANS else "photons_mean"
-            points = sorted((of(row)[key], 100 * of(row)["accuracy_mean"]) for row in mine)
+            points = [(of(row)[key], 100 * of(row)["accuracy_mean"]) for row in mine]
             style = {"color": "k", "lw": 2, "ms": 5} if way == PANS else {"color": f"C{number}", "lw": 1.2, "ms": 3}
             axis.plot(*zip(*points), "o--" if "posterior" in way else "o-", label=way, **style)
+            for row, point in zip(mine, points) if way == PANS else ():
+                axis.annotate(str(row["features"]), point, textcoords="offset points", xytext=(5, -9), fontsize=7)
         axis.set(xscale="log", ylim=(5, 92))
         axis.grid(alpha=0.3)
     clicks = [row.clicks for row in paper]
@@ -45,7 +47,7 @@ def paradigms(path: Path, rows: Rows, paper: tuple[ActiveRow, ...]) -> None:
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(
-        "FashionMNIST, K = 1; baselines with perfect photon counters, PANS with thresholded detectors (SIMULATED)",
+        "FashionMNIST, K = 1; baselines with perfect photon counters, PANS with thresholded detectors (numbers: d_f) (SIMULATED)",
         fontsize=10,
     )
     save_figure(figure, path)

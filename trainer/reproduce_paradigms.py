@@ -200,6 +200,11 @@ def _fig_2e_says(rows: Rows) -> list[str]:
             "- The paper's blue curve is a network trained on clean frames. The exact posterior decides the same frames: "
             f"{'; '.join(told)}. The gap in the paper's figure is mostly that network's."
         )
+    if pans:
+        lines.append(
+            "- The rows of PANS are held to the paper's clicks, not to photons, and spend these freely. What patterns do with less light "
+            "is in [fig-2c](fig-2c.md), what a budget of photons does, on other tasks, in [equal-photons](equal-photons.md)."
+        )
     return lines + _claims(rows)
 
 
