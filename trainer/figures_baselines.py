@@ -97,7 +97,7 @@ def sensing_training(path: Path, rows: Rows) -> None:
     right.title.set_fontsize(9)
     for axis in (left, right):
         axis.grid(alpha=0.3)
-    left.legend(fontsize=8)
+    right.legend(fontsize=8, loc="lower right")
     figure.suptitle("compressive sensing, random binary patterns, FashionMNIST (SIMULATED)", fontsize=10)
     save_figure(figure, path)
 
