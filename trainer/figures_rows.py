@@ -134,7 +134,7 @@ def robustness(path: Path, rows: list[dict[str, Any]], sweep: str) -> None:
 
 def confusions(path: Path, rows: list[dict[str, Any]], table: str) -> None:
     """Draw one matrix per row of a table, all images: true class down, decision across, numbers in % of the true class."""
-    figure, panels = new_figure(width=13.5, height=7.6, panels=4, rows=2)
+    figure, panels = new_figure(width=13.5, height=8.6, panels=4, rows=2)
     axes = panels.ravel()
     shown = None
     for place, (axis, row) in enumerate(zip(axes, rows)):

@@ -107,7 +107,7 @@ def pipeline(path: Path, one: dict[str, Any], name: str) -> None:
     images = np.sqrt(one["patterns"].reshape(*side, *np.array(one["images"][label]).shape))
     tiles = _mosaic([list(line) for line in images / images.max()])
     below.imshow(tiles, cmap="inferno", vmin=0, vmax=1)
-    below.set_title(f"its {one['features']} patterns (brightness: square root of the light)", fontsize=9)
+    below.set_title(f"the {one['features']} patterns (brightness: square root of the light)", fontsize=9)
     for axis in (above, below):
         axis.set_axis_off()
     panels = right.subplots(PIPELINE_TRIALS, 2, width_ratios=(1, 4))
