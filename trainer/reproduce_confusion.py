@@ -21,7 +21,16 @@ from .reproduce_active import PROFILE
 from .reproduce_page import Asked
 from .reproduce_sweeps import TRIALS, TRIALS_OF_ALL, enumerable, parts_of
 from .tasks import Objects, load_task
-from .trained_rows import SPREADS_SAY, TrainedRow, measured_on, profile_says, rows_say, table_head, trained_rows
+from .trained_rows import (
+    SPREADS_SAY,
+    TrainedRow,
+    measured_on,
+    profile_says,
+    rows_say,
+    seconds_say,
+    table_head,
+    trained_rows,
+)
 
 FIRST = f"first_{FIRST_OBJECTS}"
 WORST = 3  # confusions that the page names
@@ -37,12 +46,14 @@ def confusion_page(asked: Asked) -> dict[str, Any]:
     rows, pictures, lines = [], {}, _head()
     for table in ACTIVE:
         trained, mine = trained_rows(asked, table), []
+        parts = []
         for row in trained:
             facts = {"trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL]}
             made = measured_on(asked, row, facts, partial(_matrices, row, asked.data_dir))
             if made is None:
                 asked.report(f"confusion: {table}, d_f = {row.features} is not measured yet: pans reproduce confusion")
                 continue
+            parts.append(made)
             measured = {part: row.figures[part]["1"] | {"matrix": made[part]} for part in (FIRST, "all")}
             mine.append({"table": table, "features": row.features, "classes": made["classes"], **measured})
         there = [row for row in trained if any(row.features == found["features"] for found in mine)]
@@ -53,6 +64,7 @@ def confusion_page(asked: Asked) -> dict[str, Any]:
             picture,
             "",
             *rows_say(table, there),
+            seconds_say(parts),
             "",
             *_table(mine),
             "",

@@ -17,7 +17,16 @@ from .reproduce_active import PROFILE
 from .reproduce_page import Asked
 from .reproduce_sweeps import DARKS, ETAS, EXACT_WORK_MAX, TRIALS, TRIALS_OF_ALL, measure_setting
 from .tasks import load_task
-from .trained_rows import SPREADS_SAY, TrainedRow, measured_on, profile_says, rows_say, table_head, trained_rows
+from .trained_rows import (
+    SPREADS_SAY,
+    TrainedRow,
+    measured_on,
+    profile_says,
+    rows_say,
+    seconds_say,
+    table_head,
+    trained_rows,
+)
 
 TABLE = "fashion-mnist"
 FIRST = f"first_{FIRST_OBJECTS}"
@@ -95,6 +104,7 @@ def _head(name: str, what: str) -> list[str]:
 def _swept(asked: Asked, sweep: str, settings: tuple[float, ...]) -> tuple[Curves, list[str]]:
     """Measure every trained row at every setting; finished rows lie in the cache. Also what to say of the rows."""
     curves: Curves = {}
+    parts = []
     trained = trained_rows(asked, TABLE)
     for row in trained:
         facts = {"settings": settings, "trials": [TRIALS[FIRST_OBJECTS], TRIALS_OF_ALL], "exact": EXACT_WORK_MAX}
@@ -103,10 +113,11 @@ def _swept(asked: Asked, sweep: str, settings: tuple[float, ...]) -> tuple[Curve
         if made is None:
             asked.report(f"{asked.name}: d_f = {row.features} is not measured yet: pans reproduce {asked.name}")
             continue
+        parts.append(made)
         of_row = {"table": TABLE, "features": row.features}
         base = {"sweep": sweep, "setting": "trained", FIRST: row.figures[FIRST]["1"], "all": row.figures["all"]["1"]}
         curves[row.features] = [of_row | base, *(of_row | found for found in made["rows"])]
-    return curves, rows_say(TABLE, [row for row in trained if row.features in curves])
+    return curves, [*rows_say(TABLE, [row for row in trained if row.features in curves]), seconds_say(parts)]
 
 
 def _all_settings(row: TrainedRow, data_dir: str | None, sweep: str, settings: tuple[float, ...]) -> dict[str, Any]:

@@ -21,7 +21,16 @@ from .paper_tables import FIRST_OBJECTS
 from .reproduce_active import PROFILE
 from .reproduce_page import Asked, Draw
 from .tasks import Objects, load_task
-from .trained_rows import SPREADS_SAY, TrainedRow, measured_on, profile_says, rows_say, table_head, trained_rows
+from .trained_rows import (
+    SPREADS_SAY,
+    TrainedRow,
+    measured_on,
+    profile_says,
+    rows_say,
+    seconds_say,
+    table_head,
+    trained_rows,
+)
 from .tsne import tsne
 
 TABLE = "fashion-mnist"
@@ -40,7 +49,7 @@ I64 = NDArray[np.int64]
 
 def single_shot_page(asked: Asked) -> dict[str, Any]:
     """Return one row per d_f (with one entry per image shown), and the page."""
-    shown, rows = [], []
+    shown, rows, parts = [], [], []
     trained = [row for row in trained_rows(asked, TABLE) if row.features in FEATURES]
     for row in trained:
         facts = {
@@ -53,13 +62,22 @@ def single_shot_page(asked: Asked) -> dict[str, Any]:
         if made is None:
             asked.report(f"single-shot: d_f = {row.features} is not measured yet: pans reproduce single-shot")
             continue
+        parts.append(made)
         drawn = {key: made[key] for key in ("images", "places", "labels", "classes")}
         measured = {key: made[key] for key in ("differing", "near", "objects")}
         one = {"table": TABLE, "features": row.features, FIRST: row.figures[FIRST]["1"], "all": row.figures["all"]["1"]}
         rows.append(one | measured)
         shown.append(rows[-1] | drawn | {"patterns": row.bundle.patterns()})
     there = [row for row in trained if any(row.features == found["features"] for found in rows)]
-    lines = [*_head(), *(rows_say(TABLE, there)[:1]), *_missing(rows), "", *_tables(rows), *_says(rows)]
+    lines = [
+        *_head(),
+        *(rows_say(TABLE, there)[:1]),
+        *_missing(rows),
+        seconds_say(parts),
+        "",
+        *_tables(rows),
+        *_says(rows),
+    ]
     return {"rows": rows, "markdown": "\n".join([*lines, ""]), "pictures": _pictures(shown)}
 
 

@@ -89,6 +89,11 @@ def rows_say(table: str, rows: list[TrainedRow]) -> list[str]:
     return said
 
 
+def seconds_say(parts: list[dict[str, Any]]) -> str:
+    """Return the words on how long the parts of a page took to measure."""
+    return f"Measured in {sum(part['cpu_seconds'] for part in parts):.0f} processor seconds."
+
+
 def profile_says() -> str:
     """Return the words on what simulates."""
     return (
