@@ -175,7 +175,6 @@ def _says(rows: list[dict[str, Any]]) -> list[str]:
             "the training "
             f"objects decides {100 * few['on_the_map']['accuracy_mean']:.0f} % right at 10 photons and "
             f"{100 * some['on_the_map']['accuracy_mean']:.0f} % at 100, where the map shows {100 * some['neighbours']:.0f} %. "
-            "A map made of "
-            "distances between counts, and an eye, see much less of a frame than its likelihood does.",
+            "A map made of distances between counts sees much less of a frame than its likelihood does.",
         ]
     return lines
