@@ -22,7 +22,7 @@ TASK = "fashion-mnist"
 LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 5e3, 1e4, 1e6)
 POSTERIOR_LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3)  # at more it is a nearest neighbour
 SENSING_LEVELS = (5.0, 100.0)
-NETWORK_LEVELS = (100.0, 1e4)  # a training each
+NETWORK_LEVELS = (100.0, 1e3, 1e4)  # a training each
 E2E_FEATURES = (3, 4, 6, 8, 10, 16, 24, 32, 64)  # the paper's
 ENVELOPE = "end-to-end, envelope"
 
