@@ -69,6 +69,9 @@ def test_the_page_says_where_we_are_not_ahead():
     assert "**not ahead at 3 photons (80.0 % at 3.00, network 81.0 %)**" in behind
     light = equal.markdown([row("equal light", 60, photons=1.0), row("posterior", 70)])
     assert "- fiber, equal light: **not ahead at 3 photons (60.0 % at 1.00, posterior 70.0 %)**" in light
+    near = equal.markdown([row("PANS", 71.3), row("posterior", 70)])  # both with an error of 1 point: 1.41 together
+    assert "ahead at every level measured, at 3 by less than the standard error" in near
+    assert "by less than" not in equal.markdown([row("PANS", 71.5), row("posterior", 70)])
     assert "not ahead" in equal.markdown([row("PANS", 80, photons=3.1), row("posterior", 70)])  # bought with photons
 
 
