@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from .wire_bulk import BulkDecoder
 
 NS_PER_S = 1_000_000_000
+# for ARM and GRANT to arrive, one retransmission, and a host that does not run for some 50 ms
+ARM_LEAD_NS = NS_PER_S // 10
 SETUP_POLL_S = 0.02
 CLOCK_BURST = 16
 PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for

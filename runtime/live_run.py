@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .actuate import GateDesk
-from .connection import Arrived, Connection
+from .connection import ARM_LEAD_NS, Arrived, Connection
 from .core import Output
 from .errors import LinkError
 from .framing import Messages
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from .loop import RunConfig
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
-ARM_LEAD_NS = (
-    100 * NS_PER_MS
-)  # for ARM and GRANT to arrive, one retransmission, and a host that does not run for some 50 ms
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
 RECEIVE_WINDOW = 4096  # stream messages
 FLUSH_EVERY_NS = 500 * NS_PER_MS

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .connection import NS_PER_S, Connection, plan_chunks
+from .connection import ARM_LEAD_NS, NS_PER_S, Connection, plan_chunks
 from .errors import DeviceError, LinkError, UsageError
 from .link import Link, open_link
 from .plan import NO_SHOT, Plan, ticks_of
@@ -24,7 +24,6 @@ LEASE_MS = 2000  # a host that is away for longer has lost its right to pulse
 PROBE_EVERY_NS = 89_000_000  # odd on purpose, and not that of the instrument that measures
 LOOK_EVERY_NS = 20_000_000
 LOOK_SOON_NS = 1_000_000  # while a pulse has no answer
-ARM_LEAD_NS = 50_000_000
 SETTLE_NS = NS_PER_S  # longest wait at the end for a pulse that is still to come
 
 

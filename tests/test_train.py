@@ -15,10 +15,11 @@ from pans.runtime.cli import main
 from pans.runtime.clicks import click_probability, object_transmission
 from pans.runtime.errors import DamagedFileError, PlanError, UsageError
 from pans.runtime.profile import load_profile
+from pans.trainer import schedule
 from pans.trainer.detection import click_probability as torch_probability
 from pans.trainer.detection import click_words, sample_clicks, word_probabilities
 from pans.trainer.device import computing_on
-from pans.trainer.estimators import cross_entropy, decision_loss
+from pans.trainer.estimators import cross_entropy, decision_loss, similarity_loss
 from pans.trainer.evaluate import evaluate_exactly, light_of
 from pans.trainer.head_fit import fit_head_exactly, joint_distribution
 from pans.trainer.heads import MlpHead
@@ -362,3 +363,13 @@ def test_shipped_bundle_meets_its_bar(data_dir):
     assert found.clicks_mean <= 5.5
     assert bundle.provenance["profile_sha256"] == PROFILE.sha256
     assert evaluate_exactly(bundle, light_of(bundle, PROFILE, test.images), test.labels).accuracy_mean >= 0.72
+
+
+def test_similarity_waits_for_the_second_stage_where_there_is_one():
+    shown, wanted = torch.rand(2, 64), torch.rand(2, 64)
+    error, both = (similarity_loss(weight, (8, 8))(shown, wanted) for weight in (0.0, 0.9))
+    assert not torch.allclose(error, both)
+    two = Options(features=4, epochs=10, warm=0.5, similarity=0.9, estimator="disarm")
+    one = replace(two, estimator="ste")
+    for options, now, expected in ((two, 4.9, error), (two, 5.0, both), (two, 10.0, both), (one, 0.0, both)):
+        assert torch.equal(schedule.loss_at(options, now, (8, 8))(shown, wanted), expected)

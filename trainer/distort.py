@@ -38,8 +38,8 @@ Imaged = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Imaged | None = None) -> Objects:
     """Return `copies` distorted copies of all but the last `kept` objects, then the objects as they are.
 
-    `imaged` says how an image is made of what lies behind it, which is then what is distorted. UsageError for images too small to
-    be distorted, or more than fit.
+    `imaged` says how an image is made of what lies behind it, which is then what is distorted; without it nothing lies behind.
+    UsageError for images too small to be distorted, or more than fit.
     """
     if not copies:
         return objects
@@ -48,7 +48,7 @@ def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Ima
     n = len(objects) - kept
     drawn = [distorted(source[:n], [DISTORT_STREAM, seed, number]) for number in range(copies)]
     images = drawn if imaged is None else [imaged(pictures) for pictures in drawn]
-    behind = None if objects.behind is None else np.concatenate([*drawn, objects.behind])
+    behind = None if imaged is None else np.concatenate([*drawn, source])
     labels = np.concatenate([np.tile(objects.labels[:n], copies), objects.labels])
     return Objects(np.concatenate([*images, objects.images]), labels, behind)
 

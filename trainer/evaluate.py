@@ -120,10 +120,10 @@ def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int,
     """Return the share of `trials` decisions per object and class, float64 (n, classes)."""
     decider, rng = make_decider(bundle, shots=shots), np.random.default_rng(seed)
     objects = np.arange(len(light.probability))
-    shares = np.zeros((len(objects), bundle.n_classes))
+    decided = np.zeros((len(objects), bundle.n_classes), np.int64)
     for _ in range(trials):
-        shares[objects, decider.decide_batch(rng.binomial(shots, light.probability), shots)] += 1 / trials
-    return shares
+        decided[objects, decider.decide_batch(rng.binomial(shots, light.probability), shots)] += 1
+    return decided / trials
 
 
 def outcome_probabilities(probability: F64, shots: int) -> F64:

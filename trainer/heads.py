@@ -6,7 +6,7 @@ Owns the digital back end in torch; never samples. A head takes click means (n, 
 - `MlpHead`: one hidden layer, the paper's (512 units).
 - `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
 - `PictureHead`: an image decoder, from clicks to a coarse picture and by transposed convolutions to the full one.
-- `DecoderHead`: an image decoder of two hidden layers, the paper's (512 and 512 units); a tenth of the other's time per picture.
+- `DecoderHead`: an image decoder of two hidden layers, the paper's (512 and 512 units); a seventh of the other's time per picture.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .reproduce_page import replace_text
+from pans.runtime.container import replace_file
 
 
 def kept(
@@ -32,6 +32,6 @@ def kept(
     part = make()
     # through JSON: a part just made and one read again are the same to the caller
     text = json.dumps({"made_with": plain, "cpu_seconds": time.process_time() - started, **part})
-    replace_text(path, text)
+    replace_file(path, text.encode())
     whole: dict[str, Any] = json.loads(text)
     return whole

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle import Bundle, load_bundle
+from pans.runtime.container import replace_file
 from pans.runtime.profile import Profile, load_profile
 
 from .evaluate import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
@@ -126,9 +126,7 @@ def make_row(
         **measure_row(bundle_path, task, profile),
     }
     figures["direct"] = direct_at(name, figures["all"]["1"]["photons_mean"])
-    beside = figures_path.with_suffix(".part")
-    beside.write_text(json.dumps(figures, indent=1))
-    os.replace(beside, figures_path)
+    replace_file(figures_path, json.dumps(figures, indent=1).encode())
     checkpoint.unlink(missing_ok=True)
     return figures
 

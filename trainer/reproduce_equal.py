@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any
 
 import torch
 
+from pans.runtime.container import replace_file
 from pans.runtime.incident import incident_field
 from pans.runtime.profile import load_profile
 
@@ -119,9 +119,7 @@ def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
     started = time.process_time()
     figures = _direct(task, way, photons) if way in DIRECT else _pans(task, way, photons)
     row = {"task": task.name, "way": way, "asked": photons, "cpu_seconds": time.process_time() - started, **figures}
-    beside = path.with_suffix(".part")
-    beside.write_text(json.dumps(row, indent=1))
-    os.replace(beside, path)
+    replace_file(path, json.dumps(row, indent=1).encode())
     return row
 
 

@@ -8,7 +8,6 @@ images. SIMULATED on the profile `ideal`, FashionMNIST.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from pans.runtime.clicks import object_transmission
+from pans.runtime.container import replace_file
 from pans.runtime.profile import load_profile
 
 from .detection import click_probability, click_words
@@ -145,9 +145,7 @@ def _kept(path: Path, make: Callable[[], dict[str, Any]], report: Callable[[str]
         return found
     report(f"measuring {path.stem}")
     made = make()
-    beside = path.with_suffix(".part")
-    beside.write_text(json.dumps(made))
-    os.replace(beside, path)
+    replace_file(path, json.dumps(made).encode())
     return made
 
 

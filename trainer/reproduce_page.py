@@ -7,13 +7,13 @@ Owns the question (`Asked`) and the writing; never measures and never draws. A p
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import say
+from pans.runtime.container import replace_file
 from pans.runtime.errors import UsageError
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
@@ -42,17 +42,10 @@ def write_page(folder: Path, name: str, page: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     texts = {"json": json.dumps({"rows": page["rows"], "simulated": True}, indent=1) + "\n", "md": page["markdown"]}
     for suffix, text in texts.items():
-        replace_text(folder / f"{name}.{suffix}", text)
+        replace_file(folder / f"{name}.{suffix}", text.encode())
     pictures: dict[str, Draw] = page.get("pictures", {})
     for ending, draw in pictures.items():
         try:
             draw(folder / f"{name}{ending}.png")
         except ModuleNotFoundError as error:
             raise UsageError("the picture needs matplotlib, which is not installed", remedy=NEEDS_PLOT) from error
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write `text` to `path`, whole or not at all."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(text, encoding="utf-8")
-    os.replace(beside, path)

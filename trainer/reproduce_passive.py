@@ -12,7 +12,6 @@ figures are no proof.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pans.runtime.container import replace_file
 from pans.runtime.profile import Profile, load_profile
 
 from . import task_barcode
@@ -109,9 +109,7 @@ def make_cell(
         exported = export_trained(path.with_suffix(".pans"), trained, task, profile, name=title, provenance=provenance)
         figures |= {"sha256": exported.sha256, "score_difference": exported.score_difference}
     report(f"{name} d_f={row.features} dark={dark:g}: {figures['value']:.3f} at {figures['clicks']:.2f} clicks")
-    beside = path.with_suffix(".part")
-    beside.write_text(json.dumps(figures, indent=1))
-    os.replace(beside, path)
+    replace_file(path, json.dumps(figures, indent=1).encode())
     return figures
 
 

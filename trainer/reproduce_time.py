@@ -14,7 +14,6 @@ test images at no more than its clicks + 5 %. Processor seconds of one thread, m
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pans.runtime.container import replace_file
 from pans.runtime.profile import load_profile
 
 from .detection import click_probability, sample_clicks
@@ -49,9 +49,7 @@ def time_table(asked: Asked) -> dict[str, Any]:
             path = asked.cache / f"time-{row.features}.json"
             if not path.is_file():
                 made = _race(row, asked.data_dir, asked.report)
-                beside = path.with_suffix(".part")
-                beside.write_text(json.dumps(made, indent=1))
-                os.replace(beside, path)
+                replace_file(path, json.dumps(made, indent=1).encode())
             found.append(json.loads(path.read_text()))
     return {"rows": found, "markdown": _markdown(found)}
 

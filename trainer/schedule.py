@@ -62,11 +62,10 @@ def slope_and_clamp(options: Options, now: float) -> tuple[float, float]:
 def loss_at(options: Options, now: float, picture_shape: tuple[int, int] | None) -> LossOf:
     """Return the cross-entropy, which turns to wrong decisions in the last part of the epochs; of pictures error and similarity.
 
-    Similarity waits for stage 2, where there is one: it takes most of the time, and the error alone leads to the same valley.
+    Similarity waits for stage 2, where there is one: it takes most of the time, and to start without it cost nothing measurable.
     """
     if picture_shape is not None:
-        has_second = second_stage(options) < options.epochs
-        waits = has_second and now < second_stage(options)
+        waits = now < second_stage(options) < options.epochs
         return similarity_loss(0.0 if waits else options.similarity, picture_shape)
     part = options.polish * options.epochs
     into = now - (options.epochs - part)
