@@ -114,7 +114,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
     lab = Lab(first, second)
     asked = []
     for number in range(10):
-        tick = lab.clock.to_tick(time.perf_counter_ns() + 150 * MS)
+        tick = lab.clock.to_tick(time.perf_counter_ns() + 400 * MS)
         asked.append(tick)
         lab.desk.take([Action(number, tick, 2000, 3)])
         lab.turns(0.02)
