@@ -63,48 +63,54 @@ class Options:
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
 
 
+LIMITS = {
+    "features": (1, 4096),
+    "epochs": (1, 100_000),
+    "restarts": (1, 1000),
+    "starts": (1, 1000),
+    "hidden": (1, 65536),
+    "batch": (2, 1 << 20),
+    "seed": (0, 2**63 - 1),
+    "shots": (1, 64),
+    "warm": (0, 1),
+    "polish": (0, 1),
+    "similarity": (0, 1),
+    "mix": (0, 1),
+    "shift_px": (0, 65536),
+    "offset_px": (0, 65536),
+    "copies": (0, 1000),
+}
+CHOICES = {"budget": BUDGETS, "encoder": ENCODERS, "head": HEADS, "estimator": ESTIMATOR_NAMES}
+
+
 def check_options(options: Options, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained on this profile."""
-    limits = {
-        "features": (1, 4096),
-        "epochs": (1, 100_000),
-        "restarts": (1, 1000),
-        "starts": (1, 1000),
-        "hidden": (1, 65536),
-    }
-    limits |= {
-        "batch": (2, 1 << 20),
-        "seed": (0, 2**63 - 1),
-        "shots": (1, 64),
-        "warm": (0, 1),
-        "polish": (0, 1),
-        "similarity": (0, 1),
-        "mix": (0, 1),
-        "shift_px": (0, 65536),
-        "offset_px": (0, 65536),
-        "copies": (0, 1000),
-    }
-    for name, (low, high) in limits.items():
+    for name, (low, high) in LIMITS.items():
         if not low <= getattr(options, name) <= high:
-            raise UsageError(f"--{name} is {getattr(options, name)}, allowed: {low} to {high}")
+            raise UsageError(f"{_flag(name)} is {getattr(options, name)}, allowed: {low} to {high}")
+    for name, allowed in CHOICES.items():
+        if getattr(options, name) not in allowed:
+            raise UsageError(f"{_flag(name)} is {getattr(options, name)!r}, allowed: {', '.join(allowed)}")
     for name in ("alpha", "photons", "clicks", "light", "input_photons"):
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
-            raise UsageError(f"--{name} is {value}, allowed: finite and above 0")
+            raise UsageError(f"{_flag(name)} is {value}, allowed: finite and above 0")
+    if options.dark is not None and not 0 <= options.dark < math.inf:
+        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
+    _check_together(options)
+    _check_fits(options, profile)
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _check_together(options: Options) -> None:
+    """Options that are right by themselves and not beside each other."""
     if options.clicks is not None and options.clicks >= options.features:
         raise UsageError(
             f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
         )
-    if options.budget not in BUDGETS:
-        raise UsageError(f"--budget is {options.budget!r}, allowed: {', '.join(BUDGETS)}")
-    if options.encoder not in ENCODERS:
-        raise UsageError(f"--encoder is {options.encoder!r}, allowed: {', '.join(ENCODERS)}")
-    if options.head not in HEADS:
-        raise UsageError(f"--head is {options.head!r}, allowed: {', '.join(HEADS)}")
-    if options.dark is not None and not 0 <= options.dark < math.inf:
-        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
-    if options.estimator not in ESTIMATOR_NAMES:
-        raise UsageError(f"--estimator is {options.estimator!r}, allowed: {', '.join(ESTIMATOR_NAMES)}")
     if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
         raise UsageError(
             f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
@@ -113,6 +119,9 @@ def check_options(options: Options, profile: Profile) -> None:
         )
     if options.mix > 0 and options.shots < 2:
         raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
+
+
+def _check_fits(options: Options, profile: Profile) -> None:
     channels = profile.detector.channels
     if profile.mode == "parallel" and options.features > channels:
         raise PlanError(
