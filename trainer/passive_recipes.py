@@ -115,8 +115,11 @@ def _fiber(shared: Options, row: PassiveRow) -> Options:
 
 
 def _picture(shared: Options) -> Options:
-    decoder = replace(shared, head="decoder", estimator="disarm", warm=0.5, hidden=512, similarity=0.9)
-    return replace(decoder, epochs=30) if shared.features <= 10 else replace(decoder, epochs=24, copies=2)
+    decoder = replace(shared, head="decoder", similarity=0.9)
+    if shared.features >= 48:  # more clicks than a decoder of the paper's width makes use of
+        return replace(decoder, estimator="ste", hidden=1024, epochs=30, copies=2)
+    disarmed = replace(decoder, estimator="disarm", warm=0.5, hidden=512)
+    return replace(disarmed, epochs=30) if shared.features <= 10 else replace(disarmed, epochs=24, copies=2)
 
 
 def _digits(shared: Options, row: PassiveRow) -> Options:
