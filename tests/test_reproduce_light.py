@@ -47,6 +47,7 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     assert rows["PANS"]["value"] > 45  # by chance a third
     assert rows["posterior"]["value"] > 45
     assert rows["PANS"]["illumination"] > 0
+    assert {row["objects"] for row in rows.values()} == {450}  # all that were held out
     assert len(loaded) == 2
     again = equal.equal_table(Asked("equal-photons", tmp_path))
     assert json.dumps(again["rows"]) == json.dumps(found["rows"])
