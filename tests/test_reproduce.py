@@ -182,6 +182,7 @@ def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatc
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "load", lambda *_: task)
     found = passive.make_cell(tmp_path, "mmf-mnist-image", row, 0.01, None, lambda _line: None)
+    assert found["spread_trials"] is None  # of one trial
     ((title, samples),) = passive.samples_of(tmp_path, "mmf-mnist-image", [(row, found)])
     assert title.startswith("d_f = 4, dark 0.01")
     assert np.array_equal(samples.pictures, images[:1])  # all are of one class

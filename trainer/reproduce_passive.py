@@ -192,11 +192,11 @@ def _accuracy(trained: Trained, p: Tensor, labels: Tensor, share: Tensor) -> tup
     return 100 * float((right * share).sum()), 100 * spread, 100 * right
 
 
-def _similarity(trained: Trained, p: Tensor, images: Any) -> tuple[float, float, Tensor]:
-    """SSIM of the pictures given back, as the paper's release counts it (ssim.py): one trial."""
+def _similarity(trained: Trained, p: Tensor, images: Any) -> tuple[float, float | None, Tensor]:
+    """SSIM of the pictures given back, as the paper's release counts it (ssim.py): one trial, hence no spread over trials."""
     random = torch.Generator().manual_seed(1)
     wanted = torch.from_numpy(images.astype(np.float32) / 255)
     found = torch.cat([trained.head(sample_clicks(part, random).float()) for part in p.split(CHUNK)])
     pictures = found.clamp(0, 1).reshape(wanted.shape)
     values = torch.cat([ssim(a, b) for a, b in zip(pictures.split(CHUNK), wanted.split(CHUNK))]).double()
-    return float(values.mean()), 0.0, values
+    return float(values.mean()), None, values
