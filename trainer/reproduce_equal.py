@@ -184,9 +184,9 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         "sensing: the light that reaches its optics is the light of the camera's frame, W makes none, and `photons` is what it "
         "detects of the N. The network is small and trained for minutes: a lower bound.",
         "",
-        "Of `cells-3`, ten patterns reached 92.3 % at 10 photons and 94.1 % at 25, below the posterior (93.2 and 98.4 %): ten clicks "
+        "Of `cells-3`, ten patterns reached 92.3 % at 10 photons and 94.1 % at 25, below the posterior (92.9 and 98.2 %): ten clicks "
         "are then too few. Rows with more patterns were trained afterwards; how many was chosen on 6000 other objects of the "
-        "generator (data seed 101), for 25 photons among 32, 64 and 128 (97.8, 98.2 and 98.3 % there). "
+        "generator (data seed 101), for 25 photons among 32, 64 and 128 (97.8, 98.2 and 98.3 % there); `cells` has as many. "
         "What PANS saves at few photons it there has to pay for in patterns.",
         "",
     ]
