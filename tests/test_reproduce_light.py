@@ -52,6 +52,13 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     again = equal.equal_table(Asked("equal-photons", tmp_path))
     assert json.dumps(again["rows"]) == json.dumps(found["rows"])
     assert len(loaded) == 2
+    for way, key in (("posterior", "frames"), ("posterior", "floor"), ("network", "epochs")):
+        path = tmp_path / f"equal-columns-{way}-3.json"
+        kept = path.read_text()
+        path.write_text(json.dumps(json.loads(kept) | {key: "another"}))
+        left = {row["way"] for row in equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"]}
+        assert left == set(rows) - {way}  # made in another way, it counts as not made
+        path.write_text(kept)
 
 
 def test_the_page_says_where_we_are_not_ahead():

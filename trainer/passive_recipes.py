@@ -42,6 +42,7 @@ SAME_LIGHT = (
     "cells",
     "cells-4",
 )  # more dark counts take nothing of their light
+CELLS_STARTS = {("cells", 3): 6, ("cells-4", 3): 6, ("cells-4", 10): 4}  # where fewer may all end in a poor valley
 CELLS_RATE = 5e-3  # 10 000 pixels: one step moves the sum over all of them
 
 
@@ -76,9 +77,7 @@ def _recipe(name: str, row: PassiveRow, dark: float, conserving: bool) -> Option
         return _field(name, shared)
     if name == "mmf-mnist-image":
         return _picture(shared)
-    if name == "cells-4" and row.features == 10:
-        return replace(_cells(shared, row), starts=4)  # one start ended in a poor valley
-    return (_digits if name == "mmf-mnist" else _cells)(shared, row)
+    return _digits(shared, row) if name == "mmf-mnist" else _cells(name, shared, row)
 
 
 def _barcode(shared: Options, row: PassiveRow) -> Options:
@@ -135,11 +134,10 @@ def _digits(shared: Options, row: PassiveRow) -> Options:
     return replace(digits, clicks=CLICKS_AIM_FEW * row.clicks, epochs=60, starts=4, restarts=2)
 
 
-def _cells(shared: Options, row: PassiveRow) -> Options:
-    cells = replace(_plain(shared), front_rate=CELLS_RATE)
-    if row.features == 3:  # two starts may both end in a poor valley
-        return replace(cells, starts=6)
-    return replace(cells, clicks=CLICKS_AIM_CELLS * row.clicks)
+def _cells(name: str, shared: Options, row: PassiveRow) -> Options:
+    plain = _plain(shared)
+    cells = replace(plain, front_rate=CELLS_RATE, starts=CELLS_STARTS.get((name, row.features), plain.starts))
+    return cells if row.features == 3 else replace(cells, clicks=CLICKS_AIM_CELLS * row.clicks)
 
 
 def _plain(shared: Options) -> Options:

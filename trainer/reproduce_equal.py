@@ -106,14 +106,14 @@ def _finished(path: Path, name: str, way: str, photons: float) -> dict[str, Any]
     if way not in DIRECT:
         wanted = (recipe if way == "PANS" else light_recipe)(name, photons)
         return found if same_options(found["options"], wanted) else None
-    if found.get("frames") != "all":  # an earlier version read the first 1000
-        return None
-    return found if way != "network" or found["epochs"] == network_epochs(name) else None
+    return found if direct_recipe(name, way).items() <= found.items() else None
 
 
-def network_epochs(name: str) -> int:
-    """Return how many passes over the training objects the network of a task gets, each with fresh noise."""
-    return NETWORK_EPOCHS.get(name, NETWORK_EPOCHS_ELSE)
+def direct_recipe(name: str, way: str) -> dict[str, Any]:
+    """Return what direct imaging is decided with: which frames, and the posterior's floor or the network's passes over fresh noise."""
+    if way == "posterior":
+        return {"frames": "all", "floor": FLOOR}
+    return {"frames": "all", "epochs": NETWORK_EPOCHS.get(name, NETWORK_EPOCHS_ELSE)}
 
 
 def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
@@ -138,16 +138,14 @@ def _pans(task: Task, way: str, photons: float) -> dict[str, Any]:
 
 def _direct(task: Task, way: str, photons: float) -> dict[str, Any]:
     frames = measure_frames(task, None)
+    how = direct_recipe(task.name, way)
     if way == "posterior":
-        decide, _ = bayes(frames, photons, "counting", seed=0, floor=FLOOR)
-        how: dict[str, Any] = {"floor": FLOOR}
+        decide, _ = bayes(frames, photons, "counting", seed=0, floor=how["floor"])
     else:
-        how = {"epochs": network_epochs(task.name)}
         decide = aware_cnn(frames, photons, "counting", seed=0, epochs=how["epochs"])
     done = run_trials(frames, photons, "counting", decide, trials=TRIALS, seed=0)
     whole, first = done.measured(), done.measured(200)
     return how | {
-        "frames": "all",
         "value": 100 * whole.accuracy_mean,
         "first_200": 100 * first.accuracy_mean,
         "spread_trials": 100 * whole.accuracy_std,
