@@ -3,10 +3,9 @@
 import argparse
 import sys
 
+from pans.firmware_sim.commands.simulate import SIMULATE
 from pans.runtime.cli import EXIT_INTERRUPTED, say
 from pans.runtime.errors import PansError
-
-from .commands import SIMULATE
 
 
 def main() -> int:

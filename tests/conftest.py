@@ -28,3 +28,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     return Path(os.environ["PANS_DATA"])
+
+
+@pytest.fixture(scope="module")
+def flow_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with cells.toml, flow.toml and thirds.pans (see thirds.py)."""
+    from thirds import write_thirds
+
+    return write_thirds(tmp_path_factory.mktemp("flow"))

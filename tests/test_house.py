@@ -12,8 +12,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from tree import ROOT
 
-ROOT = Path(__file__).parent.parent
 PACKAGES = ("runtime", "trainer", "firmware_sim", "hw_profiles")
 ALLOWED = {
     "runtime": {"hw_profiles"},
@@ -100,12 +100,12 @@ def test_every_module_says_what_it_owns() -> None:
             assert ast.get_docstring(ast.parse(path.read_text())), path
 
 
-def test_the_package_list_is_flat_and_complete() -> None:
+def test_the_package_list_is_complete() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert settings["packages"] == [f"pans.{package}" for package in PACKAGES]
-    for package in PACKAGES:
-        nested = [path for path in modules(package) if path.parent != ROOT / package]
-        assert not nested, nested
+    folders = {path.parent for package in PACKAGES for path in modules(package)}
+    assert set(settings["packages"]) == {"pans." + ".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    for folder in folders:
+        assert (folder / "__init__.py").is_file(), folder
 
 
 @pytest.mark.skipif(os.environ.get("PANS_SKIP_WHEEL") == "1", reason="PANS_SKIP_WHEEL=1: no build tools here")

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.profile import Profile
+from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
 ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py

@@ -14,9 +14,8 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.firmware_sim.calrun import simulate
-from pans.runtime.calibrate import Counts, fit_light, log_likelihood
-from pans.runtime.calibration_run import (
+from pans.firmware_sim.trials.calibration import simulate
+from pans.runtime.core.calibration import (
     LADDER,
     TELLING,
     calibration_exposure_us,
@@ -25,8 +24,9 @@ from pans.runtime.calibration_run import (
     design_run,
     profile_level,
 )
+from pans.runtime.instrument.estimate import Counts, fit_light, log_likelihood
+from pans.runtime.instrument.profile import load_profile
 from pans.runtime.intervals import CHI2_95, jeffreys_interval
-from pans.runtime.profile import load_profile
 
 
 def main() -> None:

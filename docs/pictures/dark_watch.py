@@ -13,9 +13,9 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 
-from pans.firmware_sim.darkrun import Detector
-from pans.runtime.channels import ChannelHealth
-from pans.runtime.dark_watch import ChannelWatch, WatchSettings
+from pans.firmware_sim.trials.dark_counts import Detector
+from pans.runtime.instrument.channel_health import ChannelHealth
+from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 
 RATE, CHANNELS, STEP = 0.01, 4, 20
 LEGS = ((12_000, 1.0), (6_000, 2.0), (6_000, 1.0), (300, 20.0), (6_000, 1.0))

@@ -14,14 +14,14 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from pans.runtime.cmd_replay import sent_plan
-from pans.runtime.connection import plan_from_chunks
-from pans.runtime.decide import make_decider
-from pans.runtime.passages import abort_reason
-from pans.runtime.record import read_recording
-from pans.runtime.record_format import NO_LABEL
-from pans.runtime.run_flow import replayed_core
-from pans.runtime.wire import MessageType, decode_frames, decode_mark, unpack_body
+from pans.runtime.commands.replay import sent_plan
+from pans.runtime.commands.run_flow import replayed_core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.flow.matching import abort_reason
+from pans.runtime.link.connection import plan_from_chunks
+from pans.runtime.record.format import NO_LABEL
+from pans.runtime.record.recorder import read_recording
+from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
 
 recording = read_recording(Path(sys.argv[1]))
 first = int(sys.argv[2]) if len(sys.argv) > 2 else 0

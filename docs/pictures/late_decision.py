@@ -12,14 +12,14 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from pans.firmware_sim.gridrun import grid_setup
-from pans.firmware_sim.serve import open_sim
-from pans.runtime import blame
-from pans.runtime.blame import Verdict
-from pans.runtime.core import Core
-from pans.runtime.decide import make_decider
-from pans.runtime.evidence import IDLE, OVERSLEPT, Facts
-from pans.runtime.loop import RunConfig, run_live
+from pans.firmware_sim.ports.serve import open_sim
+from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.live.loop import RunConfig, run_live
+from pans.runtime.timing import attribution as blame
+from pans.runtime.timing.attribution import Verdict
+from pans.runtime.timing.evidence import IDLE, OVERSLEPT, Facts
 
 CASES = {
     "stall:60ms/400ms": "the link stalls",

@@ -12,15 +12,15 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from pans.firmware_sim.changes import Changes
-from pans.firmware_sim.detector import detector_model, first_click_probability, sample_clicks
-from pans.firmware_sim.exposures import Exposures
-from pans.firmware_sim.light import begin, prepare
-from pans.firmware_sim.moving import Cells
-from pans.firmware_sim.scene_file import open_scene
-from pans.firmware_sim.upload import Program
-from pans.runtime.profile import load_profile
-from pans.runtime.wire_commands import PARALLEL
+from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.scene.changes import Changes
+from pans.firmware_sim.scene.detector import detector_model, first_click_probability, sample_clicks
+from pans.firmware_sim.scene.exposure_times import Exposures
+from pans.firmware_sim.scene.light import begin, prepare
+from pans.firmware_sim.scene.moving import Cells
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.wire.commands import PARALLEL
 
 matplotlib.use("Agg")
 from matplotlib import pyplot

@@ -1,0 +1,1 @@
+"""Argparse in, exit code out; no computation."""

@@ -1,0 +1,125 @@
+"""`pans simulate`: a stand-alone simulated instrument behind a pseudo-terminal or TCP.
+
+Owns the command's arguments and its way to end; never the instrument. The first line on stdout is the device URL.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+from typing import NoReturn
+
+from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS
+from pans.firmware_sim.ports.faults import check_possible, parse_faults
+from pans.firmware_sim.ports.serve import DEFAULT_SCENE, SimOptions, build_instrument, check_options
+from pans.firmware_sim.ports.shell import open_port, serve
+from pans.runtime.cli import Command, emit, say
+from pans.runtime.timing.cpu import check_core
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
+    parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark, a .npz or a .toml file")
+    parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
+    parser.add_argument(
+        "--changes", default="", help="like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (SIMULATOR.md)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
+    parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
+    parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
+    parser.add_argument("--drift-ppm", type=float, default=DEFAULT_DRIFT_PPM, help="rate error of the device's clock")
+    parser.add_argument(
+        "--optics", default="", metavar="BUNDLE", help="look through the passive optics of this bundle: no projector"
+    )
+    parser.add_argument(
+        "--buffer", type=int, default=256, help="stream messages that the device can hold back (default 256)"
+    )
+    parser.add_argument("--core", type=int, metavar="N", help="bind it to processor core N and keep that awake")
+    parser.add_argument(
+        "--echo", type=int, metavar="BYTES", help="no instrument: answer each frame with BYTES bytes (for benchmarks)"
+    )
+    parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started this one")
+
+
+def _run(args: argparse.Namespace) -> int:
+    options = check_options(
+        SimOptions(
+            args.profile,
+            args.scene,
+            args.seed,
+            offset=args.offset,
+            drift_ppm=args.drift_ppm,
+            faults=args.faults,
+            buffer=args.buffer,
+            optics=args.optics,
+            changes=args.changes,
+        )
+    )
+    check_core(args.core)
+    check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
+    instrument, clock = build_instrument(options, time.perf_counter_ns())
+    if args.echo is not None:
+        instrument = FrameEcho(args.echo)
+    port = open_port(args.listen)
+    signal.signal(signal.SIGTERM, _leave)
+    orphaned = _watch_stdin() if args.until_stdin_closes else threading.Event()
+    payload = {"device": port.url, "profile": args.profile, "scene": args.scene, "seed": args.seed, "simulated": True}
+    try:
+        emit(args, payload, port.url)
+        if not args.until_stdin_closes:
+            say(f"SIMULATED instrument {args.profile} before scene {args.scene}; Ctrl-C ends it")
+        gc.freeze()  # what was made so far is never collected: hardware has no pauses
+        serve(instrument, clock, port, orphaned.is_set, args.core)
+    finally:
+        port.close()
+    return 0
+
+
+class FrameEcho:
+    """No instrument at all: as many bytes back for every delimiter that comes, to know what the port alone costs."""
+
+    session = 0
+
+    def __init__(self, n_bytes: int) -> None:
+        self._answer = bytes(n_bytes)
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        """See `SteppedDevice`."""
+        return self._answer * data.count(0)
+
+    def next_event_tick(self) -> int | None:
+        """See `SteppedDevice`."""
+        return None
+
+    def draw_ahead(self) -> bool:
+        """See `SteppedDevice`."""
+        return False
+
+
+def _watch_stdin() -> threading.Event:
+    """Return an event that is set when the starting process closes our standard input, by dying at the latest."""
+    closed = threading.Event()
+
+    def watch() -> None:
+        try:
+            while os.read(sys.stdin.fileno(), 4096):
+                pass
+        except OSError:
+            pass
+        closed.set()
+
+    threading.Thread(target=watch, name="pans-sim-stdin", daemon=True).start()
+    return closed
+
+
+def _leave(signum: int, frame: FrameType | None) -> NoReturn:
+    raise SystemExit(0)
+
+
+SIMULATE = Command("run a simulated instrument that other programs open as an ordinary device", _configure, _run)

@@ -1,0 +1,1 @@
+"""The instrument as a state machine without I/O."""

@@ -1,0 +1,78 @@
+"""The actuation outputs: which pulses were accepted, and which output is open when.
+
+Owns the pulses and refusals, bounded, as the ground truth of what was actuated; never decides whether the state allows one (device.py).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from pans.runtime.wire.commands import Gate
+from pans.runtime.wire.messages import AckStatus
+
+from .upload import Refused
+
+GATE_CHANNELS = 8
+MAX_PENDING_GATES = 256
+MAX_KEPT_PULSES = 4096
+
+
+class GatePulse(NamedTuple):
+    """One accepted actuation: output `channel` opens at `tick` and closes at `end_tick`, unless cut short."""
+
+    tick: int
+    end_tick: int
+    channel: int
+
+
+class GateRefusal(NamedTuple):
+    """One pulse that was asked for at tick `asked_at` and not accepted, and why."""
+
+    tick: int
+    channel: int
+    asked_at: int
+    status: AckStatus
+
+
+class Gates:
+    """All outputs; `pulses` and `refusals` in the order of their commands, the oldest forgotten; `accepted` and `refused` count all."""
+
+    def __init__(self) -> None:
+        self.pulses: deque[GatePulse] = deque(maxlen=MAX_KEPT_PULSES)
+        self.refusals: deque[GateRefusal] = deque(maxlen=MAX_KEPT_PULSES)
+        self.accepted = self.refused = 0
+        self._pending: list[int] = []  # ticks, some of them passed
+
+    def add(self, gate: Gate, now: int) -> None:
+        """Accept a pulse, or raise `Refused`: a pulse that comes too late is never executed."""
+        try:
+            self._check(gate, now)
+        except Refused as refusal:
+            self.refused += 1
+            self.refusals.append(GateRefusal(gate.tick, gate.channel, now, refusal.status))
+            raise
+        self.accepted += 1
+        self._pending.append(gate.tick)
+        self.pulses.append(GatePulse(gate.tick, gate.tick + gate.duration_ticks, gate.channel))
+
+    def _check(self, gate: Gate, now: int) -> None:
+        if gate.tick <= now:
+            raise Refused(AckStatus.TOO_LATE, f"gate tick {gate.tick} has passed, it is {now}")
+        if gate.channel >= GATE_CHANNELS or not gate.duration_ticks:
+            text = f"gate {gate.channel} for {gate.duration_ticks} ticks: channels are 0..{GATE_CHANNELS - 1}"
+            raise Refused(AckStatus.OUT_OF_RANGE, text)
+        if len(self._pending) >= MAX_PENDING_GATES:
+            self._pending = [tick for tick in self._pending if tick > now]
+        if len(self._pending) >= MAX_PENDING_GATES:
+            raise Refused(AckStatus.OUT_OF_RANGE, f"{MAX_PENDING_GATES} gate pulses are pending already")
+
+    def is_open(self, channel: int, now: int) -> bool:
+        """Whether output `channel` is open at tick `now`."""
+        return any(pulse.channel == channel and pulse.tick <= now < pulse.end_tick for pulse in self.pulses)
+
+    def close_all(self, now: int) -> None:
+        """Close what is open and cancel what is to come."""
+        kept = [pulse._replace(end_tick=min(pulse.end_tick, now)) for pulse in self.pulses if pulse.tick <= now]
+        self.pulses = deque(kept, maxlen=MAX_KEPT_PULSES)
+        self._pending.clear()

@@ -1,0 +1,398 @@
+"""The instrument as a sans-I/O state machine: bytes and ticks in, bytes out (docs/PROTOCOL.md is its specification).
+
+Owns the session, commands, states, lease, receive window and gates; never reads a clock, sleeps or opens a port.
+`Instrument.step(tick, data)` moves device time to `tick`, digests what the host sent by then and returns what the device has
+sent. Whatever arrives, it answers, refuses or counts; it never raises over bytes and never allocates beyond its limits.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pans.firmware_sim.scene.changes import Changes
+from pans.firmware_sim.scene.detector import detector_model
+from pans.firmware_sim.scene.drawing import ClickSource
+from pans.firmware_sim.scene.exposure_times import Exposures
+from pans.firmware_sim.scene.light import LightTable, StillObjects, begin, prepare, tabulate, warm_up
+from pans.firmware_sim.scene.moving import SceneFile
+from pans.firmware_sim.scene.optics import passive_photoelectrons
+from pans.firmware_sim.scene.still import Scene
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import PARALLEL, Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
+from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
+
+from .gates import GATE_CHANNELS, Gates
+from .sequential import MAX_LEASE_MS, Measurement, check_arm
+from .stream_buffer import U32, StreamBuffer
+from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
+
+if TYPE_CHECKING:
+    from pans.firmware_sim.scene.shifts import ShiftTable
+    from pans.firmware_sim.scene.tape import BarTable
+
+    from .parallel import FrameRun
+
+FIRMWARE = "pans-sim 1"
+BUFFER_MESSAGES = 256
+NEVER = 1 << 64
+
+
+@dataclass(slots=True)
+class InstrumentCounters:
+    """What the instrument has seen since power-on; nothing is dropped without one of these moving."""
+
+    sessions: int = 0
+    foreign_session: int = 0
+    unknown_type: int = 0
+    malformed: int = 0
+    refused: int = 0
+    repeated_commands: int = 0
+    commands_out_of_order: int = 0
+    lease_expiries: int = 0
+
+
+class Instrument:
+    """A simulated instrument from power-on; `step` and `next_event_tick` are all that a shell needs."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        scene: Scene | SceneFile,
+        *,
+        seed: int = 0,
+        power_on_tick: int = 0,
+        epoch: int = 1,
+        buffer_messages: int = BUFFER_MESSAGES,
+        optics: Analyser | None = None,
+    ) -> None:
+        self.optics = optics  # passive: then there is no projector
+        self.profile = profile
+        self.scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
+        _check_scene(self.scene, profile, optics)
+        warm_up(self.scene)
+        if profile.mode == "parallel":  # nothing is compiled after the instrument is switched on
+            from pans.firmware_sim.scene import detector_kernels
+
+            from . import frame_writer
+
+            detector_kernels.warm_up()
+            frame_writer.warm_up()
+        self.counters = InstrumentCounters()
+        self.decoder = wire.FrameDecoder()
+        self.decoder.use_kernels()
+        self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
+        self.session = 0  # the host's nonce; 0 before the first HELLO
+        self.gates = Gates()
+        self._seed, self._epoch, self._tick, self._tick_hz = seed, epoch, power_on_tick, profile.clock.tick_hz
+        self._draws = 0  # exposures drawn in earlier runs
+        self.stream = StreamBuffer(buffer_messages)
+        self._out: list[bytes | memoryview] = []
+        self._forget_session()
+
+    def _forget_session(self) -> None:
+        projector = self.profile.projector
+        pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
+        self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
+        self._plan = PlanMemory(self.profile)
+        self._light: tuple[tuple[int, int, int], LightTable | ShiftTable | BarTable] | None = None
+        self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
+        self._run: Measurement | FrameRun | None = None
+        self._lease_tick: int | None = None
+        self._status_tick: int | None = None
+        self._exposures_ended = 0
+        self.stream.limit = 0
+        self.stream.restart()
+
+    @property
+    def tick(self) -> int:
+        """Device time of the latest step."""
+        return self._tick
+
+    @property
+    def projector_lit(self) -> bool:
+        """Whether light can leave the projector: in a run, and in no other state."""
+        return self.state is DeviceState.RUNNING
+
+    # -- time ----------------------------------------------------------------------------------------------------------
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        """Advance to `tick` (never back), digest `data` as having arrived then, and return all bytes sent by then."""
+        if tick < self._tick:
+            raise ValueError(f"device time cannot go back: at {self._tick}, asked for {tick}")
+        while True:
+            due, what = self._next_event()
+            if self.state is DeviceState.RUNNING and self._run is not None:
+                self._out += self.stream.put_due(self._run, min(due, tick), self.session)
+            if due > tick:
+                break
+            self._tick = due
+            self._happen(what)
+        self._tick = tick
+        if data:
+            for frame in self.decoder.feed(data):
+                self._receive(frame)
+        sent = b"".join(self._out)
+        self._out.clear()
+        return sent
+
+    def next_event_tick(self) -> int | None:
+        """Tick at which the device does something by itself next; None when it only waits for the host."""
+        due, _ = self._next_event()
+        if self.state is DeviceState.RUNNING and self._run is not None and (message := self._run.next_tick) is not None:
+            due = min(due, message)
+        return None if due == NEVER else due
+
+    def draw_ahead(self) -> bool:
+        """Do a piece of work that will be needed: for shells that have nothing else to do. Whether there was any."""
+        return self._run is not None and self._run.draw_ahead()
+
+    def _next_event(self) -> tuple[int, str]:
+        """The earliest event but for the stream's messages, which go before it; at the same tick in the order end, lease, status."""
+        due, what = NEVER if self._status_tick is None else self._status_tick, "status"
+        if self._run is None:
+            return due, what
+        if self._lease_tick is not None and self._lease_tick <= due:
+            due, what = self._lease_tick, "lease"
+        if self.state is DeviceState.ARMED:
+            return (self._run.start_tick, "start") if self._run.start_tick <= due else (due, what)
+        end = self._run.end_tick
+        return (end, "end") if end is not None and end <= due else (due, what)
+
+    def _happen(self, what: str) -> None:
+        if what == "status":
+            self._send_status()
+        elif what == "start":
+            self._enter(DeviceState.RUNNING, StateReason.NONE)
+        elif what == "end":
+            self._end_run(DeviceState.IDLE, StateReason.COMPLETED)
+        elif what == "lease":
+            self.counters.lease_expiries += 1
+            self._end_run(DeviceState.SAFE, StateReason.LEASE_EXPIRED)
+
+    def _enter(self, state: DeviceState, reason: StateReason) -> None:
+        self.state, self.reason = state, reason
+        self._send_status()
+
+    def _end_run(self, state: DeviceState, reason: StateReason) -> None:
+        """Leave ARMED or RUNNING: what was exposed is sent, the projector goes dark, gates close unless the run completed."""
+        run = self._run
+        if run is None:
+            return
+        rest = run.cut(self._tick)
+        if rest is not None:
+            self._out += self.stream.put(rest, self.session)
+        self._exposures_ended = run.ended_by(self._tick)
+        self._draws += run.begun_by(self._tick)
+        self._run = self._lease_tick = None
+        if reason is not StateReason.COMPLETED:
+            self.gates.close_all(self._tick)
+        self._enter(state, reason)
+
+    # -- what the device sends -----------------------------------------------------------------------------------------
+
+    def _send_status(self) -> None:
+        if not self.session:
+            return
+        self._status_tick = self._tick + self._tick_hz
+        left = 0 if self._lease_tick is None else (self._lease_tick - self._tick) * 1000 // self._tick_hz
+        following = self._exposures_ended if self._run is None else self._run.begun_by(self._tick)
+        status = wire.Status(self.state, self.reason, left, self.stream.dropped_exposures & U32, self._tick, following)
+        self._out.append(wire.encode_status(status, self.session))
+
+    def _send_ack(self) -> None:
+        self._out.append(wire.encode_ack(self._ack, self.session))
+
+    # -- what the device receives --------------------------------------------------------------------------------------
+
+    def _receive(self, frame: Frame) -> None:
+        try:
+            if frame.type == MessageType.HELLO:
+                self._hello(frame)
+            elif not self.session or frame.session != self.session:
+                self.counters.foreign_session += 1
+            elif frame.type == MessageType.PING:
+                ping = wire.decode_ping(frame.payload)
+                pong = wire.Pong(ping.probe_id, ping.host_ns, self._tick, self._tick)
+                self._out.append(wire.encode_pong(pong, self.session))
+            elif frame.type == MessageType.GRANT:
+                self._grant(wire.decode_grant(frame.payload))
+            elif frame.type == MessageType.COMMAND:
+                self._command(wire.decode_command(frame.payload))
+            else:
+                self.counters.unknown_type += 1
+        except wire.MalformedMessage:
+            self.counters.malformed += 1
+
+    def _hello(self, frame: Frame) -> None:
+        hello = wire.decode_hello(frame.payload)
+        if not frame.session:
+            raise wire.MalformedMessage("HELLO without a nonce")
+        if frame.session == self.session and hello == (wire.SCHEMA, wire.PROTOCOL_VERSION):
+            # A repetition: starting afresh here would let commands that came in between be executed twice.
+            self._out.append(wire.encode_welcome(self._facts(), self.session))
+            self._send_status()
+            return
+        self.counters.sessions += 1
+        self._end_run(DeviceState.IDLE, StateReason.STOPPED)
+        self._forget_session()
+        self._out.append(wire.encode_welcome(self._facts(), frame.session))
+        # Another schema would misread every further byte: say who we are and go no further.
+        same = hello == (wire.SCHEMA, wire.PROTOCOL_VERSION)
+        self.session = frame.session if same else 0
+        self._send_status()
+
+    def _facts(self) -> dict[str, Any]:
+        profile = self.profile
+        passive = {} if self.optics is None else {"optics_sha256": self.optics.fingerprint}
+        return passive | {
+            "firmware": FIRMWARE,
+            "serial": f"SIM-{self._seed & U32:08X}",
+            "epoch": self._epoch,
+            "tick_hz": self._tick_hz,
+            "tick": self._tick,
+            "mode": profile.mode,
+            "channels": profile.detector.channels,
+            "levels": profile.projector.levels,
+            "pattern_memory": profile.projector.pattern_memory,
+            "pattern_pixels": min(profile.projector.width_px * profile.projector.height_px, MAX_PATTERN_PIXELS),
+            "slot_memory": MAX_SLOTS,
+            "buffer_messages": self.stream.capacity,
+            "simulated": True,
+            "profile": profile.name,
+            "gate_channels": GATE_CHANNELS,
+            "scene": self.scene.name[:60],  # a receiver takes at most 256 bytes of text
+            "objects": self.scene.n_objects,
+            "seed": self._seed,
+        }
+
+    def _grant(self, grant: wire.Grant) -> None:
+        if self._run is not None and grant.lease_ms:
+            self._renew(grant.lease_ms)
+        self._out += self.stream.grant(grant.stream_limit)
+
+    def _renew(self, lease_ms: int) -> None:
+        self._lease_tick = self._tick + max(1, min(lease_ms, MAX_LEASE_MS) * self._tick_hz // 1000)
+
+    def _command(self, command: wire.CommandMessage) -> None:
+        expected = self._ack.last_id + 1
+        if command.command_id == expected:
+            mask = self._ack.refused_mask << 1 & U32
+            self._ack = self._ack._replace(last_id=expected, refused_mask=mask)
+            try:
+                self._execute(command)
+            except Refused as refusal:
+                self.counters.refused += 1
+                self._ack = wire.Ack(expected, expected, refusal.status, refusal.text, mask | 1)
+            except wire.MalformedMessage as error:
+                self.counters.refused += 1
+                self._ack = wire.Ack(expected, expected, AckStatus.MALFORMED, str(error), mask | 1)
+        elif command.command_id < expected:
+            self.counters.repeated_commands += 1
+        else:
+            self.counters.commands_out_of_order += 1
+        self._send_ack()
+
+    # -- commands ------------------------------------------------------------------------------------------------------
+
+    def _execute(self, command: wire.CommandMessage) -> None:
+        opcode, body = command.opcode, command.body
+        if opcode == Opcode.LOAD_PATTERN:
+            self._require_idle("LOAD_PATTERN")
+            if self.optics is not None:
+                raise Refused(AckStatus.OUT_OF_RANGE, "passive optics: there is no projector to show a pattern")
+            self._patterns.load(unpack_pattern(body))
+        elif opcode == Opcode.LOAD_PLAN:
+            self._require_idle("LOAD_PLAN")
+            self._plan.load(unpack_plan(body))
+            if self._plan.program is not None:
+                with suppress(Refused):  # ARM says what is wrong
+                    self._light_table(self._plan.program)  # seconds for many pictures in flow: ARM must not wait for it
+        elif opcode == Opcode.ARM:
+            self._require_idle("ARM")
+            self._arm(unpack_arm(body))
+        elif opcode == Opcode.GATE:
+            self._gate(body)
+        elif opcode in (Opcode.STOP, Opcode.RESET):
+            if body:
+                raise wire.MalformedMessage(f"{Opcode(opcode).name} has a body of {len(body)} bytes, expected none")
+            self._end_run(DeviceState.IDLE, StateReason.STOPPED)
+            if opcode == Opcode.RESET and self.state is DeviceState.SAFE:
+                self._enter(DeviceState.IDLE, StateReason.NONE)
+        else:
+            raise Refused(AckStatus.UNKNOWN_OPCODE, f"opcode {opcode:#04x} is not in protocol {wire.PROTOCOL_VERSION}")
+
+    def _require_idle(self, what: str) -> None:
+        if self.state is not DeviceState.IDLE:
+            hint = ": RESET leaves it" if self.state is DeviceState.SAFE else ""
+            raise Refused(AckStatus.WRONG_STATE, f"{what} needs IDLE, the device is {self.state.name}{hint}")
+
+    def _arm(self, arm: Arm) -> None:
+        program = self._plan.program
+        if program is None:
+            raise Refused(AckStatus.WRONG_STATE, "no complete plan is loaded")
+        check_arm(program, arm, self._tick, self._tick_hz)
+        table = self._light_table(program)
+        model = detector_model(self.profile, self._exposure_us(program))
+        exposures = Exposures(program, arm.n_cycles or None, self._tick_hz)
+        changes = Changes(self.scene.changes, program.channels)
+        light = begin(self.scene, table, program, exposures, changes, self._seed, self._draws)
+        self.stream.restart()
+        self._exposures_ended = 0
+        source = ClickSource(light, exposures, model, changes, self._seed, self._draws)
+        if isinstance(light, StillObjects) and program.mode != PARALLEL:
+            self._run = Measurement(program, arm, light, source)
+        else:
+            from .parallel import FrameRun  # numba is loaded only for parallel instruments
+
+            self._run = FrameRun(program, arm, light, source, self.scene.moves)
+        self._renew(arm.lease_ms)
+        self._enter(DeviceState.ARMED, StateReason.NONE)
+
+    def _exposure_us(self, program: Program) -> float:
+        return program.exposure_ticks * 1e6 / self._tick_hz
+
+    def _light_table(self, program: Program) -> LightTable | ShiftTable | BarTable:
+        """Return the table of this pattern set at this exposure, computed at most once for each."""
+        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
+        if self._light is None or self._light[0] != key:
+            try:
+                self._light = (key, self._tabulate(program))
+            except ConfigError as error:
+                raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
+        return self._light[1]
+
+    def _tabulate(self, program: Program) -> LightTable | ShiftTable | BarTable:
+        exposure_us = self._exposure_us(program)
+        if self.optics is None:
+            return prepare(self.profile, self.scene, self._patterns.stack(program.n_patterns), exposure_us)
+        if program.n_patterns != len(self.optics.matrix):
+            text = f"a plan of {program.n_patterns} patterns, the optics lead to {len(self.optics.matrix)} detectors"
+            raise Refused(AckStatus.OUT_OF_RANGE, text)
+        assert isinstance(self.scene.what, Scene)  # see _check_scene
+        return tabulate(self.profile, passive_photoelectrons(self.optics, self.scene.what, exposure_us), exposure_us)
+
+    def _gate(self, body: bytes) -> None:
+        gate = unpack_gate(body)
+        if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
+            raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
+        self.gates.add(gate, self._tick)
+
+
+def _check_scene(scene: SceneFile, profile: Profile, optics: Analyser | None) -> None:
+    """Refuse what the simulator cannot do with a scene that moves."""
+    if not scene.moves:
+        return
+    if profile.mode != "parallel":
+        raise ConfigError(
+            f"scene {scene.name!r} moves, and {profile.name} shows pattern after pattern: objects would be gone before the last one",
+            remedy="choose a parallel profile, such as flow-snspd",
+        )
+    if optics is not None:
+        raise ConfigError(
+            f"scene {scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
+        )

@@ -1,0 +1,219 @@
+"""What the host has uploaded: pattern memory and plan memory, with every limit checked before anything is stored.
+
+Owns the checks of LOAD_PATTERN and LOAD_PLAN and the compiled `Program`; never runs it. A chunk that cannot be meant raises
+`Refused` with the status and text of the acknowledgement, and leaves the memory as it was. Chunks come in order; the one that
+starts at 0 starts over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk, PlanChunk
+from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, DARK_PATTERN, MAX_PAYLOAD_BYTES, AckStatus
+
+MAX_PATTERN_PIXELS = 1 << 22
+MAX_UPLOAD_BYTES = 1 << 28
+MAX_SLOTS = 1 << 20
+MAX_CYCLE_TICKS = 1 << 48
+
+
+class Refused(Exception):
+    """A command that the device does not carry out; becomes the acknowledgement's status and text."""
+
+    def __init__(self, status: AckStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.text = text
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A complete plan: exposures of one cycle, int64 (slots,), and how they are cut into blocks (first slot, count)."""
+
+    mode: int
+    n_patterns: int
+    exposure_ticks: int
+    slot_period_ticks: int
+    cycle_ticks: int
+    cycles_per_object: int
+    offsets: NDArray[np.int64]
+    patterns: NDArray[np.uint16]
+    blocks: tuple[tuple[int, int], ...]
+
+    @property
+    def n_slots(self) -> int:
+        return len(self.offsets)
+
+    @property
+    def channels(self) -> int:
+        return self.n_patterns if self.mode == PARALLEL else 1
+
+
+@dataclass(slots=True)
+class _Pattern:
+    levels: NDArray[np.uint16]
+    filled: int = 0
+
+
+@dataclass(slots=True)
+class PatternMemory:
+    """The uploaded patterns; `revision` changes whenever a pixel does."""
+
+    capacity: int
+    max_pixels: int
+    levels: int
+    revision: int = 0
+    _patterns: dict[int, _Pattern] = field(default_factory=dict)
+
+    def load(self, chunk: PatternChunk) -> None:
+        """Store one chunk, or raise `Refused`."""
+        _require(chunk.pattern < self.capacity, lambda: f"pattern {chunk.pattern}: memory holds {self.capacity}")
+        allowed = min(self.max_pixels, MAX_PATTERN_PIXELS)
+        _require(chunk.n_pixels <= allowed, lambda: f"pattern of {chunk.n_pixels} pixels: allowed {allowed}")
+        top = int(chunk.levels.max())
+        _require(top < self.levels, lambda: f"level {top}: the projector has 0..{self.levels - 1}")
+        pattern = self._patterns.get(chunk.pattern)
+        if chunk.first_pixel == 0:
+            pattern = self._new(chunk)
+        if pattern is None or chunk.first_pixel != pattern.filled or chunk.n_pixels != len(pattern.levels):
+            expected = f"{pattern.filled} of {len(pattern.levels)}" if pattern else "0"
+            found = f"{chunk.first_pixel} of {chunk.n_pixels}"
+            raise Refused(AckStatus.OUT_OF_RANGE, f"pattern {chunk.pattern}: pixel {found}, expected {expected}")
+        pattern.levels[pattern.filled : pattern.filled + len(chunk.levels)] = chunk.levels
+        pattern.filled += len(chunk.levels)
+        self.revision += 1
+
+    def _new(self, chunk: PatternChunk) -> _Pattern:
+        held = sum(pattern.levels.nbytes for index, pattern in self._patterns.items() if index != chunk.pattern)
+        wanted = held + 2 * chunk.n_pixels
+        _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
+        pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, np.uint16))
+        return pattern
+
+    def stack(self, n_patterns: int) -> NDArray[np.uint16]:
+        """Return patterns 0..n-1 as uint16 (n, pixels); `Refused` when one is missing, incomplete or of another size."""
+        chosen = [self._patterns.get(index) for index in range(n_patterns)]
+        complete = [one.levels for one in chosen if one is not None and one.filled == len(one.levels)]
+        if len(complete) < n_patterns:
+            raise Refused(
+                AckStatus.WRONG_STATE, f"{n_patterns - len(complete)} of {n_patterns} patterns are not loaded"
+            )
+        sizes = sorted({len(levels) for levels in complete})
+        if len(sizes) > 1:
+            raise Refused(AckStatus.OUT_OF_RANGE, f"patterns have different sizes: {sizes[0]} and {sizes[-1]} pixels")
+        return np.stack(complete)
+
+
+@dataclass(slots=True)
+class PlanMemory:
+    """The uploaded plan; `program` is None until its last slot has come and all of it can be done."""
+
+    profile: Profile
+    program: Program | None = None
+    _head: PlanChunk | None = None
+    _slots: list[NDArray[np.void]] = field(default_factory=list)
+    _filled: int = 0
+
+    def load(self, chunk: PlanChunk) -> None:
+        """Store one chunk, or raise `Refused`; the last one compiles the program."""
+        if chunk.first_slot == 0:
+            _check_head(self.profile, chunk)
+            self._head, self._slots, self._filled, self.program = chunk, [], 0, None
+        if self._head is None or chunk.first_slot != self._filled or _facts(chunk) != _facts(self._head):
+            raise Refused(
+                AckStatus.OUT_OF_RANGE, f"slot {chunk.first_slot} does not continue the plan at {self._filled}"
+            )
+        _check_slots(chunk)
+        self._slots.append(chunk.slots)
+        self._filled += len(chunk.slots)
+        if self._filled == chunk.n_slots:
+            self.program = self._compile(chunk, np.concatenate(self._slots))
+
+    def _compile(self, head: PlanChunk, slots: NDArray[np.void]) -> Program:
+        offsets = slots["offset_ticks"].astype(np.int64)
+        gaps = np.diff(offsets, append=offsets[0] + head.cycle_ticks)
+        _check_spacing(self.profile, head, gaps)
+        if head.mode != PARALLEL:
+            _check_pattern_rate(self.profile, head, offsets, slots["pattern"])
+        return Program(
+            head.mode, head.n_patterns, head.exposure_ticks, head.slot_period_ticks, head.cycle_ticks,
+            head.cycles_per_object, offsets, slots["pattern"].astype(np.uint16),
+            _cut_into_blocks(gaps, head.slot_period_ticks, head.block_exposures),
+        )  # fmt: skip
+
+
+def word_bytes(n_channels: int) -> int:
+    """Bytes of one frame word: 1, 2, 4 or a multiple of 8, at least one bit for each channel."""
+    needed = (n_channels + 7) // 8
+    return next((size for size in (1, 2, 4) if needed <= size), (needed + 7) // 8 * 8)
+
+
+def _facts(chunk: PlanChunk) -> tuple[int, ...]:
+    return (*chunk[:3], *chunk[4:9])
+
+
+def _check_head(profile: Profile, head: PlanChunk) -> None:
+    tick_hz = profile.clock.tick_hz
+    channels = profile.detector.channels if head.mode == PARALLEL else profile.projector.pattern_memory
+    low, high = (round(us * tick_hz / 1e6) for us in (profile.exposure.min_us, profile.exposure.max_us))
+    per_exposure = word_bytes(head.n_patterns) if head.mode == PARALLEL else 2 + 1 / 8
+    longest = int((MAX_PAYLOAD_BYTES - BLOCK_HEADER_BYTES - 1) / per_exposure)
+    _require(head.mode == MODES[profile.mode], lambda: f"mode {head.mode}: this instrument is {profile.mode}")
+    _require(1 <= head.n_patterns <= channels, lambda: f"{head.n_patterns} patterns: allowed 1..{channels}")
+    _require(1 <= head.n_slots <= MAX_SLOTS, lambda: f"{head.n_slots} slots: allowed 1..{MAX_SLOTS}")
+    _require(low - 1 <= head.exposure_ticks <= high + 1, lambda: f"exposure {head.exposure_ticks}: {low}..{high} ticks")
+    _require(head.exposure_ticks > 0, lambda: "exposure of 0 ticks")
+    _require(0 < head.cycle_ticks <= MAX_CYCLE_TICKS, lambda: f"cycle of {head.cycle_ticks}: up to {MAX_CYCLE_TICKS}")
+    _require(1 <= head.block_exposures <= longest, lambda: f"{head.block_exposures} exposures per block: 1..{longest}")
+    _require(head.cycles_per_object > 0, lambda: "0 cycles per object: at least 1 is needed")
+
+
+def _check_slots(chunk: PlanChunk) -> None:
+    last = int(chunk.slots["offset_ticks"].max())
+    limit = chunk.cycle_ticks
+    _require(last < limit, lambda: f"exposure at {last} of a cycle of {limit} ticks")
+    shown = chunk.slots["pattern"]
+    lit = shown[shown != DARK_PATTERN]
+    top = int(lit.max()) if lit.size else 0
+    _require(top < chunk.n_patterns, lambda: f"a slot shows pattern {top}: the plan has {chunk.n_patterns}")
+
+
+def _check_spacing(profile: Profile, head: PlanChunk, gaps: NDArray[np.int64]) -> None:
+    """Refuse exposures closer than the detector can read; a tick less is forgiven for rounding."""
+    readout_ticks = profile.exposure.readout_us * profile.clock.tick_hz / 1e6
+    needed = head.exposure_ticks + max(0, math.ceil(readout_ticks) - 1)
+    shortest = int(gaps.min())
+    _require(shortest >= needed, lambda: f"exposures {shortest} ticks apart: at least {needed} are needed")
+
+
+def _check_pattern_rate(
+    profile: Profile, head: PlanChunk, offsets: NDArray[np.int64], shown: NDArray[np.uint16]
+) -> None:
+    """Refuse patterns that follow each other faster than the projector can change them."""
+    changes = offsets[shown != np.roll(shown, 1)]
+    if not len(changes):
+        return
+    shortest = int(np.diff(changes, append=changes[0] + head.cycle_ticks).min())
+    needed = math.ceil(profile.clock.tick_hz / profile.projector.pattern_rate_max_hz) - 1
+    _require(shortest >= needed, lambda: f"patterns change after {shortest} ticks: the projector needs {needed}")
+
+
+def _cut_into_blocks(gaps: NDArray[np.int64], period: int, longest: int) -> tuple[tuple[int, int], ...]:
+    blocks, first = [], 0
+    for slot, gap in enumerate(gaps.tolist(), start=1):
+        if slot == len(gaps) or gap != period or slot - first == longest:
+            blocks.append((first, slot - first))
+            first = slot
+    return tuple(blocks)
+
+
+def _require(fine: bool, text: Callable[[], str]) -> None:
+    if not fine:
+        raise Refused(AckStatus.OUT_OF_RANGE, text())

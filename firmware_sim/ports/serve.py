@@ -1,0 +1,210 @@
+"""`sim:` device URLs -> an open link to a simulated instrument, in process or in a process of its own.
+
+Owns the URL's keys, the making of an instrument from them and the child process; never looks into the bytes. `open_sim` returns
+a Link: pace=fast is virtual time in process (virtual.py), pace=real a child behind an ordinary port (shell.py), since in one
+process the interpreter's lock would let the instrument disturb the host that it is there to measure.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, fields, replace
+from typing import Any
+from urllib.parse import parse_qsl
+
+from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
+from pans.firmware_sim.device.instrument import BUFFER_MESSAGES, Instrument
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.errors import ConfigError, LinkError, UsageError
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link.base import Link, open_link
+
+from .faults import NO_FAULTS, check_possible, parse_faults
+from .faulty import FaultyDevice
+from .virtual import START_NS, VirtualLink
+
+DEFAULT_SCENE = "fashion200"
+MAX_DRIFT_PPM = 1000.0
+CHILD_GOODBYE_S = 2.0
+MAX_BUFFER_MESSAGES = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """What a simulated instrument is made of; the field names are the URL's keys."""
+
+    profile: str
+    scene: str = DEFAULT_SCENE
+    seed: int = 0
+    pace: str = "real"
+    offset: int = DEFAULT_OFFSET_TICKS
+    drift_ppm: float = DEFAULT_DRIFT_PPM
+    faults: str = ""
+    buffer: int = BUFFER_MESSAGES
+    optics: str = ""  # a bundle whose passive optics the instrument looks through
+    changes: str = ""  # what changes meanwhile, beside what the scene file says
+
+
+def parse_sim_url(url: str) -> SimOptions:
+    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&changes=...&optics=BUNDLE&...]`, or raise UsageError."""
+    scheme, _, rest = url.partition(":")
+    profile, _, query = rest.partition("?")
+    if scheme != "sim" or not profile:
+        raise UsageError(f"{url!r} is no simulator URL", remedy="write sim:PROFILE, for example sim:ideal?pace=fast")
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=16)
+    except ValueError as error:
+        raise UsageError(f"{url!r}: the part after ? is no list of key=value: {error}") from error
+    known = {field.name: field.type for field in fields(SimOptions) if field.name != "profile"}
+    options = SimOptions(profile)
+    for key, text in pairs:
+        if key not in known:
+            raise UsageError(f"{url!r}: unknown key {key!r}", remedy=f"known keys: {', '.join(known)}")
+        options = replace(options, **{key: _value(url, key, text, str(known[key]))})
+    return check_options(options)
+
+
+def check_options(options: SimOptions) -> SimOptions:
+    """Return `options` if they can be meant; UsageError names the one that cannot."""
+    if options.pace not in ("real", "fast"):
+        raise UsageError(f"pace={options.pace}: allowed are real and fast")
+    if not 0 <= options.seed < 1 << 64:
+        raise UsageError(f"seed={options.seed}: allowed are 0..2^64-1")
+    if not 1 <= options.buffer <= MAX_BUFFER_MESSAGES:
+        raise UsageError(f"buffer={options.buffer}: allowed are 1..{MAX_BUFFER_MESSAGES} messages")
+    if not 0 <= options.offset < 1 << 60:
+        raise UsageError(f"offset={options.offset}: allowed are 0..2^60-1 ticks")
+    check_possible(parse_faults(options.faults), pace=options.pace)
+    if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
+        raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
+    return options
+
+
+def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, DeviceClock]:
+    """Make the instrument, switched on at `host_ns`, and its clock; ConfigError for an impossible profile or scene.
+
+    With faults, the instrument stands behind a bad link.
+    """
+    profile = load_profile(options.profile)
+    clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
+    scene = open_scene(options.scene, options.changes)
+    faults = parse_faults(options.faults)
+    optics = _optics(options.optics)
+
+    def switch_on(epoch: int, tick: int) -> Instrument:
+        return Instrument(
+            profile,
+            scene,
+            seed=options.seed,
+            power_on_tick=tick,
+            epoch=epoch,
+            buffer_messages=options.buffer,
+            optics=optics,
+        )
+
+    start_tick = clock.tick_at(host_ns)
+    if faults == NO_FAULTS:
+        return switch_on(1, start_tick), clock
+    return FaultyDevice(switch_on, clock, faults, options.seed, start_tick), clock
+
+
+def _optics(path: str) -> Analyser | None:
+    if not path:
+        return None
+    found = load_bundle(path)[0].analyser
+    if found is None:
+        raise ConfigError(f"{path}: an active bundle: it shows patterns and has no optics", remedy="leave optics= out")
+    return found
+
+
+def open_sim(url: str) -> Link:
+    """Open a `sim:` URL (entry point of `pans.devices`); the link's `close` ends what it started."""
+    options = parse_sim_url(url)
+    if options.pace == "real":
+        load_profile(options.profile)  # a mistake in either is better told here than by the child
+        open_scene(options.scene, options.changes)
+        _optics(options.optics)
+        return ChildLink(url, options)
+    instrument, clock = build_instrument(options, START_NS)
+    return VirtualLink(instrument, clock, url)
+
+
+class ChildLink:
+    """An instrument in a process of its own, reached through the runtime's ordinary serial link."""
+
+    simulated = True
+    virtual = False
+
+    def __init__(self, url: str, options: SimOptions) -> None:
+        self.name = url
+        self._child = _spawn(options)
+        try:
+            self._url = self._first_line()
+            self._connect()
+        except BaseException:
+            self._end_child()
+            raise
+
+    def _connect(self) -> None:
+        self._link = open_link(self._url)
+        self.read = self._link.read
+        self.write = self._link.write
+        self.now_ns = self._link.now_ns
+
+    def reopen(self) -> ChildLink:
+        """Open the port of the same instrument again."""
+        self._link.close()
+        self._connect()
+        return self
+
+    def close(self) -> None:
+        """Close the port and end the child; idempotent."""
+        self._link.close()
+        self._end_child()
+
+    def _first_line(self) -> str:
+        assert self._child.stdout is not None
+        line = self._child.stdout.readline().decode("utf-8", "replace").strip()
+        if not line:
+            code = self._child.wait(CHILD_GOODBYE_S)
+            raise LinkError(f"the simulator of {self.name} did not start (exit code {code})")
+        return line
+
+    def _end_child(self) -> None:
+        for pipe in (self._child.stdin, self._child.stdout):
+            if pipe is not None:
+                pipe.close()
+        try:
+            self._child.wait(CHILD_GOODBYE_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+
+
+def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
+    breaks = parse_faults(options.faults).disconnect is not None  # which a pty cannot do
+    listen = "pty" if hasattr(os, "openpty") and not breaks else "tcp:127.0.0.1:0"
+    words = [sys.executable, "-m", "pans.firmware_sim", "--profile", options.profile, "--scene", options.scene]
+    words += ["--seed", str(options.seed), "--offset", str(options.offset), f"--drift-ppm={options.drift_ppm!r}"]
+    words += ["--listen", listen, "--until-stdin-closes"]
+    words += ["--faults", options.faults] if options.faults else []
+    words += ["--optics", options.optics] if options.optics else []
+    words += ["--changes", options.changes] if options.changes else []
+    # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
+    # for the host, which then leaves the instrument in a safe state.
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True, bufsize=0
+    )
+
+
+def _value(url: str, key: str, text: str, kind: str) -> Any:
+    try:
+        return {"int": int, "float": float, "str": str}[kind](text)
+    except ValueError:
+        noun = "a whole number" if kind == "int" else "a number"
+        raise UsageError(f"{url!r}: {key} must be {noun}, found {text!r}") from None

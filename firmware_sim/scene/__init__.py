@@ -1,0 +1,1 @@
+"""From what stands or moves to photoelectrons and clicks."""

@@ -1,0 +1,179 @@
+"""The compiled kernels of the simulated detector and optics: many clicks, packed as a parallel instrument sends them.
+
+Owns the loops; the law, the model and the generator are detector.py's, and every bit is the one that `detector.sample_clicks` draws.
+What the profile does not declare is in no loop: dead time, read noise and dark counts are in the probability already, afterpulsing
+looks one exposure back, crosstalk draws two more numbers for neighbours of a click and none elsewhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pans.runtime.instrument.click_law import ClickLaw
+
+from .detector import (
+    CHANNEL_STEP,
+    CLICK_STREAM,
+    GOLDEN,
+    LOWER_CROSSTALK_STREAM,
+    UPPER_CROSSTALK_STREAM,
+    DetectorModel,
+    stream_key,
+)
+
+_U = np.uint64
+_GOLDEN, _STEP = _U(GOLDEN), _U(CHANNEL_STEP)
+_M1, _M2 = _U(0xBF58476D1CE4E5B9), _U(0x94D049BB133111EB)
+_S11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
+
+
+@njit(cache=True, nogil=True)
+def _mix(word):  # type: ignore[no-untyped-def]
+    word = (word ^ (word >> _S30)) * _M1
+    word = (word ^ (word >> _S27)) * _M2
+    return word ^ (word >> _S31)
+
+
+@njit(cache=True, nogil=True)
+def plain_words(thresholds, row_of, key, first, words):  # type: ignore[no-untyped-def]
+    """Draw clicks without memory: thresholds uint64 (rows, channels), row_of int64 (n,), words uint8 (n, bytes), bit c is channel c."""
+    n_channels = thresholds.shape[1]
+    for t in range(row_of.size):
+        row = row_of[t]
+        state = _mix(_U(t + first) * _GOLDEN + key)
+        step = _U(0)
+        for p in range(words.shape[1]):
+            byte = _U(0)
+            for c in range(8 * p, min(8 * p + 8, n_channels)):
+                step += _STEP
+                byte |= _U((_mix(state + step) >> _S11) < thresholds[row, c]) << _U(c & 7)
+            words[t, p] = byte
+
+
+@njit(cache=True, nogil=True)
+def memory_words(thresholds, primed, row_of, keys, first, crosstalk, previous, words):  # type: ignore[no-untyped-def]
+    """As `plain_words`, with afterpulsing (primed uint64 (rows, channels): thresholds after a click) and crosstalk (a threshold; 0: none).
+
+    keys uint64 (3,) of the three streams; previous uint8 (2, channels): row 0 is the exposure before, and afterwards the last one.
+    """
+    n_channels = thresholds.shape[1]
+    for t in range(row_of.size):
+        row, exposure = row_of[t], _U(t + first)
+        state = _mix(exposure * _GOLDEN + keys[0])
+        step = _U(0)
+        for c in range(n_channels):
+            step += _STEP
+            threshold = primed[row, c] if previous[0, c] else thresholds[row, c]
+            previous[1, c] = (_mix(state + step) >> _S11) < threshold
+        for c in range(n_channels):
+            previous[0, c] = previous[1, c]
+        if crosstalk:
+            below, above = _mix(exposure * _GOLDEN + keys[1]), _mix(exposure * _GOLDEN + keys[2])
+            for c in range(n_channels):
+                if previous[1, c]:
+                    if c + 1 < n_channels and (_mix(below + _U(c + 2) * _STEP) >> _S11) < crosstalk:
+                        previous[0, c + 1] = 1
+                    if c > 0 and (_mix(above + _U(c) * _STEP) >> _S11) < crosstalk:
+                        previous[0, c - 1] = 1
+        for p in range(words.shape[1]):
+            byte = 0
+            for c in range(8 * p, min(8 * p + 8, n_channels)):
+                byte |= previous[0, c] << (c & 7)
+            words[t, p] = byte
+
+
+@njit(cache=True, nogil=True)
+def register_words(thresholds, primed, row_of, keys, first, crosstalk, previous, words):  # type: ignore[no-untyped-def]
+    """As `memory_words`, for at most 64 channels: the clicks of an exposure stand in one register, and no click costs next to nothing."""
+    n_channels = thresholds.shape[1]
+    last = _U(0)
+    for c in range(n_channels):
+        last |= _U(previous[0, c]) << _U(c)
+    for t in range(row_of.size):
+        row, exposure = row_of[t], _U(t + first)
+        state = _mix(exposure * _GOLDEN + keys[0])
+        own, step = _U(0), _U(0)
+        for c in range(n_channels):
+            step += _STEP
+            own |= _U((_mix(state + step) >> _S11) < (primed if last >> _U(c) & _U(1) else thresholds)[row, c]) << _U(c)
+        last = own
+        if crosstalk and own:
+            below, above = _mix(exposure * _GOLDEN + keys[1]), _mix(exposure * _GOLDEN + keys[2])
+            for c in range(n_channels):
+                if own >> _U(c) & _U(1):
+                    if c + 1 < n_channels and (_mix(below + _U(c + 2) * _STEP) >> _S11) < crosstalk:
+                        last |= _U(1) << _U(c + 1)
+                    if c > 0 and (_mix(above + _U(c) * _STEP) >> _S11) < crosstalk:
+                        last |= _U(1) << _U(c - 1)
+        for p in range(words.shape[1]):
+            words[t, p] = last >> _U(8 * p) & _U(0xFF)
+    for c in range(n_channels):
+        previous[0, c] = last >> _U(c) & _U(1)
+
+
+@njit(cache=True, nogil=True)
+def sparse_sums(images, starts, pixels, levels, out):  # type: ignore[no-untyped-def]
+    """Sum of level times grey over the lit pixels of each pattern: images uint8 (n, pixels of an image), exact integers.
+
+    Pattern i has the pixels `pixels[starts[i]:starts[i + 1]]` (int32) at `levels` (int32); out float64 (n, patterns).
+    """
+    for k in range(images.shape[0]):
+        for i in range(out.shape[1]):
+            total = np.int64(0)
+            for j in range(starts[i], starts[i + 1]):
+                total += np.int64(levels[j]) * np.int64(images[k, pixels[j]])
+            out[k, i] = total
+
+
+def click_thresholds(probability: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the whole numbers below which a 53-bit number is a click: exactly `number * 2**-53 < probability`."""
+    return np.ceil(probability * 2.0**53).astype(np.uint64)
+
+
+def sample_words(
+    model: DetectorModel,
+    probability: NDArray[np.float64],
+    row_of: NDArray[np.int64],
+    seed: int,
+    first_exposure: int,
+    previous: NDArray[np.uint8],
+    words: NDArray[np.uint8],
+) -> None:
+    """Draw the clicks of exposures `first_exposure`... into `words`, uint8 (n, bytes of a word), cleared first.
+
+    Exposure t has the probabilities `probability[row_of[t]]`, float64 (rows, channels). `previous` is uint8 (channels,), the clicks of the
+    exposure before, and is set to the last ones. The bits are those of `detector.sample_clicks`.
+    """
+    n_bytes = -(-probability.shape[1] // 8)
+    words[:, n_bytes:] = 0
+    used = words[:, :n_bytes]
+    thresholds = click_thresholds(probability)
+    keys = [stream_key(seed, stream) for stream in (CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM)]
+    if not model.afterpulse_probability and not model.crosstalk_probability:
+        plain_words(thresholds, row_of, _U(keys[0]), first_exposure, used)
+        if len(used):
+            previous[:] = np.unpackbits(used[-1], bitorder="little", count=len(previous))
+        return
+    primed = click_thresholds(1.0 - (1.0 - probability) * (1.0 - model.afterpulse_probability))
+    crosstalk = click_thresholds(np.array(model.crosstalk_probability))
+    both = np.stack([previous, previous])
+    draw = register_words if probability.shape[1] <= 64 else memory_words
+    draw(thresholds, primed, row_of, np.array(keys, np.uint64), first_exposure, _U(crosstalk), both, used)
+    previous[:] = both[0]
+
+
+def warm_up() -> None:
+    """Compile or load what `sample_words` needs."""
+    plain, primed = DetectorModel(ClickLaw()), DetectorModel(ClickLaw(), afterpulse_probability=0.5)
+    for effects, n in ((plain, 1), (primed, 1), (primed, 65)):
+        words = np.zeros((1, -(-n // 8)), np.uint8)
+        sample_words(effects, np.zeros((1, n)), np.zeros(1, np.int64), 0, 0, np.zeros(n, np.uint8), words)
+
+
+def sparse_patterns(levels: NDArray[np.uint16]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
+    """Return patterns (n, pixels) by their lit pixels: starts int64 (n + 1,), pixels int32 and levels int32."""
+    pattern, pixel = np.nonzero(levels)
+    starts = np.searchsorted(pattern, np.arange(len(levels) + 1)).astype(np.int64)
+    return starts, pixel.astype(np.int32), levels[pattern, pixel].astype(np.int32)

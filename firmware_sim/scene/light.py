@@ -1,0 +1,177 @@
+"""What reaches the detectors in one run: the three kinds of scenes behind one face, for measurement.py.
+
+Owns the tables made once per pattern set (`prepare`), the choice of a scene's flow (`begin`) and still objects, which pass as the plan
+says; cells and tape have rooms of their own, with numba, opened only where something moves. Never draws a click.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.firmware_sim.device.upload import Program
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.commands import PARALLEL
+from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, Mark
+
+from .changes import Changes
+from .detector import detector_model, first_click_probability, stream_key
+from .exposure_times import Exposures
+from .marks import mark_rows
+from .moving import Cells, SceneFile, Tape
+from .optics import expected_photoelectrons
+from .still import Scene
+
+if TYPE_CHECKING:
+    from .shifts import ShiftTable
+    from .tape import BarTable
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+class LightTable(NamedTuple):
+    """Every still object under every pattern, one exposure each: photoelectrons and click probability.
+
+    Both are float64 (objects, patterns + 1), the last column is the dark pattern.
+    """
+
+    photoelectrons: F64
+    probability: F64
+
+
+class RunLight(Protocol):
+    """One run's light; `rows` is asked for exposures in their order."""
+
+    probability: F64 | None  # of all rows, where they are known beforehand
+
+    def take_marks(self, before_tick: int) -> I64:
+        """Return the rows (marks.py) of marks whose tick after the start is below `before_tick`, and go on to those after."""
+
+    def rows(self, first: int, count: int) -> tuple[F64, I64]:
+        """Expected photoelectrons float64 (rows, channels), and int64 (count,) of the row of each of exposures first..first+count-1."""
+
+
+def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
+    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
+    return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
+
+
+def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
+    """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
+    with_dark = np.column_stack([photons, np.zeros(len(photons))])
+    return LightTable(with_dark, first_click_probability(detector_model(profile, exposure_us), with_dark))
+
+
+def prepare(
+    profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float
+) -> LightTable | ShiftTable | BarTable:
+    """Make what `scene` needs to know of the patterns, uint16 (patterns, pixels); ConfigError when they do not fit it."""
+    what = scene.what
+    if isinstance(what, Cells):
+        from .shifts import shift_table
+
+        return shift_table(profile, what.objects, levels, exposure_us, what.offset_px, what.background_transmission)
+    if isinstance(what, Tape):
+        from .tape import BarTable
+
+        return BarTable(profile, what, levels, exposure_us)
+    return light_table(profile, what, levels, exposure_us)
+
+
+def warm_up(scene: SceneFile) -> None:
+    """Compile or load the kernels of a scene that moves, so that ARM need not."""
+    if isinstance(scene.what, Cells):
+        from .cells import warm_up as warm_up_cells
+
+        warm_up_cells()
+    elif isinstance(scene.what, Tape):
+        from .tape import warm_up as warm_up_tape
+
+        warm_up_tape()
+
+
+def begin(
+    scene: SceneFile,
+    table: LightTable | ShiftTable | BarTable,
+    program: Program,
+    exposures: Exposures,
+    changes: Changes,
+    seed: int,
+    first_draw: int,
+) -> RunLight:
+    """Start the scene for one run; `first_draw` counts the exposures of earlier runs, so that no run repeats another one's objects."""
+    flow_seed = stream_key(seed, first_draw) if first_draw else seed
+    what = scene.what
+    if isinstance(table, LightTable):
+        assert isinstance(what, Scene)
+        return StillObjects(what, table, program, exposures, changes)
+    if isinstance(what, Cells):
+        from .cells import CellFlow
+
+        return CellFlow(what, cast("ShiftTable", table), exposures, changes, flow_seed)
+    from .tape import TapeFlow
+
+    return TapeFlow(cast(Tape, what), cast("BarTable", table), exposures, changes, flow_seed)
+
+
+class StillObjects:
+    """Objects that stand still for `cycles_per_object` cycles each, in the order of the scene, and start over at its end."""
+
+    def __init__(
+        self, scene: Scene, table: LightTable, program: Program, exposures: Exposures, changes: Changes
+    ) -> None:
+        self._scene, self._program, self._exposures, self._changes = scene, program, exposures, changes
+        self._photons = table.photoelectrons.sum(axis=1)
+        self._light = _by_row(table.photoelectrons, program.mode)
+        self.probability: F64 | None = _by_row(table.probability, program.mode)
+        self._column = np.where(program.patterns == DARK_PATTERN, program.n_patterns, program.patterns).astype(np.int64)
+        self._object = 0
+
+    @property
+    def mark(self) -> Mark:
+        """The next mark; its tick counts from the start of the run."""
+        exposure = self._object * self._program.cycles_per_object * self._program.n_slots
+        tick = int(self._exposures.begins(exposure, 1)[0])
+        number = self._object % NO_OBJECT
+        photons = float(self._photons[number % self._scene.n_objects])
+        if self._changes:
+            photons *= float(self._changes.efficiency(np.array([tick / self._exposures.tick_hz]))[0])
+        return Mark(0, number, self._scene.truth(number % self._scene.n_objects), exposure, tick, photons)
+
+    def take_mark(self) -> None:
+        """Go on to the mark after."""
+        self._object += 1
+
+    def take_marks(self, before_tick: int) -> I64:
+        """See `RunLight`."""
+        exposures_per_object = self._program.cycles_per_object * self._program.n_slots
+        begun = int(self._exposures.begun_by(np.array([before_tick - 1]))[0])
+        passing = np.arange(self._object, max(self._object, -(-begun // exposures_per_object)))
+        self._object += len(passing)
+        ticks = self._exposures.begins_of(passing * exposures_per_object)
+        numbers = passing % NO_OBJECT
+        photons = self._photons[numbers % self._scene.n_objects]
+        if self._changes:
+            photons = photons * self._changes.efficiency(ticks / self._exposures.tick_hz)
+        truths = self._scene.labels[numbers % self._scene.n_objects].astype(np.int64)
+        return mark_rows(numbers, truths, passing * exposures_per_object, ticks, np.zeros_like(ticks), photons)
+
+    def rows(self, first: int, count: int) -> tuple[F64, I64]:
+        """See `RunLight`: parallel, an object is a row and the last one is dark; sequential, a row is an object under a pattern."""
+        program = self._program
+        cycle, slot = np.divmod(np.arange(first, first + count), program.n_slots)
+        row = cycle // program.cycles_per_object % NO_OBJECT % self._scene.n_objects
+        column = self._column[slot]
+        if program.mode != PARALLEL:
+            return self._light, row * (program.n_patterns + 1) + column
+        return self._light, np.where(column == program.n_patterns, len(self._light) - 1, row)
+
+
+def _by_row(table: F64, mode: int) -> F64:
+    """A table (objects, patterns + 1) as rows of what the channels see at once: see `StillObjects.rows`."""
+    if mode != PARALLEL:
+        return table.reshape(-1, 1)
+    return np.vstack([table[:, :-1], np.full((1, table.shape[1] - 1), table[0, -1])])

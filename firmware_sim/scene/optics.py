@@ -1,0 +1,101 @@
+"""From projector levels and objects to light: expected photoelectrons of every object under every pattern.
+
+Owns the optical model and computes it once per loaded pattern set; never draws a random number, never runs per exposure.
+Only what the profile declares is modelled: the projector's photon scale, and the object modulator where there is one; or passive
+optics, as a bundle states them.
+Sums of level times grey are integers below 2^53: exact, whatever the BLAS, its threads and the block size are.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.profile import Profile
+
+from .still import Scene
+
+MAX_TABLE_ENTRIES = 1 << 26  # 512 MiB of float64
+_OBJECTS_PER_BLOCK = 1024
+
+
+def photons_per_level(profile: Profile, exposure_us: float) -> float:
+    """Photoelectrons per exposure and unit transmission for one level of one pixel (detector efficiency inside)."""
+    return profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6 / (profile.projector.levels - 1)
+
+
+def expected_photoelectrons(
+    profile: Profile, scene: Scene, pattern_levels: NDArray[np.uint16], exposure_us: float
+) -> NDArray[np.float64]:
+    """Return lambda, float64 (n_objects, n_patterns): photoelectrons per exposure of each object under each pattern.
+
+    `pattern_levels` is uint16 (n_patterns, n_pixels); the transmission is that of `clicks.object_transmission`. ConfigError
+    when the patterns do not fit the scene's images, or the table would exceed MAX_TABLE_ENTRIES.
+    """
+    n_patterns, n_pixels = pattern_levels.shape
+    if not scene.any_shape and scene.n_pixels != n_pixels:
+        height, width = scene.images.shape[1:]
+        raise ConfigError(
+            f"patterns have {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels} ({height} x {width})",
+            remedy="choose a scene of the same image shape",
+        )
+    if scene.n_objects * n_patterns > MAX_TABLE_ENTRIES:
+        raise ConfigError(
+            f"{scene.n_objects} objects x {n_patterns} patterns: the simulator's table holds {MAX_TABLE_ENTRIES} entries"
+        )
+    if not scene.lit:
+        return np.zeros((scene.n_objects, n_patterns))
+    levels = pattern_levels.astype(np.float64).T
+    t_min = profile.min_transmission
+    total = levels.sum(axis=0)
+    grey, white = grey_steps(profile)
+    through = _grey_sums(scene, grey, levels, total) / white
+    return photons_per_level(profile, exposure_us) * (t_min * total + (1.0 - t_min) * through)
+
+
+def passive_photoelectrons(analyser: Analyser, scene: Scene, exposure_us: float) -> NDArray[np.float64]:
+    """Return lambda, float64 (n_objects, n_detectors): photoelectrons per exposure behind passive optics; ConfigError as above.
+
+    A target fills the field with full scale; light grows with the exposure.
+    """
+    n_detectors, n_pixels = analyser.matrix.shape
+    images = scene.images
+    if scene.any_shape:
+        side = math.isqrt(n_pixels)
+        shape = (side, side) if side * side == n_pixels else (1, n_pixels)
+        images = np.broadcast_to(images, (len(images), *shape))
+    elif scene.n_pixels != n_pixels:
+        raise ConfigError(
+            f"the passive optics see {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels}",
+            remedy="choose a scene of the same image shape",
+        )
+    if not scene.lit:
+        return np.zeros((scene.n_objects, n_detectors))
+    return analyser.photoelectrons(images) * (exposure_us / analyser.exposure_us)
+
+
+def grey_steps(profile: Profile) -> tuple[NDArray[np.float64], int]:
+    """What the modulator makes of the 256 grey values, in whole steps, and its step number of white."""
+    modulator = profile.object_modulator
+    if modulator is None or modulator.levels >= 256:
+        return np.arange(256.0), 255
+    return np.rint(np.arange(256) / 255.0 * (modulator.levels - 1)), modulator.levels - 1
+
+
+def _grey_sums(
+    scene: Scene, grey: NDArray[np.float64], levels: NDArray[np.float64], total: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sum of level times grey step, an exact integer: float64 (n_objects, n_patterns)."""
+    if scene.any_shape:
+        return grey[scene.images.reshape(-1, 1)] * total
+    lit = np.flatnonzero(levels.any(axis=1))  # trained patterns are dark nearly everywhere: dark pixels add nothing
+    seen = levels[lit]
+    sums = np.empty((scene.n_objects, levels.shape[1]))
+    for first in range(0, scene.n_objects, _OBJECTS_PER_BLOCK):
+        block = scene.images[first : first + _OBJECTS_PER_BLOCK]
+        np.matmul(grey[block.reshape(len(block), -1)[:, lit]], seen, out=sums[first : first + len(block)])
+    return sums

@@ -1,0 +1,1 @@
+"""Long checks with a verdict: fault grid, kills, soak, causes, statistics."""

@@ -1,0 +1,312 @@
+"""The fault grid: whole runs in virtual time under every fault, judged by the checkers (checkers.py).
+
+    python -m pans.firmware_sim.trials.fault_grid [--frames 10000000] [--seeds 20] [--jobs 2] [--faults loss,all] [--json]
+
+Owns the choice of runs and their report; the host in them is the real one (`run_live`). Each fault runs alone and all together, with
+each seed; even seeds measure sequentially, odd ones in parallel. A failure prints the command that repeats it. Exit code 1 then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.ports.faults import NAMES, parse_faults
+from pans.firmware_sim.ports.faulty import FaultyDevice
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import scene_from_arrays
+from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.core.plan import Plan, build_plan
+from pans.runtime.core.still import Core, Output
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.link.recovery import Recovery
+from pans.runtime.live.loop import Onlookers, RunConfig, run_live
+from pans.runtime.live.run import LiveRun
+from pans.runtime.wire.commands import Gate
+
+from .checkers import Checker, WatchedInstrument
+
+N_PATTERNS = 4
+EXPOSURE_US = 100.0
+SHOTS = 1
+GATE_EVERY = 32  # decisions
+CASES = ("none", *NAMES, "all")
+# Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
+GRID_TIMES = {
+    "stall": "600ms/1500ms",
+    "disconnect": "200ms/1500ms",
+    "pause": "300ms/1s",
+    "clock_step": "2ms/300ms",
+    "reset": "0ms/2s",
+}
+GRID_ALL = (
+    "loss:0.003,flip:0.003,duplicate:0.003,truncate:0.003,reorder:0.003,drip:0.003,stall:600ms/2s,"
+    "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"
+)
+MEMORY_SLACK_KB = 16_384
+
+
+@dataclass(frozen=True, slots=True)
+class GridResult:
+    """What one run of the grid gave; `memory_kb` is the growth of the process over the last three quarters of the run."""
+
+    case: str
+    seed: int
+    mode: str
+    frames: int
+    ended: str
+    reconnects: int
+    abstained: int
+    memory_kb: int
+    seconds: float
+    virtual_s: float
+    checked: dict[str, int]
+    faults: dict[str, int]
+    violations: list[str]
+
+
+def case_faults(case: str) -> str:
+    """Return the fault text of a case of the grid."""
+    if case == "none":
+        return ""
+    return GRID_ALL if case == "all" else f"{case}:{GRID_TIMES[case]}" if case in GRID_TIMES else case
+
+
+def grid_setup(mode: str) -> tuple[Profile, Bundle, Plan]:
+    """Return an instrument, a bundle and a plan that put many small frames on the wire."""
+    profile = load_profile("ideal")
+    top = profile.projector.levels - 1
+    if mode == "parallel":
+        detector = replace(profile.detector, channels=N_PATTERNS)
+        profile = replace(profile, mode="parallel", detector=detector)
+    rng = np.random.default_rng(1)
+    levels = rng.integers(0, top // 3, (N_PATTERNS, 4)).astype(np.uint16)
+    levels[0, 0] = top
+    bundle = make_bundle(
+        name="grid",
+        task="grid",
+        classes=("a", "b", "c"),
+        image_shape=(2, 2),
+        levels=top + 1,
+        pattern_levels=levels,
+        photons_per_level=EXPOSURE_US * 1e-6 * profile.projector.peak_photoelectrons_hz / top,
+        table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32),
+        provenance={},
+    )
+    plan = build_plan(profile, bundle, shots_per_object=4)
+    return profile, bundle, replace(plan, block_exposures=2 if mode == "sequential" else 1)
+
+
+def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) -> GridResult:
+    """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults."""
+    mode = "parallel" if seed % 2 else "sequential"
+    profile, bundle, plan = grid_setup(mode)
+    checker = Checker(plan, SHOTS)
+    clock = DeviceClock(profile.clock.tick_hz)
+    images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+    scene = scene_from_arrays("grid", images, np.arange(6) % 3, ("a", "b", "c"))
+
+    def switch_on(epoch: int, tick: int) -> WatchedInstrument:
+        return WatchedInstrument(profile, scene, seed=seed, power_on_tick=tick, epoch=epoch).watch(checker)
+
+    faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
+    device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
+    link = VirtualLink(device, clock, f"grid:{case}")
+    host = GridHost(checker, plan, frames)
+    per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
+    config = RunConfig(shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9)
+    started = time.perf_counter()
+    core = Core(plan, make_decider(bundle, shots=SHOTS, backend="table"), SHOTS, config.n_cycles)
+    recovery = Recovery.of(link, "", 30.0)
+    onlookers = Onlookers(host.watch, host.start)
+    result = run_live(link, profile, bundle, plan, core, config, recovery=recovery, onlookers=onlookers)
+    checker.close()
+    host.finish(result.ended)
+    return GridResult(
+        case=case,
+        seed=seed,
+        mode=mode,
+        frames=checker.counts.frames_emitted,
+        ended=result.ended,
+        reconnects=result.reconnects,
+        abstained=result.tally.abstained,
+        memory_kb=host.memory_growth_kb,
+        seconds=time.perf_counter() - started,
+        virtual_s=(link.now_ns() - START_NS) / 1e9,
+        checked=asdict(checker.counts),
+        faults={name: count for name, count in asdict(device.counters).items() if count},
+        violations=checker.violations,
+    )
+
+
+def plan_blocks(plan: Plan) -> list[int]:
+    """Return the first slot of each click block of a cycle: at most `block_exposures`, equally spaced."""
+    firsts, count = [0], 1
+    for slot in range(1, plan.slots_per_cycle):
+        spaced = plan.slot_offset_ticks[slot] - plan.slot_offset_ticks[slot - 1] == plan.slot_period_ticks
+        count += 1
+        if count > plan.block_exposures or not spaced:
+            firsts.append(slot)
+            count = 1
+    return firsts
+
+
+class GridHost:
+    """What the grid does besides the ordinary run: it asks for gates, some of them too late, and watches memory."""
+
+    def __init__(self, checker: Checker, plan: Plan, frames: int) -> None:
+        self.checker = checker
+        self.memory_growth_kb = 0
+        self._plan = plan
+        self._decisions = 0
+        self._seen = 0
+        self._frames = frames
+        self._early_kb = 0
+        self._run: LiveRun | None = None
+
+    def start(self, run: LiveRun) -> None:
+        """Listen to the run."""
+        self._run = run
+        self.checker.attach(run)
+        report = run.journal.event
+
+        def tapped(event: dict[str, Any]) -> None:
+            self.checker.on_event(run.connection.session.nonce, event)
+            report(event)
+
+        run.journal.event = tapped  # type: ignore[method-assign]
+
+    def watch(self, run: LiveRun, output: Output) -> None:
+        """After each block: now and then a gate, and a look at the memory."""
+        self._seen += 1
+        if not self._early_kb and self._seen > self._frames // 5:
+            self._early_kb = resident_kb()
+        for _ in output.decisions:
+            self._decisions += 1
+            if (
+                self._decisions % GATE_EVERY == 0
+                and output.block_end_tick is not None
+                and run.connection.session.has_room
+            ):
+                # every other gate is so near that it often comes too late; the duration makes each one unique
+                lead = 50 if self._decisions % (2 * GATE_EVERY) else 100_000
+                gate = Gate(output.block_end_tick + lead, 1 + self._decisions, 0)
+                self.checker.submitted(run.connection.session.nonce, run.next_command_id, gate)
+                run.gate(*gate)
+
+    def finish(self, ended: str) -> None:
+        """After the run: commands that were all acknowledged have one outcome each."""
+        assert self._run is not None
+        session = self._run.connection.session
+        if session.settled and not self._run.link_lost:
+            self._run.journal.refusals(self._run.connection)
+            self.checker.settled(session.nonce, 1 << 32)
+        if ended not in ("completed", "the link was lost within the last object"):
+            self.checker.fail(f"the run did not complete: {ended}")
+        self.memory_growth_kb = resident_kb() - self._early_kb if self._early_kb else 0
+        if self.memory_growth_kb > MEMORY_SLACK_KB:
+            self.checker.fail(f"the process grew by {self.memory_growth_kb} kB over the run")
+
+
+def resident_kb() -> int:
+    """Return the resident memory of this process in kB; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+    except (OSError, ValueError):
+        return 0
+
+
+def run_grid(cases: Sequence[str], seeds: int, frames: int, jobs: int) -> list[GridResult]:
+    """Run every case with every seed, about `frames` messages in all, on `jobs` processes; report each on stderr."""
+    work = [(case, seed) for seed in range(seeds) for case in cases]
+    each = -(-frames // len(work))
+    results = []
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(run_case, *zip(*work), [each] * len(work)):
+            results.append(result)
+            if result.violations:
+                again = f"python -m pans.firmware_sim.trials.fault_grid --faults {result.case} --seed {result.seed} --frames {each}"
+                print(
+                    f"FAILED {result.case} seed {result.seed}: {result.violations[0]}\n  again: {again}",
+                    file=sys.stderr,
+                )
+    return results
+
+
+def table(results: Sequence[GridResult]) -> list[dict[str, Any]]:
+    """Add up the runs of each case."""
+    rows = []
+    for case in dict.fromkeys(result.case for result in results):
+        runs = [result for result in results if result.case == case]
+        checked = {key: sum(run.checked[key] for run in runs) for key in runs[0].checked}
+        rows.append(
+            {
+                "name": case,
+                "runs": len(runs),
+                "frames": sum(run.frames for run in runs),
+                "delivered": checked["blocks_delivered"],
+                "reported_lost": checked["blocks_lost"] + checked["blocks_lost_open_end"],
+                "decisions": checked["decisions"],
+                "flagged": checked["decisions_flagged"],
+                "gates_executed": checked["gates_executed"],
+                "gates_refused": checked["gates_refused"],
+                "reconnects": sum(run.reconnects for run in runs),
+                "memory_kb_max": max(run.memory_kb for run in runs),
+                "virtual_s": round(sum(run.virtual_s for run in runs)),
+                "violations": sum(len(run.violations) for run in runs),
+            }
+        )
+    return rows
+
+
+def main() -> int:
+    """Run the grid from the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m pans.firmware_sim.trials.fault_grid", description=__doc__.split("\n")[0]
+    )
+    parser.add_argument("--frames", type=int, default=10_000_000, help="stream messages in all (default ten million)")
+    parser.add_argument("--seeds", type=int, default=20, help="seeds per case (default 20)")
+    parser.add_argument("--seed", type=int, help="this seed only")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
+    parser.add_argument("--faults", default=",".join(CASES), help=f"cases, of {', '.join(CASES)}")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    args = parser.parse_args()
+    started = time.perf_counter()
+    cases = args.faults.split(",")
+    if args.seed is not None:
+        results = [run_case(case, args.seed, args.frames) for case in cases]
+    else:
+        results = run_grid(cases, args.seeds, args.frames, args.jobs)
+    rows = table(results)
+    failures = [asdict(result) for result in results if result.violations]
+    total = sum(result.frames for result in results)
+    if args.json:
+        print(
+            json.dumps({"frames": total, "seconds": time.perf_counter() - started, "rows": rows, "failures": failures})
+        )
+    else:
+        for row in rows:
+            print("  ".join(f"{key} {value}" for key, value in row.items()))
+        for failure in failures:
+            print(f"FAILED {failure['case']} seed {failure['seed']}: " + "; ".join(failure["violations"]))
+        print(
+            f"{total} frames in {time.perf_counter() - started:.0f} s: {'FAILED' if failures else 'nothing was found'}"
+        )
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

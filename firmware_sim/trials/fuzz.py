@@ -1,0 +1,379 @@
+"""`pans fuzz`: bytes and frames that nobody would send, at the decoder, the instrument and the host's session and core.
+
+Owns the making of strange input and the limits that must hold; never changes what it tests. Random bytes go to the decoder and through the
+whole instrument; structured frames have a right CRC and strange contents. After every batch the limits are checked: held bytes, queued
+commands, remembered pulses, uploaded pixels. A crash, a hang or a broken limit ends the run with the seed that repeats it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import struct
+import time
+import traceback
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
+from pans.firmware_sim.scene.still import Scene, load_scene
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.core.still import Core
+from pans.runtime.errors import LinkError
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.messages import MessageType, Opcode
+from pans.runtime.wire.session import MAX_KEPT, HostSession
+
+from .fault_grid import grid_setup
+
+BATCH_BYTES = 1 << 16
+BATCH_FRAMES = 200
+MAX_CALL_S = (
+    5.0  # of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second
+)
+NONCE = 0x5EED
+EDGES = (
+    0,
+    1,
+    2,
+    3,
+    0x7F,
+    0x80,
+    0xFF,
+    0x100,
+    0x7FFF,
+    0xFFFF,
+    0x10000,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    1 << 62,
+    (1 << 64) - 1,
+)
+HOST_TYPES = (MessageType.HELLO, MessageType.PING, MessageType.COMMAND, MessageType.GRANT)
+DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
+
+
+class CountingInstrument(Instrument):
+    """An instrument that counts what it has carried out."""
+
+    executed = 0
+
+    def _execute(self, command: wire.CommandMessage) -> None:
+        super()._execute(command)
+        self.executed += 1
+
+
+class LimitBroken(AssertionError):
+    """A limit that the protocol or the module states did not hold."""
+
+
+@dataclass(slots=True)
+class FuzzCounts:
+    """How much was thrown, and how far it came: a fuzzer that is always refused at the door proves little."""
+
+    bytes: int = 0
+    frames: int = 0
+    frames_decoded: int = 0
+    commands_executed: int = 0
+    commands_refused: int = 0
+    runs_armed: int = 0
+    blocks_accepted: int = 0
+    slowest_call_s: float = 0.0
+
+
+class Fuzzer:
+    """One seed: the same input on every machine."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.counts = FuzzCounts()
+        self._dice = random.Random(seed)
+        self._profile = load_profile("ideal")
+        self._scene: Scene = load_scene("uniform")
+        self._command_id = 0
+        self._decoder, self._compiled = wire.FrameDecoder(), wire.FrameDecoder()
+        self._compiled.use_kernels()
+        self._fresh_device()
+        self._fresh_host()
+
+    def random_bytes(self, size: int) -> None:
+        """Throw `size` bytes at the decoder, the instrument and the host, in pieces of all sizes."""
+        data = self._strange_bytes(size)
+        decoder, compiled = self._decoder, self._compiled
+        position = 0
+        while position < len(data):
+            piece = data[position : position + self._dice.choice((1, 3, 64, 1000, 1 << 16))]
+            position += len(piece)
+            found = decoder.feed(piece)
+            if compiled.feed(piece) != found:
+                raise LimitBroken("the compiled decoder and the plain one disagree")
+            self.counts.frames_decoded += len(found)
+            self._device_takes(piece)
+            self._host_takes(piece)
+        self.counts.bytes += len(data)
+        if decoder.counters.bytes_in != self.counts.bytes:
+            raise LimitBroken(f"the decoder counted {decoder.counters.bytes_in} of {self.counts.bytes} bytes")
+        self._check_limits(decoder)
+        if (compiled.counters, compiled.held_bytes) != (decoder.counters, decoder.held_bytes):
+            raise LimitBroken(f"the decoders counted {decoder.counters} and, compiled, {compiled.counters}")
+
+    def structured_frames(self, count: int) -> None:
+        """Throw `count` frames with a right CRC at the instrument and at the host, and what the instrument answers at the host."""
+        for _ in range(count // 2):
+            self._device_takes(self._frame_for_device())
+            self._host_takes(self._frame_for_host())
+        self.counts.frames += count
+        self._check_limits(self._device.decoder)
+        if self._dice.random() < 0.02:
+            self._count_device()
+            self._fresh_device()
+        if self._dice.random() < 0.2:
+            self._fresh_host()
+
+    # -- both ends -----------------------------------------------------------------------------------------------------
+
+    def _fresh_device(self) -> None:
+        self._device = CountingInstrument(self._profile, self._scene, seed=self.seed, buffer_messages=16)
+        self._device.step(0, wire.encode_hello(NONCE))
+        self._command_id = 0
+
+    def _fresh_host(self) -> None:
+        self._session = HostSession(NONCE)
+        self._session.start(0)
+        _, bundle, plan = grid_setup("sequential")
+        self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
+        self._core.begin(0, 0)
+        self._host_decoder = wire.FrameDecoder()
+        self._host_decoder.use_kernels()
+        self._host_ns = 0
+
+    def _device_takes(self, data: bytes) -> None:
+        device = self._device
+        tick = device.tick + self._dice.choice((0, 0, 1, 100, 20_000))
+        started = time.process_time()
+        sent = device.step(tick, data)
+        self._judge_time(started, "instrument", data)
+        if len(sent) > 1 << 24:
+            raise LimitBroken(f"the instrument answered {len(data)} bytes with {len(sent)}")
+
+    def _judge_time(self, started: float, who: str, data: bytes) -> None:
+        taken_s = time.process_time() - started
+        self.counts.slowest_call_s = max(self.counts.slowest_call_s, taken_s)
+        if taken_s > MAX_CALL_S:
+            raise LimitBroken(f"the {who} took {taken_s:.1f} s over {data[:100].hex()}, allowed {MAX_CALL_S}")
+
+    def _host_takes(self, data: bytes) -> None:
+        started = time.process_time()
+        self._host_digests(data)
+        self._judge_time(started, "host", data)
+
+    def _host_digests(self, data: bytes) -> None:
+        self._host_ns += 1_000_000
+        for frame in self._host_decoder.feed(data):
+            try:
+                if self._session.on_frame(frame, self._host_ns):
+                    output = self._core.step(frame)
+                    self.counts.blocks_accepted += output.block_end_tick is not None
+                if self._dice.random() < 0.1:
+                    self._session.probe(self._host_ns)
+                    self._session.submit(Opcode.GATE, b"", may_be_refused=True)
+                self._session.poll(self._host_ns)
+            except LinkError:  # what a session says that cannot go on: an allowed end
+                self._fresh_host()
+                return
+            self._session.take_output()
+
+    def _check_limits(self, decoder: wire.FrameDecoder) -> None:
+        for name, one in (("decoder", decoder), ("instrument", self._device.decoder), ("host", self._host_decoder)):
+            if one.held_bytes > wire.MAX_FRAME_BYTES:
+                raise LimitBroken(f"the {name} holds {one.held_bytes} bytes, allowed {wire.MAX_FRAME_BYTES}")
+        device = self._device
+        if len(device.gates.pulses) > MAX_KEPT_PULSES or len(device.stream._held) > device.stream.capacity:
+            raise LimitBroken("the instrument remembers more than its limits allow")
+        held = sum(pattern.levels.nbytes for pattern in device._patterns._patterns.values())
+        if held > MAX_UPLOAD_BYTES:
+            raise LimitBroken(f"the instrument holds {held} bytes of patterns")
+        if max(len(self._session.pongs), len(self._session.refusals)) > MAX_KEPT or len(self._core.marks) > 4096:
+            raise LimitBroken("the host remembers more than its limits allow")
+
+    def _count_device(self) -> None:
+        self.counts.commands_refused += self._device.counters.refused
+        self.counts.commands_executed += self._device.executed
+
+    # -- strange input -------------------------------------------------------------------------------------------------
+
+    def _strange_bytes(self, size: int) -> bytes:
+        dice = self._dice
+        kind = dice.randrange(4)
+        if kind == 0:
+            return dice.randbytes(size)
+        if kind == 1:  # mostly delimiters and codes at their edges
+            return bytes(dice.choices((0, 1, 2, 254, 255, 129, 3), k=size))
+        if kind == 2:  # long runs without an end
+            return bytes([dice.choice((1, 2, 255))]) * size
+        frames = bytearray()
+        while len(frames) < size:  # good frames with damage
+            frame = bytearray(self._frame_for_device() if dice.random() < 0.5 else self._frame_for_host())
+            for _ in range(dice.randrange(3)):
+                frame[dice.randrange(len(frame))] ^= 1 << dice.randrange(8)
+            frames += frame
+        return bytes(frames[:size])
+
+    def _number(self, bits: int) -> int:
+        dice = self._dice
+        if dice.random() < 0.5:
+            return dice.choice(EDGES) & ((1 << bits) - 1)
+        return dice.getrandbits(dice.randint(1, bits))
+
+    def _frame_for_device(self) -> bytes:
+        dice = self._dice
+        kind = dice.choices((*HOST_TYPES, dice.randrange(256)), (1, 10, 60, 10, 2))[0]
+        session = self._device.session if dice.random() < 0.97 else self._number(32)
+        if kind == MessageType.HELLO and dice.random() < 0.5:
+            return wire.encode_hello(NONCE + dice.randrange(2))
+        if kind == MessageType.PING:
+            return wire.encode_ping(self._number(32), self._number(64), session)
+        if kind == MessageType.GRANT:
+            return wire.encode_grant(wire.Grant(self._number(32), self._number(32)), session)
+        if kind == MessageType.COMMAND:
+            return self._command(session)
+        return wire.encode_frame(kind, dice.randbytes(dice.choice((0, 1, 8, 36, 300))), session)
+
+    def _command(self, session: int) -> bytes:
+        dice = self._dice
+        expected = self._device._ack.last_id + 1
+        number = expected if dice.random() < 0.9 else self._number(32)
+        opcode = dice.choice((*Opcode, *Opcode, dice.randrange(256)))
+        body = dice.randbytes(dice.choice((0, 1, 12, 24, 36, 100))) if dice.random() < 0.2 else self._body(opcode)
+        return wire.encode_command(number, opcode, body, session)
+
+    def _body(self, opcode: int) -> bytes:
+        dice, tick = self._dice, self._device.tick
+        if opcode == Opcode.LOAD_PATTERN:
+            levels = np.array([self._number(16) for _ in range(dice.choice((1, 4)))], np.uint16)
+            small = dice.random() < 0.8
+            whole = len(levels) if small else self._number(32)
+            return pack_pattern(PatternChunk(dice.randrange(3) if small else self._number(16), 0, whole, levels))
+        if opcode == Opcode.LOAD_PLAN:
+            return self._plan()
+        if opcode == Opcode.ARM:
+            self.counts.runs_armed += 1
+            start = tick + dice.randrange(1, 100) if dice.random() < 0.8 else self._number(64)
+            cycles = dice.randrange(4) if dice.random() < 0.8 else self._number(64)
+            return pack_arm(Arm(start, cycles, dice.randrange(1, 2000) if dice.random() < 0.8 else self._number(32)))
+        if opcode == Opcode.GATE:
+            near = tick + dice.randrange(1000)
+            return pack_gate(
+                Gate(near if dice.random() < 0.8 else self._number(64), self._number(32), dice.randrange(9))
+            )
+        return b""
+
+    def _plan(self) -> bytes:
+        dice = self._dice
+        n_slots = dice.choice((1, 2, 5))
+        slots = np.zeros(n_slots, wire.SLOT_DTYPE)
+        slots["offset_ticks"] = np.arange(n_slots) * 100
+        slots["pattern"] = [dice.choice((0, 1, 0xFFFF)) for _ in range(n_slots)]
+        chunk = PlanChunk(0, 2, n_slots, 0, 80, 100, 100 * n_slots, dice.choice((1, 16)), 1, slots)
+        for _ in range(dice.choice((0, 0, 0, 1, 2))):
+            name, bits = dice.choice(
+                (("mode", 8), ("n_patterns", 16), ("n_slots", 32), ("first_slot", 32), ("exposure_ticks", 32),
+                 ("slot_period_ticks", 32), ("cycle_ticks", 64), ("block_exposures", 16), ("cycles_per_object", 32))
+            )  # fmt: skip
+            changes: dict[str, Any] = {name: self._number(bits)}
+            chunk = chunk._replace(**changes)
+        if dice.random() < 0.1:
+            slots["offset_ticks"][dice.randrange(n_slots)] = self._number(64)
+        return pack_plan(chunk)
+
+    def _frame_for_host(self) -> bytes:
+        dice = self._dice
+        kind = dice.choice((*DEVICE_TYPES, MessageType.CLICKS, MessageType.CLICKS, dice.randrange(256)))
+        session = NONCE if dice.random() < 0.97 else self._number(32)
+        tracker = self._core.tracker
+        if kind in (MessageType.CLICKS, MessageType.FRAMES) and dice.random() < 0.8:
+            count = dice.randrange(1, 6)
+            good = dice.random() < 0.7
+            seq = tracker.next_seq if good else self._number(32)
+            first = tracker.next_exposure + dice.choice((0, 0, 0, 1, 50)) if good else self._number(64)
+            head = (seq, self._number(32), self._number(63), first, self._number(32), self._number(32))
+            if kind == MessageType.CLICKS:
+                patterns = np.array([dice.choice((0, 1, 2, 3, 0xFFFF)) for _ in range(count)], np.uint16)
+                return wire.encode_clicks(wire.ClickBlock(*head, patterns, np.ones(count, np.uint8)), session)
+            return wire.encode_frames(wire.FrameBlock(*head, np.ones((count, dice.choice((1, 8))), np.uint8)), session)
+        layouts = {
+            MessageType.PONG: "<IQQQ", MessageType.ACK: "<IIIHH", MessageType.STATUS: "<BBHIIQQ", MessageType.MARK: "<IIhHQQf",
+            MessageType.WELCOME: "<IHH", MessageType.CLICKS: "<IIQQIHHI", MessageType.FRAMES: "<IIQQIHHI",
+        }  # fmt: skip
+        size = struct.calcsize(layouts.get(MessageType(kind), "<I")) if kind in set(MessageType) else dice.randrange(64)
+        body = bytearray(dice.randbytes(size)) if dice.random() < 0.7 else bytearray(size)
+        if kind == MessageType.ACK and dice.random() < 0.9:
+            body[:4] = struct.pack("<I", dice.randrange(12))
+            body[-2:] = b"\0\0"
+        if kind == MessageType.WELCOME and dice.random() < 0.9:
+            body = bytearray(struct.pack("<IHH", wire.SCHEMA, wire.PROTOCOL_VERSION, 0))
+            body += dice.choice((b"\x80", b"\x81\xa1a\x01", b"\xdf\xff\xff\xff\xff", dice.randbytes(20)))
+        return wire.encode_frame(kind, bytes(body) + dice.randbytes(dice.choice((0, 0, 0, 1, 9))), session)
+
+
+class _AnyDecider:
+    name, n_classes = "any", 2
+
+    def __init__(self, n_features: int) -> None:
+        self.n_features = n_features
+
+    def decide(self, counts: np.ndarray, shots: int) -> tuple[int, float]:
+        return 0, 0.5
+
+
+def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:
+    """Throw that much; return the counts and "" or what went wrong, with a traceback."""
+    fuzzer = Fuzzer(seed)
+    counts = fuzzer.counts
+    try:
+        while counts.bytes < n_bytes or counts.frames < n_frames:
+            if counts.bytes < n_bytes:
+                fuzzer.random_bytes(min(BATCH_BYTES, n_bytes - counts.bytes))
+            if counts.frames < n_frames:
+                fuzzer.structured_frames(BATCH_FRAMES)
+    except Exception:
+        return counts, traceback.format_exc()
+    fuzzer._count_device()
+    return counts, ""
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--bytes", type=int, default=100_000_000, help="random bytes (default 100 million)")
+    parser.add_argument("--frames", type=int, default=1_000_000, help="structured frames (default one million)")
+    parser.add_argument("--seed", type=int, default=1, help="the first seed (default 1)")
+    parser.add_argument("--parts", type=int, default=20, help="seeds that the work is divided over (default 20)")
+
+
+def _run(args: argparse.Namespace) -> int:
+    started = time.perf_counter()
+    total: dict[str, float] = {}
+    for seed in range(args.seed, args.seed + args.parts):
+        counts, failure = fuzz(seed, -(-args.bytes // args.parts), -(-args.frames // args.parts))
+        for name, value in asdict(counts).items():
+            total[name] = max(total.get(name, 0), value) if name == "slowest_call_s" else total.get(name, 0) + value
+        if failure:
+            say(failure)
+            say(f"pans fuzz: seed {seed} failed after {counts.bytes} bytes and {counts.frames} frames")
+            emit(args, {**total, "failed_seed": seed})
+            return EXIT_ALERT
+    seconds = time.perf_counter() - started
+    words = ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in total.items()
+    )
+    emit(args, {**total, "failed_seed": None, "seconds": seconds}, f"nothing was found in {seconds:.0f} s: {words}")
+    return EXIT_FINE
+
+
+FUZZ = Command("throw strange bytes and frames at decoder, instrument and host", _configure, _run)

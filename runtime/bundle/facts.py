@@ -1,0 +1,244 @@
+"""What a bundle is, and what makes one impossible: facts, limits, consistency, golden vectors.
+
+Owns the checks that a made and a read bundle share; never touches a file. The checks raise ValueError with what, found and
+allowed, for the caller to say where.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .head import HEAD_MAX_BYTES
+from .int8 import STEP_MAX, WEIGHT_MAX, Int8Head
+from .optics import Analyser, check_analyser
+
+ENCODERS = ("active", "coherent", "incoherent")  # the last two are passive: nothing is shown
+FEATURES_MAX = 4096
+PIXELS_MAX = 1 << 22
+LEVELS_MAX = 65536
+CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
+OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head gives back
+TEXT_MAX_CHARACTERS = 200
+TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
+GOLDEN_MAX = 4096
+LAYERS_MAX = 16
+GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """What a run needs to know of a trained sensor; its arrays are read-only. `make_bundle` makes one."""
+
+    name: str
+    task: str
+    classes: tuple[str, ...]  # empty where a picture is given back
+    encoder: str
+    image_shape: tuple[int, int]
+    levels: int  # 0 of a passive sensor
+    pattern_levels: NDArray[np.uint16]  # (d_f, pixels), each below `levels`; (d_f, 0) of a passive sensor
+    photons_per_level: float  # photoelectrons per exposure, per level, per unit transmission; 0.0 of a passive sensor
+    head_onnx: bytes | None  # float32 (n, d_f) click means in [0, 1] -> float32 (n, outputs) scores or pixels
+    table: NDArray[np.float32] | None  # (2**d_f, classes); bit i of the row index is the click of pattern i
+    golden_means: NDArray[np.float32]  # (g, d_f)
+    golden_scores: NDArray[np.float32]  # (g, outputs)
+    provenance: Mapping[str, Any]
+    int8_head: Int8Head | None = None  # the head in integers, for our kernels
+    int8_onnx: bytes | None = None  # the same as a quantised ONNX model
+    analyser: Analyser | None = None  # the optics of a passive sensor
+    picture_shape: tuple[int, int] | None = None  # height and width of the picture that the head gives back
+
+    @property
+    def n_features(self) -> int:
+        """Number of patterns, or of detectors behind passive optics: d_f."""
+        return int(self.pattern_levels.shape[0])
+
+    @property
+    def n_pixels(self) -> int:
+        """Number of pixels of one pattern; 0 where nothing is shown."""
+        return int(self.pattern_levels.shape[1])
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes; 0 where a picture is given back."""
+        return len(self.classes)
+
+    @property
+    def n_outputs(self) -> int:
+        """Numbers that the head gives for one object: scores of classes, or pixels of the picture."""
+        return self.n_classes if self.picture_shape is None else math.prod(self.picture_shape)
+
+    @property
+    def n_shown(self) -> int:
+        """Number of patterns that the instrument must hold: none in passive sensing."""
+        return 0 if self.analyser is not None else self.n_features
+
+    def patterns(self) -> NDArray[np.float64]:
+        """Return the patterns (d_f, pixels), float64, in photoelectrons per exposure per unit transmission."""
+        return self.pattern_levels.astype(np.float64) * self.photons_per_level
+
+    def illumination(self) -> float:
+        """Return the sum of all pattern intensities of one shot, in photoelectrons per unit transmission."""
+        return int(self.pattern_levels.sum(dtype=np.uint64)) * self.photons_per_level
+
+
+def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:
+    """Return what differs between scores (g, outputs) and the golden ones, or "" if nothing does.
+
+    Scores agree within 1e-5 * max(1, |score|), and, where they decide among classes, the decision is the same wherever the golden
+    margin exceeds that.
+    """
+    if found.shape != golden.shape:
+        return f"scores of shape {found.shape}, expected {golden.shape}"
+    wanted = golden.astype(np.float64)
+    scale = np.maximum(1.0, np.abs(wanted))
+    error = np.abs(found.astype(np.float64) - wanted) / scale
+    if not np.all(error <= GOLDEN_TOLERANCE):  # a NaN fails too
+        row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
+        worst = float(error[row].max())
+        return f"the scores of vector {row} are off by {worst:.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
+    if not decides:
+        return ""
+    ranked = np.sort(wanted, axis=1)
+    clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale.max(axis=1)
+    differs = clear & (found.argmax(axis=1) != golden.argmax(axis=1))
+    if differs.any():
+        row = int(np.argmax(differs))
+        return f"the decision for vector {row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
+    return ""
+
+
+def row_index(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Table rows of means that are all 0 or 1."""
+    return means.astype(np.int64) @ (1 << np.arange(means.shape[1], dtype=np.int64))
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
+def demand(holds: bool, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
+def _check_text(text: Any, what: str) -> None:
+    fine = isinstance(text, str) and 0 < len(text) <= TEXT_MAX_CHARACTERS and text.isprintable()
+    demand(fine, f"{what} is {ascii(text)[:80]}, allowed: 1 to {TEXT_MAX_CHARACTERS} printable characters")
+
+
+def check_table_shape(shape: Sequence[int], n_features: int, n_classes: int) -> None:
+    demand(n_features <= TABLE_FEATURES_MAX, f"a table for {n_features} patterns, allowed at most {TABLE_FEATURES_MAX}")
+    wanted = (1 << n_features, n_classes)
+    demand(tuple(shape) == wanted, f"the table has shape {tuple(shape)}, allowed: (2**d_f, classes) = {wanted}")
+
+
+def _check_facts(bundle: Bundle) -> None:
+    _check_text(bundle.name, "name")
+    _check_text(bundle.task, "task")
+    demand(bundle.encoder in ENCODERS, f"encoder is {ascii(bundle.encoder)[:80]}, allowed: {', '.join(ENCODERS)}")
+    _check_outputs(bundle)
+    demand(
+        (bundle.encoder == "active") == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none"
+    )
+    scale = bundle.photons_per_level
+    if bundle.analyser is not None:
+        demand(
+            bundle.levels == 0 and scale == 0, "a passive sensor has no projector: levels and photons_per_level are 0"
+        )
+        return
+    demand(2 <= bundle.levels <= LEVELS_MAX, f"levels is {bundle.levels}, allowed: 2 to {LEVELS_MAX}")
+    demand(math.isfinite(scale) and scale > 0, f"photons_per_level is {scale}, allowed: finite and above 0")
+
+
+def _check_outputs(bundle: Bundle) -> None:
+    """Classes, or a picture: one of them."""
+    n_classes, picture = len(bundle.classes), bundle.picture_shape
+    if picture is not None:
+        demand(n_classes == 0, f"a picture and {n_classes} classes, allowed: either")
+        fits = len(picture) == 2 and min(picture) > 0 and math.prod(picture) <= OUTPUTS_MAX
+        demand(
+            bundle.table is None and bundle.int8_head is None, "a picture from a table or an int8 head, allowed: a head"
+        )
+        demand(fits, f"picture_shape is {picture}, allowed: height and width, at most {OUTPUTS_MAX} pixels")
+        return
+    demand(2 <= n_classes <= CLASSES_MAX, f"{n_classes} classes, allowed: 2 to {CLASSES_MAX}")
+    for name in bundle.classes:
+        _check_text(name, "a class name")
+    demand(len(set(bundle.classes)) == n_classes, "two classes have the same name, allowed: each name once")
+
+
+def check_bundle(bundle: Bundle) -> None:
+    """Raise ValueError at the first thing that is impossible in itself or does not fit the rest."""
+    _check_facts(bundle)
+    d_f, pixels = bundle.pattern_levels.shape
+    height, width = bundle.image_shape
+    if bundle.analyser is not None:
+        demand(pixels == 0, f"{bundle.encoder} optics show no patterns, found {pixels} pixels of them")
+        check_analyser(bundle.analyser)
+        demand(bundle.analyser.kind == bundle.encoder, f"encoder {bundle.encoder}, analyser {bundle.analyser.kind}")
+        seen, pixels = bundle.analyser.matrix.shape
+        demand(seen == d_f, f"the matrix has {seen} rows for {d_f} detectors")
+    demand(1 <= d_f <= FEATURES_MAX, f"{d_f} patterns, allowed: 1 to {FEATURES_MAX}")
+    demand(1 <= pixels <= PIXELS_MAX, f"{pixels} pixels, allowed: 1 to {PIXELS_MAX}")
+    fits = height > 0 and width > 0 and height * width == pixels
+    demand(fits, f"image_shape is {height}x{width}, but a pattern has {pixels} pixels")
+    top = int(bundle.pattern_levels.max()) if bundle.analyser is None else -1
+    demand(top < bundle.levels, f"a pattern level is {top}, allowed: 0 to {bundle.levels - 1}")
+    demand(
+        bundle.head_onnx is not None or bundle.table is not None, "neither a head nor a table, allowed: either or both"
+    )
+    if bundle.head_onnx is not None:
+        size = len(bundle.head_onnx)
+        demand(0 < size <= HEAD_MAX_BYTES, f"the head has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+    if bundle.int8_onnx is not None:
+        size = len(bundle.int8_onnx)
+        demand(0 < size <= HEAD_MAX_BYTES, f"the int8 model has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+    if bundle.int8_head is not None:
+        _check_int8(bundle.int8_head, d_f, bundle.n_outputs)
+    if bundle.table is not None:
+        check_table_shape(bundle.table.shape, d_f, bundle.n_outputs)
+        demand(bool(np.isfinite(bundle.table).all()), "the table holds scores that are not finite")
+    _check_golden(bundle)
+
+
+def _check_int8(head: Int8Head, n_features: int, n_classes: int) -> None:
+    sizes = head.sizes.tolist()
+    demand(2 <= len(sizes) <= LAYERS_MAX + 1, f"the int8 head has {len(sizes) - 1} layers, allowed: 1 to {LAYERS_MAX}")
+    demand(min(sizes) >= 1, f"the int8 head has the sizes {sizes}, allowed: 1 or more")
+    ends = (sizes[0], sizes[-1])
+    demand(ends == (n_features, n_classes), f"the int8 head maps {ends}, allowed: {(n_features, n_classes)}")
+    n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
+    demand(head.weights.shape == (n_weights,), f"the int8 head has {head.weights.size} weights, needs {n_weights}")
+    wanted = (2, sum(sizes[1:]))
+    demand(head.affine.shape == wanted, f"int8_affine has shape {head.affine.shape}, allowed: {wanted}")
+    demand(bool(np.isfinite(head.affine).all()), "the int8 head holds scales that are not finite")
+    # a sum of integers stays exact: the kernel adds in int32
+    largest = max(n_in for n_in in sizes[1:-1]) * STEP_MAX * WEIGHT_MAX if len(sizes) > 2 else 0
+    demand(largest < 1 << 31, f"an int8 layer of {max(sizes[1:])} inputs could leave int32")
+
+
+def _check_golden(bundle: Bundle) -> None:
+    means, scores = bundle.golden_means, bundle.golden_scores
+    count = means.shape[0]
+    demand(1 <= count <= GOLDEN_MAX, f"{count} golden vectors, allowed: 1 to {GOLDEN_MAX}")
+    demand(
+        means.shape == (count, bundle.n_features), f"golden_means has shape {means.shape}, d_f is {bundle.n_features}"
+    )
+    wanted = (count, bundle.n_outputs)
+    demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
+    demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
+    demand(bool(np.isfinite(scores).all()), "the golden scores are not finite (does the head answer NaN?)")
+    if bundle.table is not None:
+        binary = ((means == 0) | (means == 1)).all(axis=1)
+        found = bundle.table[row_index(means[binary])]
+        difference = golden_violation(found, scores[binary])
+        demand(not difference, f"the table does not answer the golden vectors: {difference}")

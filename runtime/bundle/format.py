@@ -1,0 +1,279 @@
+"""Bundles as bytes: docs/FORMATS.md in code.
+
+Owns the layout, its checksums and its limits; never touches a file and never makes a bundle. `parse_bundle` raises
+DamagedFileError for any byte that is not as it was written, with the part that changed. The container is our own, not zip: zip
+leaves bytes that no checksum covers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
+from pans.runtime.errors import DamagedFileError, UsageError
+
+from .facts import LEVELS_MAX, Bundle, check_bundle, demand, frozen
+from .int8 import Int8Head
+from .optics import Analyser
+
+MAGIC = b"PANSBNDL"
+VERSIONS = (1, 2)  # a bundle is written in the lowest that can say it
+HEADER_MAX_BYTES = MIB
+_PROLOGUE = struct.Struct("<8sII")
+_DIGEST_BYTES = 32
+_HEADER_KEYS = {
+    *("name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"),
+}
+_NEW_KEYS = {"sensor", "picture_shape"}  # of version 2
+_PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
+_PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
+_MATRIX_PARTS = {"<f4": "matrix", "<c8": "matrix_complex"}  # of a passive sensor, in place of the patterns: one of them
+_INT8_PARTS = {"int8_sizes": "<u4", "int8_weights": "|i1", "int8_affine": "<f4"}  # all three or none
+_PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"} | {name: dtype for dtype, name in _MATRIX_PARTS.items()}
+_SENSOR_KEYS = ("light", "optics", "full_scale_photoelectrons", "exposure_us")
+_REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
+
+
+def bundle_bytes(bundle: Bundle) -> bytes:
+    """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 256 MiB."""
+    parts: list[tuple[str, NDArray[Any]]] = [_optics_part(bundle)]
+    if bundle.head_onnx is not None:
+        parts.append(("head_onnx", np.frombuffer(bundle.head_onnx, dtype=np.uint8)))
+    if bundle.table is not None:
+        parts.append(("table", bundle.table))
+    parts += [("golden_means", bundle.golden_means), ("golden_scores", bundle.golden_scores)]
+    if bundle.int8_head is not None:
+        head = bundle.int8_head
+        parts += [("int8_sizes", head.sizes), ("int8_weights", head.weights), ("int8_affine", head.affine)]
+    if bundle.int8_onnx is not None:
+        parts.append(("int8_onnx", np.frombuffer(bundle.int8_onnx, dtype=np.uint8)))
+    rows, blobs, offset = [], [], 0
+    for name, array in parts:
+        blob = array.astype(_PARTS[name]).tobytes()
+        digest = hashlib.sha256(blob).hexdigest()
+        rows.append(
+            {
+                **{"name": name, "dtype": _PARTS[name], "shape": list(array.shape)},
+                **{"offset": offset, "length": len(blob), "sha256": digest},
+            }
+        )
+        blobs.append(blob)
+        offset += len(blob)
+    header = canonical_json(
+        {
+            "name": bundle.name,
+            "task": bundle.task,
+            "encoder": bundle.encoder,
+            "classes": list(bundle.classes),
+            "image_shape": list(bundle.image_shape),
+            "levels": bundle.levels,
+            "photons_per_level": bundle.photons_per_level,
+            "provenance": bundle.provenance,
+            "parts": rows,
+            **_new_facts(bundle),
+        }
+    )
+    total = _PROLOGUE.size + len(header) + offset + _DIGEST_BYTES
+    if len(header) > HEADER_MAX_BYTES or total > FILE_MAX_BYTES:
+        allowed = f"{HEADER_MAX_BYTES} and {FILE_MAX_BYTES}"
+        raise UsageError(
+            f"this bundle would have a header of {len(header)} and {total} bytes in all, allowed: {allowed}"
+        )
+    version = VERSIONS[bool(_new_facts(bundle))]
+    body = b"".join([_PROLOGUE.pack(MAGIC, version, len(header)), header, *blobs])
+    return body + hashlib.sha256(body).digest()
+
+
+def _optics_part(bundle: Bundle) -> tuple[str, NDArray[Any]]:
+    if bundle.analyser is None:
+        return "pattern_levels", bundle.pattern_levels
+    matrix = bundle.analyser.matrix
+    return _MATRIX_PARTS["<c8" if np.iscomplexobj(matrix) else "<f4"], matrix
+
+
+def _new_facts(bundle: Bundle) -> dict[str, Any]:
+    """What version 1 cannot say: a passive sensor, a picture instead of classes."""
+    facts: dict[str, Any] = {}
+    if bundle.analyser is not None:
+        facts["sensor"] = {name: getattr(bundle.analyser, name) for name in _SENSOR_KEYS}
+    if bundle.picture_shape is not None:
+        facts["picture_shape"] = list(bundle.picture_shape)
+    return facts
+
+
+def parse_bundle(data: bytes, where: str) -> Bundle:
+    """Return the bundle in `data`; DamagedFileError, starting with `where`, for any byte that is not as written."""
+    try:
+        header_end = _check_prologue(data)
+        if hashlib.sha256(data[:-_DIGEST_BYTES]).digest() != data[-_DIGEST_BYTES:]:
+            raise ValueError(_what_changed(data, header_end))
+        header = parse_json_object(data[_PROLOGUE.size : header_end], "header")
+        return _build(header, _read_parts(header, data, header_end))
+    except DamagedFileError as error:
+        raise DamagedFileError(f"{where}: {error.message}", remedy=error.remedy or _REMEDY) from error
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DamagedFileError(f"{where}: {error}", remedy=_REMEDY) from error
+
+
+def _check_prologue(data: bytes) -> int:
+    """Check magic, version and sizes; return where the header ends."""
+    demand(len(data) <= FILE_MAX_BYTES, f"{len(data)} bytes, allowed at most {FILE_MAX_BYTES}")
+    if data[: len(MAGIC)] != MAGIC[: len(data)]:
+        raise ValueError(f"not a PANS bundle: it starts with {data[:8]!a}, expected {MAGIC!a}")
+    smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
+    demand(len(data) >= smallest, f"truncated: {len(data)} bytes, a bundle has at least {smallest}")
+    _, version, header_length = _PROLOGUE.unpack_from(data)
+    if version not in VERSIONS:
+        raise DamagedFileError(
+            f"bundle format version {version}, allowed: {', '.join(map(str, VERSIONS))}",
+            remedy="install the pans-runtime that wrote it, or export the bundle again with this one",
+        )
+    demand(header_length <= HEADER_MAX_BYTES, f"a header of {header_length} bytes, allowed at most {HEADER_MAX_BYTES}")
+    header_end = _PROLOGUE.size + header_length
+    demand(
+        header_end + _DIGEST_BYTES <= len(data), f"truncated: {len(data)} bytes, the header alone needs {header_end}"
+    )
+    return header_end
+
+
+def _what_changed(data: bytes, header_end: int) -> str:
+    """Say as exactly as possible why the closing checksum does not fit; the header is not trusted here, only quoted."""
+    try:
+        rows = parse_json_object(data[_PROLOGUE.size : header_end], "header")["parts"]
+        wanted = header_end + sum(int(row["length"]) for row in rows) + _DIGEST_BYTES
+        if wanted > len(data):
+            return f"truncated: {len(data)} bytes, the header announces {wanted}"
+        if wanted < len(data):
+            return f"{len(data) - wanted} bytes too many: {len(data)}, the header announces {wanted}"
+        for row in rows:
+            start = header_end + int(row["offset"])
+            if hashlib.sha256(data[start : start + int(row["length"])]).hexdigest() != row["sha256"]:
+                return f"altered: the part {ascii(row['name'])[:40]} does not have its SHA-256"
+    except (DamagedFileError, KeyError, TypeError, ValueError, OverflowError):
+        pass
+    return "altered: the header or the closing SHA-256 is not as written"
+
+
+def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict[str, NDArray[Any]]:
+    """Return the parts by name, after checking that they fill the file without gap, overlap or rest."""
+    version = _PROLOGUE.unpack_from(data)[1]
+    keys = _HEADER_KEYS | (set(header) & _NEW_KEYS if version > 1 else set())
+    demand(set(header) == keys, f"the header has the keys {_quoted(header)}, allowed: {_quoted(keys)}")
+    demand(
+        version == VERSIONS[bool(keys & _NEW_KEYS)], f"a bundle of format version {version} that says no more than 1"
+    )
+    rows = header["parts"]
+    demand(isinstance(rows, list) and len(rows) <= len(_PARTS), "the header's parts are not a short list")
+    parts: dict[str, NDArray[Any]] = {}
+    offset, room = 0, len(data) - _DIGEST_BYTES - header_end
+    for row in rows:
+        demand(isinstance(row, dict) and set(row) == _PART_KEYS, f"a part needs the keys {_quoted(_PART_KEYS)}")
+        name, shape, length = row["name"], row["shape"], row["length"]
+        demand(isinstance(name, str) and name in _PARTS, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(_PARTS)}")
+        demand(name not in parts, f"the part {name} stands twice")
+        demand(row["dtype"] == _PARTS[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {_PARTS[name]}")
+        good_shape = isinstance(shape, list) and len(shape) in (1, 2) and all(_is_count(n) for n in shape)
+        demand(good_shape and _is_count(length), f"{name} has shape {ascii(shape)[:80]}, allowed: one or two sizes")
+        wanted = math.prod(shape) * np.dtype(_PARTS[name]).itemsize
+        demand(length == wanted, f"{name} has {length} bytes, its shape {shape} needs {wanted}")
+        demand(
+            row["offset"] == offset and offset + length <= room, f"{name} lies outside the file or over another part"
+        )
+        blob = data[header_end + offset : header_end + offset + length]
+        demand(hashlib.sha256(blob).hexdigest() == row["sha256"], f"the part {name} does not have its SHA-256")
+        native = np.dtype(_PARTS[name]).newbyteorder("=")
+        parts[name] = frozen(np.frombuffer(blob, dtype=_PARTS[name]).reshape(shape).astype(native))
+        offset += length
+    demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
+    optics = [name for name in ("pattern_levels", *_MATRIX_PARTS.values()) if name in parts]
+    passive = "sensor" in header
+    demand(len(optics) <= 1, f"the parts {', '.join(optics)}, allowed: one of them")
+    if not (passive and optics):
+        optics = ["pattern_levels"]
+    for name in (*optics, "golden_means", "golden_scores"):
+        demand(name in parts and parts[name].ndim == 2, f"the part {name} is missing or not a matrix")
+    return parts
+
+
+def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bundle:
+    shape, classes, scale = header["image_shape"], header["classes"], header["photons_per_level"]
+    good_shape = isinstance(shape, list) and len(shape) == 2 and all(_is_count(n) for n in shape)
+    demand(good_shape, f"image_shape is {ascii(shape)[:80]}, allowed: [height, width]")
+    passive, picture = "sensor" in header, header.get("picture_shape")
+    levels = header["levels"]
+    levels_fit = _is_count(levels) or (passive and levels == 0 and not isinstance(levels, bool))
+    demand(levels_fit, f"levels is {ascii(header['levels'])[:80]}, allowed: 2 to {LEVELS_MAX}")
+    good_scale = isinstance(scale, int | float) and not isinstance(scale, bool)
+    demand(good_scale, f"photons_per_level is {ascii(scale)[:80]}, allowed: finite and above 0")
+    demand(isinstance(classes, list), f"classes is {ascii(classes)[:80]}, allowed: a list of names")
+    demand(isinstance(header["provenance"], dict), "provenance is not an object")
+    good_picture = isinstance(picture, list) and len(picture) == 2 and all(_is_count(n) for n in picture)
+    demand(picture is None or good_picture, f"picture_shape is {ascii(picture)[:80]}, allowed: [height, width]")
+    analyser = _analyser(header, parts) if passive else None
+    patterns = parts["pattern_levels"] if analyser is None else frozen(np.zeros((len(analyser.matrix), 0), np.uint16))
+    head = parts.get("head_onnx")
+    int8_onnx = parts.get("int8_onnx")
+    bundle = Bundle(
+        name=header["name"],
+        task=header["task"],
+        classes=tuple(classes),
+        encoder=header["encoder"],
+        image_shape=(shape[0], shape[1]),
+        levels=header["levels"],
+        pattern_levels=patterns,
+        photons_per_level=float(scale),
+        head_onnx=None if head is None else head.tobytes(),
+        table=parts.get("table"),
+        golden_means=parts["golden_means"],
+        golden_scores=parts["golden_scores"],
+        provenance=header["provenance"],
+        int8_head=_int8_head(parts),
+        int8_onnx=None if int8_onnx is None else int8_onnx.tobytes(),
+        analyser=analyser,
+        picture_shape=None if picture is None else (picture[0], picture[1]),
+    )
+    check_bundle(bundle)
+    return bundle
+
+
+def _analyser(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Analyser:
+    facts = header["sensor"]
+    demand(
+        isinstance(facts, dict) and set(facts) == set(_SENSOR_KEYS),
+        f"sensor is {ascii(facts)[:80]}, needed are the keys {', '.join(_SENSOR_KEYS)}",
+    )
+    matrix = next((parts[name] for name in _MATRIX_PARTS.values() if name in parts), None)
+    if matrix is None:
+        raise ValueError(f"a passive sensor without its matrix, needed: {' or '.join(_MATRIX_PARTS.values())}")
+    numbers = {}
+    for name in ("full_scale_photoelectrons", "exposure_us"):
+        value = facts[name]
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        demand(good, f"sensor.{name} is {ascii(value)[:80]}, allowed: finite and above 0")
+        numbers[name] = float(value)
+    return Analyser(header["encoder"], matrix, facts["light"], facts["optics"], **numbers)
+
+
+def _int8_head(parts: Mapping[str, NDArray[Any]]) -> Int8Head | None:
+    found = [parts[name] for name in _INT8_PARTS if name in parts]
+    demand(len(found) in (0, 3), f"an int8 head needs the parts {', '.join(_INT8_PARTS)}, all of them")
+    if not found:
+        return None
+    sizes, weights, affine = found
+    demand((sizes.ndim, weights.ndim, affine.ndim) == (1, 1, 2), "the parts of the int8 head have wrong shapes")
+    return Int8Head(frozen(sizes.astype(np.int64)), weights, affine)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= FILE_MAX_BYTES
+
+
+def _quoted(names: Mapping[str, Any] | set[str]) -> str:
+    return ascii(", ".join(sorted(str(name) for name in names))[:200])

@@ -1,0 +1,176 @@
+"""The trained artifact in one file: quantised patterns, a back end (table, ONNX head or both), golden vectors, provenance.
+
+Owns how a bundle is made, written and loaded; what it is stands in bundle_facts.py, its bytes in bundle_format.py. Never shows
+a pattern and never decides. A read either returns a `Bundle` whose every byte is covered by a checksum and whose table
+answers the golden vectors, or raises DamagedFileError.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
+from pans.runtime.errors import UsageError
+
+from .facts import LEVELS_MAX, Bundle, check_bundle, check_table_shape, frozen, golden_violation, row_index
+from .format import bundle_bytes, parse_bundle
+from .head import OnnxHead, open_head
+from .int8 import Int8Head
+from .optics import Analyser
+
+__all__ = [
+    "Bundle",
+    "bundle_bytes",
+    "golden_violation",
+    "load_bundle",
+    "make_bundle",
+    "parse_bundle",
+    "word_means",
+    "write_bundle",
+]
+
+TABLE_BUILD_FEATURES_MAX = 12
+
+
+def make_bundle(
+    *,
+    name: str,
+    task: str,
+    classes: Sequence[str] = (),
+    image_shape: tuple[int, int],
+    levels: int = 0,
+    pattern_levels: ArrayLike | None = None,
+    photons_per_level: float = 0.0,
+    head_onnx: bytes | None = None,
+    table: ArrayLike | None = None,
+    provenance: Mapping[str, Any],
+    int8_head: Int8Head | None = None,
+    int8_onnx: bytes | None = None,
+    analyser: Analyser | None = None,
+    picture_shape: tuple[int, int] | None = None,
+) -> Bundle:
+    """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where d_f <= 12.
+
+    An active sensor has `levels`, `pattern_levels` and `photons_per_level`, a passive one its `analyser` instead; a head decides among
+    `classes`, or gives back a picture of `picture_shape`. `pattern_levels` is (d_f, pixels) of any integer dtype, `table`
+    (2**d_f, classes) floats; one of head and table must be given, and where both are they must agree. UsageError says what does
+    not fit, DamagedFileError what is wrong with the head.
+    """
+    try:
+        quantised = _as_levels(pattern_levels, levels) if analyser is None else _no_levels(pattern_levels, analyser)
+        n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
+            given = None if table is None else np.array(table, dtype=np.float32)
+        means, scores, given = _evaluate_back_end(
+            head_onnx, given, len(quantised), n_outputs, decides=picture_shape is None
+        )
+        bundle = Bundle(
+            name=name,
+            task=task,
+            classes=tuple(classes),
+            encoder="active" if analyser is None else analyser.kind,
+            image_shape=(int(image_shape[0]), int(image_shape[1])),
+            levels=int(levels),
+            pattern_levels=frozen(quantised),
+            photons_per_level=float(photons_per_level),
+            head_onnx=None if head_onnx is None else bytes(head_onnx),
+            table=None if given is None else frozen(given),
+            golden_means=frozen(means),
+            golden_scores=frozen(scores),
+            provenance=parse_json_object(canonical_json(dict(provenance)), "provenance"),
+            int8_head=int8_head,
+            int8_onnx=None if int8_onnx is None else bytes(int8_onnx),
+            analyser=analyser,
+            picture_shape=picture_shape,
+        )
+        check_bundle(bundle)
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"this bundle cannot be made: {error}") from error
+    return bundle
+
+
+def word_means(words: ArrayLike, n_features: int) -> NDArray[np.float32]:
+    """Return click words (n,) as the head's input (n, d_f), float32: bit i becomes feature i; d_f <= 63."""
+    bits = np.asarray(words, dtype=np.int64)[:, None] >> np.arange(n_features, dtype=np.int64)
+    return (bits & 1).astype(np.float32)
+
+
+def _no_levels(pattern_levels: ArrayLike | None, analyser: Analyser) -> NDArray[np.uint16]:
+    if pattern_levels is not None:
+        raise ValueError("pattern_levels beside an analyser: a passive sensor shows nothing")
+    return np.zeros((len(analyser.matrix), 0), np.uint16)
+
+
+def _as_levels(pattern_levels: ArrayLike | None, levels: int) -> NDArray[np.uint16]:
+    values = np.asarray(pattern_levels)
+    if values.ndim != 2 or not np.issubdtype(values.dtype, np.integer) or values.size == 0:
+        raise ValueError(
+            f"pattern_levels has shape {values.shape} and dtype {values.dtype}, allowed: integers (d_f, pixels)"
+        )
+    low, high = int(values.min()), int(values.max())
+    if low < 0 or high >= min(levels, LEVELS_MAX):
+        raise ValueError(f"pattern_levels run from {low} to {high}, allowed: 0 to {levels - 1}")
+    return values.astype(np.uint16)
+
+
+def _evaluate_back_end(
+    head_onnx: bytes | None, table: NDArray[np.float32] | None, n_features: int, n_outputs: int, *, decides: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return (golden means, golden scores, table or None); the head answers where there is one, else the table."""
+    if table is not None:
+        check_table_shape(table.shape, n_features, n_outputs)
+    if head_onnx is None:
+        if table is None:
+            raise ValueError("neither a head nor a table was given, allowed: either or both")
+        means = _golden_words(n_features)
+        return means, table[row_index(means)], table
+    head = open_head(head_onnx, n_features, n_outputs, "head")
+    means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
+    if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX:
+        table = head.scores(word_means(np.arange(1 << n_features), n_features))
+    elif table is not None:
+        _demand_agreement(head, table, n_features)
+    return means, head.scores(means), table
+
+
+def _demand_agreement(head: OnnxHead, table: NDArray[np.float32], n_features: int) -> None:
+    difference = golden_violation(table, head.scores(word_means(np.arange(1 << n_features), n_features)))
+    if difference:
+        raise ValueError(f"head and table disagree: {difference} (vector = click word; found = table, expected = head)")
+
+
+def _golden_words(n_features: int) -> NDArray[np.float32]:
+    """No click, all clicks, single clicks (at most 64, evenly spread), 64 random words with a fixed seed."""
+    singles = np.unique(np.linspace(0, n_features - 1, min(n_features, 64)).round().astype(np.int64))
+    rows = np.zeros((2 + len(singles) + 64, n_features), dtype=np.float32)
+    rows[1] = 1.0
+    rows[2 + np.arange(len(singles)), singles] = 1.0
+    rows[2 + len(singles) :] = np.random.default_rng(20250101).integers(0, 2, size=(64, n_features))
+    return rows
+
+
+def _golden_shots(n_features: int) -> NDArray[np.float32]:
+    """Means of 2, 3, 5 and 8 shots, four rows each, divided as a decider divides: float32 counts by float32 shots."""
+    rng = np.random.default_rng(20250102)
+    rows = [rng.integers(0, k + 1, size=(4, n_features)).astype(np.float32) / np.float32(k) for k in (2, 3, 5, 8)]
+    return np.concatenate(rows)
+
+
+def write_bundle(bundle: Bundle, path: str | Path) -> str:
+    """Write `bundle` beside `path`, sync, rename over it; return the file's SHA-256 as hex."""
+    data = bundle_bytes(bundle)
+    replace_file(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_bundle(path: str | Path) -> tuple[Bundle, str]:
+    """Return the bundle in `path` and the file's SHA-256 as hex; UsageError without a file, else DamagedFileError."""
+    data = read_file(path)
+    return parse_bundle(data, str(path)), hashlib.sha256(data).hexdigest()

@@ -1,0 +1,77 @@
+"""`pans bench`: speed beside error, on this machine, now.
+
+Owns the arguments and the report; each benchmark is found by entry point (`pans.benches`), so that the simulator's joins from its own
+package. Exit code 0 whatever the figures are: a benchmark measures, tests judge.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.cli import EXIT_FINE, Command, emit, say
+from pans.runtime.errors import UsageError
+
+NAMES = ("decide", "link", "loop", "ingest", "sim")
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", choices=[*NAMES, "all"], help="what to measure")
+    parser.add_argument(
+        "--bundle", type=Path, action="append", default=[], help="a bundle to decide with (decide: may be repeated)"
+    )
+    parser.add_argument(
+        "--inputs",
+        type=Path,
+        action="append",
+        default=[],
+        help="decide: .npz with counts (n, d_f), shots, labels; one per --bundle",
+    )
+    parser.add_argument("--seconds", type=float, default=5.0, help="loop: length of each of its four runs (default 5)")
+    parser.add_argument("--load", action="store_true", help="loop: keep both cores busy with other processes")
+    parser.add_argument("--frames", type=int, default=0, help="ingest: also run the whole way over this many frames")
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
+    parser.add_argument("--plot", type=Path, help="write a picture of speed against error (plot extra)")
+
+
+def _run(args: argparse.Namespace) -> int:
+    from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
+
+    if args.seconds <= 0 or args.frames < 0:
+        raise UsageError("--seconds must be above 0 and --frames not negative")
+    options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.frames, args.load, args.quick)
+    before = machine_facts()
+    rows: list[dict[str, Any]] = []
+    for name in NAMES if args.what == "all" else (args.what,):
+        bench = _find(name)
+        if bench is None:
+            say(f"pans bench {name}: not installed")
+            continue
+        say(f"pans bench {name} ...")
+        rows += [{"bench": name, **row} for row in bench(options)]
+    machine = before | {"load_1min_after": machine_facts()["load_1min"]}
+    if args.plot is not None:
+        write_plot(rows, args.plot)
+    text = "\n".join(f"{key:<16} {value}" for key, value in machine.items())
+    emit(args, {"machine": machine, "rows": rows}, f"{text}\n\n{table_text(rows)}")
+    return EXIT_FINE
+
+
+def bench_link(options: Any) -> list[dict[str, Any]]:
+    """Return the rows of bench_link.py, which takes numbers of round trips rather than options."""
+    from pans.runtime.bench.link import bench_link
+
+    return bench_link(samples=400 if options.quick else 4000)
+
+
+def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:
+    for point in entry_points(group="pans.benches", name=name):
+        found: Callable[[Any], list[dict[str, Any]]] = point.load()
+        return found
+    return None
+
+
+BENCH = Command("measure speed and error on this machine", _configure, _run)

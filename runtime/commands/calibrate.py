@@ -1,0 +1,117 @@
+"""`pans calibrate`: photon level, dark rates and non-uniformity of one instrument, measured through the ordinary session, into
+a dated file.
+
+Owns the command's arguments, its two stages and its answer; the design is calibration_run.py's, the estimate calibrate.py's, the file
+calibration.py's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.instrument.profile import Profile, load_profile
+
+from .run import profile_of
+
+FIRST_STAGE_SHARE = 0.1
+PEAK_OFF = 0.2  # of the profile's brightness: beyond it the answer says so
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device", required=True, help="device URL; a clear field must stand before it (sim: scene=uniform)"
+    )
+    parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
+    parser.add_argument(
+        "-o", "--out", required=True, type=Path, metavar="FILE", help="calibration file to write (.json)"
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, help="instrument time (default 10)")
+    parser.add_argument("--seed", type=int, default=1, help="of the random patterns (default 1)")
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    from pans.runtime.core.calibration import (
+        LADDER,
+        TELLING,
+        calibration_exposure_us,
+        count_model,
+        counts_of,
+        design_run,
+        joined_counts,
+        profile_level,
+    )
+    from pans.runtime.core.calibration_result import calibration_values
+    from pans.runtime.instrument.calibration import save_calibration
+    from pans.runtime.instrument.estimate import fit_light
+
+    if not 0.5 <= args.seconds <= 86_400:
+        raise UsageError(f"--seconds must be from 0.5 to 86400, found {args.seconds:g}")
+    profile = load_profile(args.profile or profile_of(args.device))
+    exposure_us = calibration_exposure_us(profile)
+    model, guess = count_model(profile, exposure_us), profile_level(profile, exposure_us)
+    first = design_run(profile, LADDER, guess, FIRST_STAGE_SHARE * args.seconds, args.seed)
+    core, _ = _measure(args.device, profile, first)
+    found = fit_light(joined_counts(counts_of(core, first, profile)), model).level
+    if found.value <= 0 or not math.isfinite(found.value):
+        raise UsageError(
+            "no exposure with light clicked" if found.value <= 0 else "every exposure with light clicked",
+            remedy="check the light path: a clear field must stand before the detector, neither dark nor blinding",
+        )
+    second = design_run(profile, TELLING, found.value, (1 - FIRST_STAGE_SHARE) * args.seconds, args.seed + 1)
+    core, facts = _measure(args.device, profile, second)
+    values = calibration_values(counts_of(core, second, profile), model, second, profile)
+    values |= {"command": shlex.join(["pans", *sys.argv[1:]]), "seed": args.seed, "device": facts}
+    sha256 = save_calibration(args.out, values)
+    payload = {
+        "calibration": str(args.out),
+        "sha256": sha256,
+        **{key: value for key, value in values.items() if key != "channels"},
+    }
+    emit(args, payload, _words(args.out, values))
+    off = abs(values["efficiency"]["relative_to_profile"] - 1.0) > PEAK_OFF
+    return EXIT_ALERT if off else EXIT_FINE
+
+
+def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any]]:
+    """Run one design through the ordinary session; return the core with its sums, and the device's facts."""
+    from pans.runtime.core.calibration import CalibrationCore
+    from pans.runtime.link.base import open_link
+    from pans.runtime.live.loop import RunConfig, run_live
+
+    core = CalibrationCore(design.plan, design.n_cycles)
+    seconds = design.n_cycles * design.plan.cycle_us * 1e-6
+    say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
+    config = RunConfig(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
+    result = run_live(open_link(device), profile, design.bundle, design.plan, core, config)
+    if result.ended != "completed":
+        raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
+    keep = ("serial", "firmware", "name", "simulated")
+    return core, {key: result.device[key] for key in keep if key in result.device}
+
+
+def _words(path: Path, values: dict[str, Any]) -> str:
+    low, high = values["photons_per_level_ci"]
+    spread, efficiency = values["non_uniformity"], values["efficiency"]
+    half = "no upper bound" if high is None else f"±{50 * (high - low) / values['photons_per_level']:.2f} %"
+    banner = "SIMULATED · " if values["device"].get("simulated") else ""
+    found = "patterns differ" if spread["found"] else "no sign that patterns differ"
+    level, dark, dark_ci = values["photons_per_level"], values["dark_per_exposure"], values["dark_ci"]
+    lines = [
+        f"{banner}{path}",
+        f"  photon level    {level:.6g} photoelectrons per level and exposure ({values['exposure_us']:g} us), 95 % {half}",
+        f"  peak            {values['peak_photoelectrons_hz']:.6g} photoelectrons/s, "
+        f"{efficiency['relative_to_profile']:.4f} of the profile's",
+        f"  dark            {dark:.3g} per exposure, 95 % {dark_ci[0]:.3g} to {dark_ci[1]:.3g}",
+        f"  non-uniformity  {spread['relative']:.2%} ({found}, p = {spread['p_value']:.2g})",
+    ]
+    return "\n".join(lines)
+
+
+CALIBRATE = Command("measure photon level and dark rates of an instrument, into a dated file", _configure, _calibrate)

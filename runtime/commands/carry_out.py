@@ -1,0 +1,245 @@
+"""One `pans run`, carried out: what is prepared while the port opens, who looks on, the files it leaves, the exit code.
+
+Owns the order of these; arguments are cmd_run.py's, the run itself is loop.py's. `carry_out` returns the exit code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
+from pans.runtime.link.base import open_link
+from pans.runtime.live.signals import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
+
+from .run_dark import DarkRun
+from .run_words import closing_words, recording_header, what_was_run
+
+if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.core.plan import Plan
+    from pans.runtime.decide.verdict import Decider
+    from pans.runtime.link.base import Link
+    from pans.runtime.link.recovery import Recovery
+    from pans.runtime.live.loop import LiveCore, RunConfig, RunResult
+    from pans.runtime.record.parts_writer import AnyRecorder
+
+    from .run import Job
+    from .run_flow import FlowRun
+
+T = TypeVar("T")
+
+
+class _Background(Generic[T]):
+    """Runs one call in a thread, so that a port can open while the compiled kernels load."""
+
+    def __init__(self, call: Callable[[], T]) -> None:
+        self._call = call
+        self._value: list[T] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        try:
+            self._value.append(self._call())
+        except BaseException as error:  # raised again by `result`, in the thread that waits for it
+            self._error = error
+
+    def result(self) -> T:
+        """Wait for the call; return its value or raise its error."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._value[0]
+
+
+def carry_out(args: argparse.Namespace, job: Job) -> int:
+    """Run the job, leave its files and return the exit code."""
+    with stop_signals(continuous=not (job.seconds or job.decisions)) as stop:
+        return _carry_out(args, job, stop)
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """All that a run needs beside its link, made while the port opens."""
+
+    bundle: Bundle
+    bundle_sha256: str
+    decider: Decider
+    honest: DarkRun
+    plan: Plan
+    core: LiveCore
+    passing: FlowRun | None
+    config: RunConfig
+    header: dict[str, Any]
+    recording: Path
+    expected_decisions: int
+
+
+def _prepare(args: argparse.Namespace, job: Job, started_ns: int) -> _Prepared:
+    from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.core.plan import build_plan
+    from pans.runtime.core.still import Core
+    from pans.runtime.decide.backends import make_decider
+    from pans.runtime.live.gates import open_actuator
+    from pans.runtime.live.loop import RunConfig
+
+    from .run_flow import FlowRun, core_of
+
+    bundle, bundle_sha256 = load_bundle(job.bundle_path)
+    decider = make_decider(bundle, shots=job.shots, backend=job.backend)
+    honest = DarkRun.of(args, job.profile)
+    n_objects, passing, seconds = -(-job.decisions // job.trials), None, job.seconds
+    core: LiveCore
+    if job.flow is not None:
+        plan, flow_core, n_cycles = core_of(honest.profile, bundle, decider, job.flow, job.shots, job.seconds)
+        flow_core.guard = honest.guard(plan, bundle, job.shots, flow=True)
+        core, passing, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act, job.act_profile)), 0.0
+    else:
+        plan = build_plan(
+            honest.profile,
+            bundle,
+            shots_per_object=job.shots * job.trials,
+            dark_slots_per_cycle=job.dark_slots,
+            order=job.order,
+        )
+        n_cycles = n_objects * plan.cycles_per_object
+        core = Core(plan, decider, job.shots, n_cycles, honest.guard(plan, bundle, job.shots))
+    lease_ms = job.profile.timing.lease_ms
+    config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
+    job.out.mkdir(parents=True, exist_ok=True)
+    header = recording_header(job, bundle_sha256, decider, n_objects)
+    header["config"]["dark"] = honest.header()
+    if passing is not None:
+        header["config"]["flow"] = passing.header()
+    recording = job.record or job.out / "run.pansrec"
+    expected = n_objects * job.trials
+    return _Prepared(bundle, bundle_sha256, decider, honest, plan, core, passing, config, header, recording, expected)
+
+
+def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
+    started_ns = process_start_ns()
+    opening = _Background(lambda: open_link(job.device))
+    try:
+        from pans.runtime.container import read_file
+        from pans.runtime.link.recovery import Recovery
+        from pans.runtime.link.trace import TracedLink
+        from pans.runtime.live.continuous import open_recorder
+
+        ready = _prepare(args, job, started_ns)
+    except BaseException:
+        _close_quietly(opening)
+        raise
+    for warning in ready.honest.warnings:
+        say(f"pans: {warning}")
+    link = opening.result()
+    if job.trace is not None:
+        link = TracedLink(link, job.trace, job.device)
+    recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
+    bundle_bytes = read_file(job.bundle_path)
+    with open_recorder(ready.recording, ready.header, bundle_bytes, job.continuous.limits) as recorder:
+        result = _watched(job, ready, link, recorder, recovery, stop)
+        summary = _summary(job, ready, result)
+        result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
+    return _conclude(args, job, ready, result, summary)
+
+
+def _watched(
+    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder, recovery: Recovery | None, stop: Stop
+) -> RunResult:
+    """Run, with everybody looking on: the dark counts' guard, the live view, metrics and the state file."""
+    from pans.runtime.core.still import Output
+    from pans.runtime.live.continuous import Attendants
+    from pans.runtime.live.loop import LiveRun, Onlookers, run_live
+    from pans.runtime.live.view import live_view
+
+    bundle, honest, seen = ready.bundle, ready.honest, Attendants(job.continuous, recorder)
+    title = f"{bundle.name} on {job.profile.name}"
+    view = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
+    with seen, view as watch:
+
+        def prepared(run: LiveRun) -> None:
+            honest.check_device(run)
+            seen.prepared(run)
+            if ready.passing is not None:
+                ready.passing.prepared(run)
+
+        def look(run: LiveRun, output: Output) -> None:
+            honest.look(run, output)
+            watch(run, output)
+
+        onlookers = Onlookers(look, prepared, stop)
+        return run_live(
+            link, honest.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, onlookers
+        )
+
+
+def _summary(job: Job, ready: _Prepared, result: RunResult) -> dict[str, Any]:
+    from pans.runtime.report.summary import summarise
+
+    frames = job.shots * (1 if job.flow is None else job.flow.pool)
+    summary = summarise(
+        result,
+        illumination=ready.bundle.illumination() * frames,
+        expected_decisions=ready.expected_decisions,
+        flow=None if ready.passing is None else ready.passing.summary(),
+    )
+    ready.honest.add_to(summary)
+    if ready.passing is not None:
+        result.tally.confusion += ready.passing.core.matcher.confusion
+    return summary
+
+
+def _conclude(args: argparse.Namespace, job: Job, ready: _Prepared, result: RunResult, summary: dict[str, Any]) -> int:
+    """Write the page, say how it went and return the exit code."""
+    from pans.runtime.report.summary import write_markdown
+
+    page, bundle = job.out / "summary.md", ready.bundle
+    facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, ready.recording, summary)
+    write_markdown(page, summary, facts, result.tally, bundle.classes)
+    payload = {
+        **summary,
+        "recording": str(ready.recording),
+        "report": str(page),
+        "shots": job.shots,
+        "seed": getattr(args, "seed", None),
+    }
+    emit(args, payload, closing_words(payload))
+    return _exit_code(summary)
+
+
+def process_start_ns() -> int:
+    """Return when this process started on the scale of time.perf_counter_ns (Linux), or now where that is not known."""
+    now_ns = time.perf_counter_ns()
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        ticks_hz = 100  # USER_HZ: fixed at 100 in the ABI of Linux
+        age_s = float(Path("/proc/uptime").read_text().split()[0]) - int(fields[19]) / ticks_hz
+        return now_ns - round(max(age_s, 0.0) * 1e9)
+    except (OSError, ValueError, IndexError):
+        return now_ns
+
+
+def _close_quietly(opening: _Background[Any]) -> None:
+    try:
+        opening.result().close()
+    except Exception as error:
+        say(f"pans: besides, the device could not be opened: {error}")
+
+
+def _exit_code(summary: dict[str, Any]) -> int:
+    if summary["ended"] == ASKED_TO_STOP:
+        return EXIT_FINE  # what went wrong on the way stands in the summary
+    if summary["ended"] == INTERRUPTED:
+        return EXIT_INTERRUPTED
+    if summary["link_lost"]:
+        return EXIT_DEVICE
+    if summary["late"] or summary["lost"]:
+        return EXIT_TIMING
+    return EXIT_FINE if summary["verdict"] == "PASS" else EXIT_ALERT

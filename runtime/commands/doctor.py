@@ -1,0 +1,54 @@
+"""`pans devices` and `pans doctor`: where instruments may be, and what in this machine stands in their way.
+
+Owns the commands' arguments and wording; the checks are doctor.py's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+
+from .doctor_checks import examine, schemes, serial_ports, udev_rule, usb_devices
+
+
+def _configure_devices(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--no-usb", action="store_true", help="do not look at the USB bus")
+
+
+def _devices(args: argparse.Namespace) -> int:
+    ports = serial_ports() + ([] if args.no_usb else usb_devices())
+    lines = [f"{port.url:<36} {port.state:<14} {port.description}" for port in ports]
+    lines += [f"    remedy: {port.remedy}" for port in ports if port.remedy]
+    lines = lines or ["no serial port and no USB device was found"]
+    lines.append(f"schemes: {', '.join(schemes())}   (without hardware: sim:ideal, simserial:ideal, simusb:ideal)")
+    emit(args, {"devices": [asdict(port) for port in ports], "schemes": schemes()}, "\n".join(lines))
+    return EXIT_FINE
+
+
+def _configure_doctor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--udev", action="store_true", help="print the udev rule that gives access to instruments, and end"
+    )
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    if args.udev:
+        emit(args, {"udev": udev_rule()}, udev_rule().rstrip())
+        return EXIT_FINE
+    findings = examine()
+    lines = []
+    for finding in findings:
+        mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
+        lines.append(f"{mark:<5}{finding.check:<22} {finding.found}")
+        if not finding.ok:
+            lines.append(f"     remedy: {finding.remedy}")
+    broken = [finding.check for finding in findings if finding.needed and not finding.ok]
+    lines.append(f"{'cannot run: ' + ', '.join(broken) if broken else 'ready to run'}")
+    emit(args, {"findings": [asdict(finding) for finding in findings], "ready": not broken}, "\n".join(lines))
+    return EXIT_ALERT if broken else EXIT_FINE
+
+
+DEVICES = Command("list ports and USB devices, and whether they can be opened", _configure_devices, _devices)
+DOCTOR = Command("check this machine: ports, permissions, libraries, clock, scheduler", _configure_doctor, _doctor)

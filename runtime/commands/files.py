@@ -1,0 +1,247 @@
+"""The commands on files: `pans verify`, `pans info`, `pans bundle`.
+
+Owns their arguments and how their answers look; the checks are in verify.py, the facts in file_facts.py, the formats elsewhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import io
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime import __version__
+from pans.runtime.bundle.model import make_bundle, write_bundle
+from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, emit
+from pans.runtime.container import read_file
+from pans.runtime.core.plan import exposure_us
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.report.file_facts import file_facts
+from pans.runtime.report.verify import FileVerdict, verify_file, verify_folder
+
+DEFAULT_LEVELS = 124
+_VALUE_CHARACTERS = 200
+
+
+# ---- verify ----
+
+
+def _configure_verify(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "paths",
+        nargs="+",
+        metavar="PATH",
+        help="a bundle, a recording, a calibration, or a profile (file or shipped name)",
+    )
+
+
+def _verify(args: argparse.Namespace) -> int:
+    groups = [verify_folder(path) if Path(path).is_dir() else [verify_file(path)] for path in args.paths]
+    verdicts = [verdict for group in groups for verdict in group]
+    payload = {
+        "ok": all(verdict.ok for verdict in verdicts),
+        "alerts": [{"path": verdict.path, "message": text} for verdict in verdicts for text in verdict.alerts],
+        "violations": [{"path": verdict.path, "message": text} for verdict in verdicts for text in verdict.violations],
+        "files": [
+            {"path": verdict.path, "kind": verdict.kind, "ok": verdict.ok, "damaged": verdict.damaged}
+            for verdict in verdicts
+        ],
+    }
+    emit(args, payload, "\n".join(line for verdict in verdicts for line in _verdict_lines(verdict)))
+    if any(verdict.damaged for verdict in verdicts):
+        return EXIT_USAGE
+    return EXIT_FINE if payload["ok"] else EXIT_ALERT
+
+
+def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
+    word = "ok" if verdict.ok else "DAMAGED" if verdict.damaged else "VIOLATED" if verdict.violations else "alerts"
+    yield f"{word:<8}  {verdict.kind:<9}  {verdict.path}"
+    yield from (f"          violation: {text}" for text in verdict.violations)
+    yield from (f"          alert: {text}" for text in verdict.alerts)
+
+
+# ---- info ----
+
+
+def _configure_info(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "path", metavar="PATH", help="a bundle, a recording, a calibration, or a profile (file or shipped name)"
+    )
+
+
+def _info(args: argparse.Namespace) -> int:
+    facts = file_facts(args.path)
+    rows = list(_flat(facts))
+    if not args.json and sys.stdout.isatty():
+        _show_table(rows)
+    else:
+        width = max(len(key) for key, _ in rows)
+        emit(args, facts, "\n".join(f"{key:<{width}}  {value}" for key, value in rows))
+    return EXIT_USAGE if facts.get("damage") else EXIT_FINE
+
+
+def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield (dotted key, printable value); a stranger's text must not steer the terminal."""
+    for key, value in facts.items():
+        name = _printable(f"{prefix}{key}")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{name}.")
+        elif isinstance(value, list | tuple):
+            yield name, _printable(", ".join(str(item) for item in value))
+        elif key == "simulated" and value is True:
+            yield name, "SIMULATED"
+        elif value is not None and value != "":
+            yield name, _printable(str(value))
+
+
+def _printable(text: str) -> str:
+    short = text if len(text) <= _VALUE_CHARACTERS else f"{text[:_VALUE_CHARACTERS]}…"
+    return "".join(letter if letter.isprintable() else "�" for letter in short)
+
+
+def _show_table(rows: list[tuple[str, str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for key, value in rows:
+        table.add_row(Text(key), Text(value))  # Text: brackets in a value are not markup
+    Console().print(table)
+
+
+# ---- bundle ----
+
+
+def _configure_bundle(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--patterns", required=True, type=Path, metavar="P.npy", help="floats (d_f, pixels) in photons")
+    parser.add_argument(
+        "--head", type=Path, metavar="H.onnx", help="click means (n, d_f) -> scores (n, classes), float32"
+    )
+    parser.add_argument(
+        "--table", type=Path, metavar="T.npy", help="scores (2**d_f, classes); bit i of a row is pattern i"
+    )
+    parser.add_argument("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--levels", type=int, metavar="N", help=f"intensity levels (default {DEFAULT_LEVELS})")
+    group.add_argument(
+        "--profile", metavar="P", help="take the levels of this profile, and check that it can expose them"
+    )
+    parser.add_argument(
+        "--image-shape", metavar="HxW", help="rows x columns of a pattern (default: square, else one row)"
+    )
+    parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
+    parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.pans", help="the file to write")
+
+
+def _bundle(args: argparse.Namespace) -> int:
+    if args.head is None and args.table is None:
+        raise UsageError("neither --head nor --table was given", remedy="give one of them, or both")
+    profile = load_profile(args.profile) if args.profile else None
+    levels = profile.projector.levels if profile else DEFAULT_LEVELS if args.levels is None else args.levels
+    patterns, provenance = _inputs(args, profile)
+    quantised = quantise_patterns(patterns, levels)
+    bundle = make_bundle(
+        name=args.name or args.out.stem,
+        task=args.task,
+        classes=[name.strip() for name in args.classes.split(",")],
+        image_shape=_image_shape(args.image_shape, patterns.shape[1]),
+        levels=levels,
+        pattern_levels=quantised.pattern_levels,
+        photons_per_level=quantised.photons_per_level,
+        head_onnx=read_file(args.head) if args.head else None,
+        table=_load_array(args.table) if args.table else None,
+        provenance={**provenance, "quantisation": _quantisation_facts(quantised)},
+    )
+    exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}
+    sha256 = write_bundle(bundle, args.out)
+    facts = {**_quantisation_facts(quantised), **exposure, "levels": levels, "patterns": bundle.n_features}
+    emit(args, {"bundle": str(args.out), "sha256": sha256, **facts}, "\n".join(_bundle_lines(args.out, sha256, facts)))
+    return EXIT_FINE
+
+
+def _inputs(args: argparse.Namespace, profile: Profile | None) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return the patterns, and where everything came from; no time of day, so that the same inputs give the same bytes."""
+    patterns = _load_array(args.patterns)
+    if patterns.ndim != 2:
+        raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
+    files = {"patterns": args.patterns, "head": args.head, "table": args.table}
+    sources = {
+        role: {"file": path.name, "sha256": hashlib.sha256(read_file(path)).hexdigest()}
+        for role, path in files.items()
+        if path is not None
+    }
+    made_by = {"made_by": "pans bundle", "pans_version": __version__, "inputs": sources}
+    return patterns, made_by | ({"profile": {"name": profile.name, "sha256": profile.sha256}} if profile else {})
+
+
+def _quantisation_facts(quantised: QuantisedPatterns) -> dict[str, Any]:
+    wanted = quantised.illumination_wanted
+    return {
+        "photons_per_level": quantised.photons_per_level,
+        "quantisation_error_max_photons": quantised.error_max,
+        "illumination": quantised.illumination,
+        "illumination_error_relative": (quantised.illumination - wanted) / wanted,
+        "pixels_lost": quantised.pixels_lost,
+    }
+
+
+def _bundle_lines(out: Path, sha256: str, facts: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{out}  SHA-256 {sha256}"
+    yield (
+        f"  {facts['patterns']} patterns on {facts['levels']} levels of {facts['photons_per_level']:.6g} photons; "
+        f"rounding is off by at most {facts['quantisation_error_max_photons']:.3g} photons per pixel"
+    )
+    yield (
+        f"  illumination {facts['illumination']:.6g} photons ({facts['illumination_error_relative']:+.2%} by rounding); "
+        f"{facts['pixels_lost']} lit pixels became dark"
+    )
+    if "exposure_us" in facts:
+        yield f"  exposure {facts['exposure_us']:.6g} us"
+
+
+def _image_shape(text: str | None, pixels: int) -> tuple[int, int]:
+    if text is None:
+        side = math.isqrt(pixels)
+        return (side, side) if side * side == pixels else (1, pixels)
+    height, _, width = text.lower().partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) * int(width) == pixels):
+        raise UsageError(f"--image-shape {text!r} does not fit {pixels} pixels", remedy="give HxW with H * W = pixels")
+    return int(height), int(width)
+
+
+def _load_array(path: Path) -> NDArray[Any]:
+    """Read one .npy array of floats; its header is held against the file's size before anything is allocated."""
+    data = read_file(path)
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        shape, fortran, dtype = read(stream)
+        if dtype.kind != "f":
+            raise ValueError(f"dtype {dtype}, allowed: floats")
+        wanted = math.prod(shape) * dtype.itemsize
+        if len(data) - stream.tell() != wanted:
+            raise ValueError(f"{len(data) - stream.tell()} bytes of data, its shape {shape} needs {wanted}")
+    except (ValueError, KeyError, EOFError) as error:
+        raise DamagedFileError(
+            f"{path}: not a readable .npy array: {error}", remedy="write it with numpy.save"
+        ) from error
+    return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+
+
+VERIFY = Command("check bundles, recordings, calibrations and profiles", _configure_verify, _verify)
+INFO = Command("show what a file holds", _configure_info, _info)
+BUNDLE = Command("make a bundle from any trained model", _configure_bundle, _bundle)

@@ -1,0 +1,185 @@
+"""`pans run` and `pans demo`: from a bundle and a device URL to decisions, a recording and a summary.
+
+Owns the commands' arguments, the files they leave and their exit codes; the run itself is loop.py's. `demo` is `run` with the
+shipped bundle, the shipped scene and the simulated instrument at real pace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.resources
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from pans.runtime.cli import Command
+from pans.runtime.errors import UsageError
+from pans.runtime.flow.settings import FlowSettings
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.live.continuous import Continuous, add_continuous_options, continuous_of
+from pans.runtime.timing.cpu import check_core
+
+from .carry_out import carry_out
+from .run_dark import add_options as add_dark_options
+from .run_flow import add_options, settings_of
+
+BACKENDS = (
+    "auto",
+    "table",
+    "count-table",
+    "sparse",
+    "onnx",
+    "int8",
+    "int8-onnx",
+    "float64",
+)  # decide.BACKENDS, unloaded
+DEMO_BUNDLE = "fashion10.pans"
+DEMO_PROFILE = "oled-qcmos"
+DEMO_SCENE = "fashion200"
+DEMO_OBJECTS = 200
+DEMO_TRIALS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What one call of the command is to do, resolved."""
+
+    bundle_path: Path
+    device: str
+    profile: Profile
+    out: Path
+    shots: int
+    trials: int
+    decisions: int
+    seconds: float
+    deadline_us: float
+    order: str
+    dark_slots: int
+    backend: str
+    realtime: bool
+    core: int | None
+    record: Path | None
+    reconnect_s: float
+    trace: Path | None
+    command: str
+    flow: FlowSettings | None
+    act: str
+    act_profile: Profile
+    continuous: Continuous
+
+
+def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
+    parser.add_argument("--shots", type=int, default=1, metavar="K", help="shots per decision (default 1)")
+    parser.add_argument(
+        "--trials", type=int, default=trials, metavar="N", help=f"decisions per object (default {trials})"
+    )
+    parser.add_argument("--seconds", type=float, default=0.0, help="stop after this time")
+    parser.add_argument("--deadline-us", type=float, default=0.0, help="decision deadline (default: the profile's)")
+    parser.add_argument(
+        "--order", default="auto", choices=("auto", "pattern-major", "shot-major"), help="pattern order"
+    )
+    parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
+    parser.add_argument("--backend", default="auto", choices=BACKENDS, help="decision back end")
+    parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
+    parser.add_argument(
+        "--core", type=int, metavar="N", help="bind the loop to processor core N and keep that awake; takes all of it"
+    )
+    parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
+    parser.add_argument(
+        "--reconnect-s", type=float, default=10.0, help="how long to look for a lost device (default 10, 0: not at all)"
+    )
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE", help="write all bytes of both directions as hex, with times"
+    )
+
+
+def _configure_run(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", type=Path, help="a trained bundle (.pans)")
+    parser.add_argument(
+        "--device", required=True, help="device URL, for example serial:/dev/ttyACM0 or sim:ideal?pace=fast"
+    )
+    parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
+    parser.add_argument("--record", type=Path, help="recording to write (default: run.pansrec in --out)")
+    parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
+    _configure_common(parser, trials=1)
+    add_options(parser)
+    add_dark_options(parser)
+    add_continuous_options(parser)
+
+
+def _configure_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated detector (default 1)")
+    parser.add_argument(
+        "--pace", default="real", choices=("real", "fast"), help="real time in a process of its own, or virtual"
+    )
+    parser.add_argument("--profile", default=DEMO_PROFILE, help=f"hardware profile (default {DEMO_PROFILE})")
+    _configure_common(parser, trials=DEMO_TRIALS)
+
+
+def _run(args: argparse.Namespace) -> int:
+    profile = args.profile or profile_of(args.device)
+    out = args.out or (args.record.parent if args.record else Path("pans-run"))
+    return carry_out(args, _job(args, args.bundle, args.device, profile, out, args.decisions, args.record))
+
+
+def _demo(args: argparse.Namespace) -> int:
+    device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
+    bundle = Path(str(importlib.resources.files("pans.runtime") / "shipped" / DEMO_BUNDLE))
+    decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials
+    return carry_out(args, _job(args, bundle, device, args.profile, args.out or Path("pans-demo"), decisions, None))
+
+
+def _job(
+    args: argparse.Namespace, bundle: Path, device: str, profile: str, out: Path, decisions: int, record: Path | None
+) -> Job:
+    for name in ("shots", "trials"):
+        if getattr(args, name) < 1:
+            raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
+    if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
+        raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
+    check_core(args.core)
+    loaded, flow = load_profile(profile), settings_of(args)
+    if flow is not None and (decisions or args.trials != 1):
+        raise UsageError(
+            "a flow has as many decisions as objects pass", remedy="--seconds, in place of --decisions and --trials"
+        )
+    return Job(
+        bundle_path=bundle,
+        device=device,
+        profile=loaded,
+        out=out,
+        shots=args.shots,
+        trials=args.trials,
+        decisions=decisions,
+        seconds=args.seconds,
+        deadline_us=args.deadline_us or loaded.timing.decision_deadline_us,
+        order=args.order,
+        dark_slots=args.dark_slots,
+        backend=args.backend,
+        realtime=not args.no_realtime,
+        core=args.core,
+        record=record,
+        reconnect_s=args.reconnect_s,
+        trace=args.trace,
+        command=shlex.join(["pans", *sys.argv[1:]]),
+        flow=flow,
+        act=getattr(args, "act", "device"),
+        act_profile=load_profile(args.act_profile) if getattr(args, "act_profile", None) else loaded,
+        continuous=continuous_of(args),
+    )
+
+
+def profile_of(device: str) -> str:
+    """A `sim:PROFILE?...` URL names its profile; a real instrument's must be given."""
+    if device.startswith("sim:"):
+        return device[4:].partition("?")[0]
+    raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
+
+
+RUN = Command("decide on a device's clicks with a trained bundle, live", _configure_run, _run)
+DEMO = Command(
+    "the main job with nothing but the package: a simulated instrument, real images, timed decisions",
+    _configure_demo,
+    _demo,
+)

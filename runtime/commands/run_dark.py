@@ -1,0 +1,181 @@
+"""What a run does about calibration and dark counts: its options, the guard that they ask for, what the recording and the
+summary say.
+
+Owns the joining alone: the file is calibration.py's, the watch dark_watch.py's, consequences dark_guard.py's. A replay makes
+the same guard from the recording's header.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.calibration import (
+    MAX_AGE_H,
+    Calibration,
+    find_objections,
+    find_warnings,
+    load_calibration,
+    now_utc,
+)
+from pans.runtime.instrument.click_law import click_law, click_probability
+from pans.runtime.instrument.light_level import LightWatch
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.record.format import DecisionFlag
+
+if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.core.dark_guard import DarkGuard
+    from pans.runtime.core.follower import Output
+    from pans.runtime.core.plan import Plan
+    from pans.runtime.live.run import LiveRun
+
+FALSE_ALARM_H = (
+    240.0  # hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
+)
+LEAST_ARL = 1e4  # dark exposures
+FEW_CLICKS = 10
+NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
+F64 = NDArray[np.float64]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to `pans run`."""
+    group = parser.add_argument_group("an honest instrument (docs/CALIBRATION.md, docs/DARK.md)")
+    group.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="what `pans calibrate` measured on this instrument"
+    )
+    group.add_argument(
+        "--calibration-max-age-h",
+        type=float,
+        default=MAX_AGE_H,
+        metavar="H",
+        help=f"older is stale (default {MAX_AGE_H:g})",
+    )
+    group.add_argument(
+        "--on-dark",
+        default="warn",
+        choices=("warn", "tables", "mask", "abstain"),
+        help="when the dark counts have changed: tell (default), decide with tables for them, leave channels out, or abstain",
+    )
+
+
+class DarkRun:
+    """Calibration and policy of one run."""
+
+    def __init__(self, profile: Profile, calibration: Calibration | None, policy: str, warnings: list[str]) -> None:
+        self.calibration, self.policy, self.warnings = calibration, policy, warnings
+        self.profile = profile if calibration is None else calibration.applied_to(profile)
+        self._header: dict[str, Any] = {}
+        self.light = LightWatch()
+
+    @staticmethod
+    def of(args: argparse.Namespace, profile: Profile) -> DarkRun:
+        """Read what the command line asks for; ConfigError for a calibration of another profile."""
+        path = getattr(args, "calibration", None)
+        calibration = None if path is None else load_calibration(path)
+        max_age_h = getattr(args, "calibration_max_age_h", MAX_AGE_H)
+        if not max_age_h > 0:
+            raise UsageError(f"--calibration-max-age-h must be above 0, found {max_age_h:g}")
+        if calibration is not None:
+            find_objections(calibration, profile, None)
+        asked = hasattr(args, "calibration")  # `pans demo` has no instrument to calibrate
+        warnings = find_warnings(calibration, now_utc(), max_age_h) if asked else []
+        return DarkRun(profile, calibration, getattr(args, "on_dark", "warn"), warnings)
+
+    def guard(self, plan: Plan, bundle: Bundle, shots: int, flow: bool = False) -> DarkGuard | None:
+        """Return the guard of a core; None where the plan has nothing dark in it and nothing was asked for.
+
+        A `flow` without dark slots is watched in the frames in which no object was found.
+        """
+        if not plan.dark_slots_per_cycle and not flow:
+            if self.policy == "warn":
+                return None
+            raise UsageError(
+                f"--on-dark {self.policy}: the plan has no dark slots", remedy="use --dark-slots 1 or more"
+            )
+        channels = plan.n_patterns if plan.mode == "parallel" else 1
+        if self.calibration is None:
+            rate = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
+            expected = low = high = np.full(channels, rate)
+        else:
+            expected, low, high = self.calibration.dark_probability(self.profile, plan.exposure_us, channels)
+            said = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
+            few = self.calibration.dark_clicks(channels) < FEW_CLICKS
+            expected = np.where(
+                few, np.clip(said, low, high), expected
+            )  # hardly measured: the profile's, as far as possible
+        per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
+        self._header = {
+            "policy": self.policy,
+            "arl_dark_exposures": max(LEAST_ARL, FALSE_ALARM_H * per_hour),
+            "expected": expected.tolist(),
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "afterpulses": self.profile.detector.afterpulse_probability > 0,
+            "lit": {
+                "arl_exposures": max(LEAST_ARL, 2 * FALSE_ALARM_H * plan.slots_per_cycle * 3.6e9 / plan.cycle_us),
+                "arl_objects": max(LEAST_ARL, 2 * FALSE_ALARM_H * 3600 * plan.objects_hz),
+            },
+        }
+        return made_guard(self._header, plan, bundle, shots)
+
+    def header(self) -> dict[str, Any]:
+        """What the recording says, and a replay needs."""
+        calibration = None
+        if self.calibration is not None:
+            calibration = {"sha256": self.calibration.sha256, "values": dict(self.calibration.values)}
+        return {"guard": self._header, "calibration": calibration, "warnings": self.warnings}
+
+    def check_device(self, run: LiveRun) -> None:
+        """Before arming: is this the device that was calibrated? ConfigError if not."""
+        welcome = run.connection.session.welcome
+        serial = None if welcome is None else welcome.facts.get("serial")
+        if self.calibration is not None:
+            find_objections(self.calibration, self.profile, None if serial is None else str(serial))
+        for warning in self.warnings:
+            run.journal.event({"kind": "calibration_warning", "words": warning})
+
+    def look(self, run: LiveRun, output: Output) -> None:
+        """After a block: compare the clicks of its decisions with those of the run's beginning."""
+        for decision in output.decisions:
+            if not decision.flags & NOT_MEASURED:
+                words = self.light.take(decision.clicks)
+                if words:
+                    run.journal.event({"kind": "light_changed", **self.light.found[-1]})
+
+    def add_to(self, summary: dict[str, Any]) -> None:
+        """Add calibration, its warnings and the light to a run's summary; data that contradict the calibration are a fault."""
+        one = self.calibration
+        summary["calibration"] = (
+            None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
+        )
+        summary["calibration_warnings"] = self.warnings
+        summary["light"] = self.light.report()
+        contradicted = [] if one is None else [str(found["words"]) for found in self.light.found]
+        if contradicted:
+            summary["faults"] = [*summary["faults"], *contradicted]
+            summary["verdict"] = "FAIL"
+
+
+def made_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:
+    """Return the guard that a header speaks of, None if of none; KeyError, TypeError or ValueError if it is damaged."""
+    from pans.runtime.core.dark_guard import DarkGuard
+    from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
+    from pans.runtime.instrument.dead_channels import LitWatch
+
+    if not header:
+        return None
+    expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
+    settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
+    watch = ChannelWatch(len(expected), expected, settings, low, high)
+    lit = None
+    if "lit" in header:  # recordings made before have none
+        lit = LitWatch(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)

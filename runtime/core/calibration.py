@@ -1,0 +1,234 @@
+"""What a calibration shows and counts: random binary patterns on a clear field, dark slots, and the core that adds up their clicks.
+
+Owns the design (exposure, lit pixels, plan) and the sums; the session is loop.py's, the estimate calibrate.py's. Two stages: a
+short ladder of drives from far too dim to far too bright, then drives around 1.6 expected photoelectrons, where clicks tell
+most of the level per exposure (the information `n lambda^2 / (exp(lambda) - 1)` is greatest at 1.59)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.facts import Bundle
+from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.estimate import CountModel, Counts
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock
+
+from .follower import Follower, Output
+from .plan import Plan, build_plan
+from .window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES, WRONG_PATTERNS
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+LADDER = (0.05, 0.2, 0.8, 3.0, 12.0)  # expected photoelectrons of the first stage, if the profile is right
+TELLING = (1.0, 1.6, 2.2)  # of the second, around the most informative
+SEQUENTIAL_PATTERNS = 60
+PARALLEL_FRAMES = 900
+DARK_SHARE = 0.1
+LEAST_SEQUENTIAL_US, LEAST_PARALLEL_US = 40.0, 50.0  # shorter exposures would only load the link
+DEAD_TIME_MATTERS = 1e-3  # of the exposure
+_SIDES = (32, 64, 128, 256, 512)
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """Patterns as a bundle that the ordinary session uploads, the plan, and the drive of each pattern (levels, summed over pixels)."""
+
+    bundle: Bundle
+    plan: Plan
+    drives: F64
+    n_cycles: int
+
+
+def count_model(profile: Profile, exposure_us: float) -> CountModel:
+    """What the profile says of the detector beyond light and dark counts, for this exposure."""
+    detector = profile.detector
+    dead = detector.dead_time_ns * 1e-3 / exposure_us
+    law = ClickLaw(0.0, detector.read_noise_e, detector.threshold_e)
+    return CountModel(law, dead if dead > DEAD_TIME_MATTERS else 0.0)
+
+
+def calibration_exposure_us(profile: Profile) -> float:
+    """The shortest exposure that the profile allows and the link carries: most clicks, and so most knowledge, per second."""
+    least = LEAST_PARALLEL_US if profile.mode == "parallel" else LEAST_SEQUENTIAL_US
+    return min(max(profile.exposure.min_us, least), profile.exposure.max_us)
+
+
+def profile_level(profile: Profile, exposure_us: float) -> float:
+    """Photoelectrons of one level of one pixel in one exposure, as the profile says."""
+    return profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6 / (profile.projector.levels - 1)
+
+
+def design_run(profile: Profile, targets: Sequence[float], level: float, seconds: float, seed: int) -> Design:
+    """Lay out patterns whose expected photoelectrons are `targets` in turn if one level of one pixel gives `level`.
+
+    PlanError when even one pixel at the lowest level is far too bright. `seed` chooses the lit pixels.
+    """
+    exposure_us = calibration_exposure_us(profile)
+    parallel = profile.mode == "parallel"
+    n = profile.detector.channels if parallel else min(SEQUENTIAL_PATTERNS, profile.projector.pattern_memory)
+    levels = _random_patterns(profile, np.resize(np.asarray(targets), n) / level, np.random.default_rng(seed))
+    side = round(levels.shape[1] ** 0.5)
+    bundle = Bundle(
+        name="calibration", task="calibration", classes=("light",), encoder="active", image_shape=(side, side),
+        levels=profile.projector.levels, pattern_levels=levels, photons_per_level=profile_level(profile, exposure_us),
+        head_onnx=None, table=None, golden_means=np.zeros((0, n), np.float32), golden_scores=np.zeros((0, 1), np.float32),
+        provenance={},
+    )  # fmt: skip
+    plan = _plan(profile, bundle, n, exposure_us)
+    n_cycles = max(1, int(seconds * 1e6 / plan.cycle_us))
+    return Design(bundle, plan, levels.sum(axis=1).astype(np.float64), n_cycles)
+
+
+def _plan(profile: Profile, bundle: Bundle, n: int, exposure_us: float) -> Plan:
+    if profile.mode == "parallel":
+        dark = max(1, round(DARK_SHARE * PARALLEL_FRAMES))
+        return build_plan(profile, bundle, shots_per_object=PARALLEL_FRAMES, dark_slots_per_cycle=dark)
+    spacing = exposure_us + profile.exposure.readout_us
+    shots = max(1, int(1e6 / profile.projector.pattern_rate_max_hz / spacing))  # as many as fit into one display
+    dark = max(1, round(DARK_SHARE * n))
+    order = "pattern-major" if shots > 1 else "shot-major"
+    return build_plan(profile, bundle, shots_per_object=shots, dark_slots_per_cycle=dark, order=order)
+
+
+def _random_patterns(profile: Profile, drives: F64, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Return uint16 (n, pixels): random pixels, as many as the drive asks for, at the lowest level that needs at most half of
+    the panel."""
+    panel = min(profile.projector.width_px, profile.projector.height_px)
+    sides = [side for side in _SIDES if side <= panel] or [panel]
+    top = profile.projector.levels - 1
+    side = next((side for side in sides if drives.max() <= top * (side * side // 2)), sides[-1])
+    pixels = side * side
+    lit_level = min(top, max(1, int(np.ceil(drives.max() / (pixels // 2)))))
+    lit = np.clip(np.rint(drives / lit_level), 1, pixels).astype(np.int64)
+    if drives.max() < 0.2:
+        raise PlanError(
+            f"{profile.name}: one pixel at the lowest level gives {1.6 / drives.max():.3g} photoelectrons per exposure, far too many",
+            remedy="put a filter before the detector",
+        )
+    levels = np.zeros((len(drives), pixels), np.uint16)
+    for row, count in zip(levels, lit):
+        row[rng.permutation(pixels)[:count]] = lit_level
+    return levels
+
+
+class CalibrationCore(Follower):
+    """Adds up clicks by channel, pattern and whether the exposure before clicked; decides nothing."""
+
+    def __init__(self, plan: Plan, n_cycles: int) -> None:
+        super().__init__(plan, n_cycles)
+        self.parallel = plan.mode == "parallel"
+        self.channels = plan.n_patterns if self.parallel else 1
+        self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
+        # channel, pattern (the last is dark; in parallel mode 0 is lit), was there a click before, exposures and clicks
+        self.sums: I64 = np.zeros((self.channels, (1 if self.parallel else plan.n_patterns) + 1, 2, 2), np.int64)
+        self._slot_pattern = plan.slot_pattern
+        self._before: NDArray[np.uint8] | None = None  # clicks of the exposure before, (channels,), where it is known
+        self._next = 0
+
+    def warm_up(self) -> None:
+        """Nothing here is compiled."""
+
+    def cycles_left(self, n_cycles: int) -> int:
+        """Return the cycles that were not seen whole."""
+        return n_cycles - self.tracker.next_exposure // self._slots_per_cycle
+
+    def _fits(self, block: ClickBlock | FrameBlock) -> bool:
+        if isinstance(block, FrameBlock):
+            return self.parallel and 8 * block.words.shape[1] >= self.channels
+        return not self.parallel
+
+    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        self.take_block(block)
+        return Output([], [], None)
+
+    def take_block(self, block: ClickBlock | FrameBlock) -> None:
+        """Count a block that follows the one before without a gap."""
+        n_exposures = len(block.words) if isinstance(block, FrameBlock) else len(block.patterns)
+        slots = (block.exposure_index + np.arange(n_exposures)) % self._slots_per_cycle
+        planned = self._slot_pattern[slots]
+        if isinstance(block, FrameBlock):
+            bits = np.unpackbits(block.words, axis=1, bitorder="little", count=self.channels)
+            right = np.ones(n_exposures, np.bool_)
+        else:
+            bits, right = np.asarray(block.bits)[:, None], np.asarray(block.patterns) == planned
+        known = right.copy()
+        known[0] &= self._before is not None
+        first = np.zeros((1, self.channels), np.uint8) if self._before is None else self._before[None, :]
+        before = np.concatenate([first, bits[:-1]])
+        dark = planned == DARK_PATTERN
+        column = np.where(dark, self.sums.shape[1] - 1, 0 if self.parallel else planned)
+        for channel in range(self.channels):
+            where = (column[known], before[known, channel])
+            np.add.at(self.sums[channel, :, :, 0], where, 1)
+            np.add.at(self.sums[channel, :, :, 1], where, bits[known, channel])
+        self._before, self._next = bits[-1].copy(), block.exposure_index + n_exposures
+        self.tallies[DARK_EXPOSURES] += int((dark & right).sum()) * self.channels
+        self.tallies[DARK_CLICKS] += int(bits[dark & right].sum())
+        self.tallies[WRONG_PATTERNS] += int((~right).sum())
+
+    def _skip_to(self, exposure_index: int, tick: int) -> Output:
+        if exposure_index != self._next:
+            self._before = None  # what the exposure before did is not known behind a gap
+        self._next = exposure_index
+        return Output([], [], None)
+
+    def _give_up(self) -> Output:
+        self._before, self._next = None, 0
+        return Output([], [], None)
+
+    def _nothing_left(self) -> bool:
+        return self.tracker.next_exposure >= self.end_exposure
+
+
+def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[Counts]:
+    """Return each channel's counts, with what the exposure before and the neighbours add to a click's probability."""
+    detector = profile.detector
+    after = np.log1p(-detector.afterpulse_probability)
+    pooled = core.sums.sum(axis=2)  # channel, pattern, (exposures, clicks)
+    rate = pooled[..., 1] / np.maximum(pooled[..., 0], 1)
+    result = []
+    for channel in range(core.channels):
+        across = np.zeros(core.sums.shape[1])
+        if core.parallel:
+            for neighbour in (channel - 1, channel + 1):
+                if 0 <= neighbour < core.channels:
+                    across += np.log1p(-detector.crosstalk_probability * rate[neighbour])
+        n_lit = core.sums.shape[1] - 1
+        drive = np.append(design.drives[[channel]] if core.parallel else design.drives, 0.0)
+        pattern = np.append(np.arange(n_lit) + (channel if core.parallel else 0), -1)
+        primed = np.tile([0.0, after], (n_lit + 1, 1))
+        result.append(
+            Counts(
+                np.repeat(drive, 2),
+                core.sums[channel, :, :, 1].ravel(),
+                core.sums[channel, :, :, 0].ravel(),
+                (primed + across[:, None]).ravel(),
+                np.repeat(pattern, 2),
+            )
+        )
+    if not any(int(counts.exposures.sum()) for counts in result):
+        raise UsageError("the device sent no exposures that could be counted")
+    return result
+
+
+def joined_counts(parts: Sequence[Counts]) -> Counts:
+    """All channels' counts as one data set."""
+    return Counts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Counts._fields))
+
+
+def plan_facts(design: Design) -> dict[str, Any]:
+    """What a calibration file says about how it was measured."""
+    return {
+        "patterns": len(design.drives),
+        "lit_pixels_mean": float((design.bundle.pattern_levels > 0).sum(axis=1).mean()),
+        "exposure_us": design.plan.exposure_us,
+        "cycles": design.n_cycles,
+        "instrument_seconds": design.n_cycles * design.plan.cycle_us * 1e-6,
+    }

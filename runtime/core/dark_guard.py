@@ -1,0 +1,269 @@
+"""From dark exposures to consequences: the watch, what it means, and what the policy does about it, for one core.
+
+Owns the policies; never counts (dark_watch.py), names (channels.py) or computes tables (dark_tables.py). Deterministic: the
+same blocks give the same events and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
+`decider` for every decision, and passes its events on.
+
+Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates, without dead channels; `mask`
+leaves channels out that are hot, quiet or dead; both abstain where all are left out, or more than can be done (dark_tables.py);
+`abstain` gives no label while a warning or an alarm lasts. Decisions made meanwhile carry DARK_ALARM, but for `warn`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.decide.backends import Decider
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Finding
+from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch
+from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport, wilson_interval
+from pans.runtime.instrument.dead_channels import LitWatch, Silence
+from pans.runtime.record.format import DecisionFlag
+from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
+
+from .dark_tables import Adapter, extra_probability, make_adapter
+from .plan import Plan
+
+POLICIES = ("warn", "tables", "mask", "abstain")
+MAX_FINDINGS = 1000  # kept for the summary; the recording has them all
+F64 = NDArray[np.float64]
+
+
+class DarkGuard:
+    """Watches the dark exposures of one run and does what `policy` says."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        watch: ChannelWatch,
+        policy: str = "warn",
+        bundle: Bundle | None = None,
+        shots: int = 1,
+        afterpulses: bool = False,
+        lit: LitWatch | None = None,
+    ) -> None:
+        if policy not in POLICIES:
+            raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
+        self._parallel = plan.mode == "parallel"
+        self._adapter: Adapter | None = None
+        if policy in ("tables", "mask"):
+            if bundle is None:
+                raise UsageError(f"--on-dark {policy} needs a bundle")
+            self._adapter = make_adapter(bundle, shots)
+        self._n_features = plan.n_patterns
+        self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
+        self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
+        self._any_click = np.zeros(1, np.int64)
+        self._news: list[dict[str, Any]] = []
+        self.findings: list[Finding] = []
+        self.dropped_findings = 0
+        self._dark_slot = plan.slot_pattern == DARK_PATTERN
+        self._afterpulses = afterpulses  # whether the detector has them: then exposures behind a click are left out
+        self._any_dark = bool(self._dark_slot.any())
+        self._silent_before: bool | None = None  # of the exposure before the next block; None where it is not known
+        self._next = 0
+        self._made: Decider | None = None
+        self._made_for: tuple[Any, ...] = ()
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels, before arming."""
+        self.watch.warm_up()
+        if self.lit is not None:
+            self.lit.warm_up()
+
+    def restart(self) -> None:
+        """Follow another stream: its exposures count from 0 again, the rates go on."""
+        if self.lit is not None:
+            self.lit.end_object()
+        self._next, self._silent_before = 0, None
+
+    def take(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
+        """Take a block: its dark exposures, and what its lit ones say about dead channels; return events.
+
+        With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
+        """
+        if self.lit is not None:
+            words = block.words if isinstance(block, FrameBlock) else np.asarray(block.bits).reshape(-1, 1)
+            self.lit.take_exposures(words)
+            self._look_for_dead()
+        events = self._take_dark(block)
+        return self.news() + events
+
+    def take_object(self, counts: NDArray[np.int64], number: int) -> None:
+        """Take the clicks of a whole window, int64 (d_f,), of object `number` (NO_OBJECT: one of its own).
+
+        What it says holds from this decision on; `news` has the events.
+        """
+        if self.lit is None:
+            return
+        if not self._parallel:
+            self._any_click[0] = counts.sum()
+            counts = self._any_click
+        self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
+        self._look_for_dead()
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return the events of what was found with objects, once."""
+        news, self._news = self._news, []
+        return news
+
+    def _look_for_dead(self) -> None:
+        assert self.lit is not None
+        if not self.lit.has_news:
+            return
+        found = [one for channel in self.lit.returned() for one in self.health.note_returned(channel)]
+        dead = self.lit.look()
+        if len(dead) > 1 and len(dead) == self.lit.n_channels:
+            words = _silence_words("no channel", self._parallel, dead[0])
+            found += self.health.note_dead(tuple(range(len(dead))), words)
+        else:
+            for one in dead:
+                who = f"channel {one.channel} never" if self._parallel else "the detector never"
+                found += self.health.note_dead((one.channel,), _silence_words(who, self._parallel, one))
+        self._news += self._keep(found)
+
+    def _take_dark(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
+        if isinstance(block, FrameBlock):
+            if not self._any_dark:
+                return []
+            slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
+            return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
+        bits, dark = np.asarray(block.bits), np.asarray(block.patterns) == DARK_PATTERN
+        if not self._afterpulses:
+            return self.take_dark_words(bits[dark].reshape(-1, 1))
+        known = self._silent_before if block.exposure_index == self._next else False
+        silent = np.concatenate([[bool(known)], bits[:-1] == 0])
+        self._next, self._silent_before = block.exposure_index + len(bits), bool(bits[-1] == 0)
+        return self.take_dark_words(bits[dark & silent].reshape(-1, 1))
+
+    def take_dark_words(self, words: NDArray[np.uint8]) -> list[dict[str, Any]]:
+        """Take dark exposures, words uint8 (n, bytes), in the order of time; return events."""
+        return self._found(self.watch.update_words(words)) if len(words) else []
+
+    def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return events."""
+        if not frames:
+            return []
+        if self.lit is not None:
+            self.lit.take_counts(frames, clicks)
+            self._look_for_dead()
+        return self.news() + self._found(self.watch.update(frames, clicks))
+
+    def _found(self, alarms: list[Alarm]) -> list[dict[str, Any]]:
+        return self._keep(self.health.take(alarms))
+
+    def _keep(self, found: list[Finding]) -> list[dict[str, Any]]:
+        kept = found[: max(0, MAX_FINDINGS - len(self.findings))]
+        self.findings += kept
+        self.dropped_findings += len(found) - len(kept)
+        return [finding.event() for finding in found]
+
+    @property
+    def serious(self) -> list[Finding]:
+        """The states of level warning or alarm that last."""
+        return [
+            finding for finding in self.health.present if LEVELS.index(finding.level) >= 1 or finding.kind == "dead"
+        ]
+
+    @property
+    def flags(self) -> DecisionFlag:
+        """What a decision made now carries."""
+        serious = self.serious if self.policy != "warn" else []
+        if not serious:
+            return DecisionFlag(0)
+        if self.policy == "abstain":
+            return DecisionFlag.DARK_ALARM | DecisionFlag.ABSTAINED
+        assert self._adapter is not None
+        extra, masked = self._concerned(serious)
+        abstains = masked.all() or not self._adapter.can_do(masked | (extra > 0))
+        return DecisionFlag.DARK_ALARM | (DecisionFlag.ABSTAINED if abstains else DecisionFlag(0))
+
+    def decider(self, ordinary: Decider) -> Decider:
+        """The back end for a decision made now, unless `flags` say that there is none."""
+        serious = self.serious if self._adapter is not None else []
+        if not serious:
+            return ordinary
+        assert self._adapter is not None
+        extra, masked = self._concerned(serious)
+        looks = 0
+        if self.policy == "tables":
+            looks = max(1, self.watch.exposures - min(finding.since for finding in serious)).bit_length()
+        key = (looks, masked.tobytes(), *(finding.channels for finding in serious))
+        if self._made is None or key != self._made_for:
+            self._made, self._made_for = self._adapter.made(ordinary, extra, masked), key
+        return self._made
+
+    def count_word(self, counts: NDArray[np.int64]) -> None:
+        """Remember the clicks of a decision made while nothing was wrong, int64 (d_f,): how often they come is what other tables
+        are made with.
+        """
+        if self._adapter is not None and not self.health.present:
+            self._adapter.count(counts)
+
+    def _concerned(self, serious: list[Finding]) -> tuple[F64, NDArray[np.bool_]]:
+        """How much more often a silent exposure of each channel clicks, float64 (d_f,), and which channels are left out, bool (d_f,)."""
+        masked = np.zeros(self._n_features, np.bool_)
+        for finding in serious:
+            if self.policy == "mask" or finding.kind == "dead":
+                masked[list(finding.channels) if self._parallel else slice(None)] = True
+        if self.policy == "mask":
+            return np.zeros(self._n_features), masked
+        extra = np.resize(extra_probability(self.health.rates(), self.watch.expected), self._n_features)
+        return np.where(masked, 0.0, extra), masked
+
+    def report(self, report: DarkReport) -> DarkReport:
+        """Return `report` with the findings, what lasts, and every channel's rate with its interval.
+
+        Its alarm is judged anew: from the exposures that were watched (behind no click, where the detector afterpulses), and against the
+        end of the interval where the expected rate is an estimate.
+        """
+        watch = self.watch
+        monitor = DarkMonitor(float(watch.high.mean()) if watch.high.max() > FLOOR_RATE else 0.0)
+        judged = monitor.report(watch.exposures * watch.n_channels, int(watch.clicks.sum()))
+        n = self.watch.exposures
+        rows = []
+        for clicks, expected in zip(self.watch.clicks.tolist(), self.watch.expected.tolist()):
+            low, high = wilson_interval(clicks, n)
+            rate = clicks / n if n else 0.0
+            rows.append(
+                {"exposures": n, "clicks": clicks, "per_exposure": rate, "low": low, "high": high, "expected": expected}
+            )
+        return replace(
+            report,
+            alarm=judged.alarm,
+            policy=self.policy,
+            findings=tuple(finding.event() for finding in self.findings),
+            present=tuple(f"{finding.level}: {finding.words}" for finding in self.health.present),
+            channels=tuple(rows),
+        )
+
+    def words(self) -> str:
+        """One line on the present state, for the live view; "" when nothing is wrong."""
+        return "; ".join(
+            f"{finding.kind} ({finding.level}, {finding.rate / finding.expected:.3g} times the expected rate"
+            + (
+                f", channel {', '.join(map(str, finding.channels))})"
+                if len(finding.channels) < self.watch.n_channels
+                else ")"
+            )
+            for finding in self.health.present
+        )
+
+
+def _silence_words(who: str, has_others: bool, silence: Silence) -> str:
+    if silence.proved:
+        return (
+            f"{who} clicked in {silence.length} exposures, lit and dark, though dark counts alone would make it "
+            f"({silence.rate:.2g} per exposure at least): dead or disconnected, whatever the scene"
+        )
+    others = "; the other channels click as before" if has_others else ""
+    cause = (
+        "a dead or disconnected channel" if has_others else "dead or disconnected, or no light at all (lamp, shutter)"
+    )
+    return f"{who} clicked with {silence.length} objects in a row, of which {silence.rate:.3g} made it click before{others}: {cause}"

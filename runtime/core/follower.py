@@ -1,0 +1,284 @@
+"""What every core does with a stream: order, gaps, marks, the end; what a decision row is.
+
+Owns one stream from ARM to its end and what is remembered of it; never decides: `core.Core` does so for objects that stand still and
+`flow.FlowCore` for those that pass by. `step` returns an `Output` for one frame, `begin` and `end` for what a stream leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.messages import (
+    ClickBlock,
+    DeviceState,
+    Frame,
+    FrameBlock,
+    MalformedMessage,
+    Mark,
+    MessageType,
+    StateReason,
+    Status,
+    decode_status,
+)
+from pans.runtime.wire.tracker import Gap, StreamTracker
+
+from .plan import Plan
+
+MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
+PART_MARKS = 16  # of them that a part of a recording begins with
+
+
+class Decision(NamedTuple):
+    """One row of the decision log, in the order of record.DECISION_DTYPE; `probability` is the winning class's softmax."""
+
+    number: int
+    tick: int
+    exposure_index: int
+    object: int
+    shot: int
+    clicks: int
+    label: int
+    truth: int
+    flags: int
+    probability: float
+    counts_crc: int
+
+
+class Action(NamedTuple):
+    """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
+
+    number: int
+    tick: int
+    duration_ticks: int
+    channel: int
+
+
+class Passage(NamedTuple):
+    """An object that has passed by, one per decision: exposures `first`..`last` with its light, the end of the last in device ticks.
+
+    `centre` is the exposure at which it was centred, `clicks` are those of the whole passage.
+    """
+
+    first: int
+    last: int
+    centre: int
+    leave_tick: int
+    clicks: int
+
+
+class Output(NamedTuple):
+    """What one step produced; `block_end_tick` is the end of the last exposure seen, None if the frame held no exposures.
+
+    In flow `passages` says, for every decision in its place, what it was made from; `actions` is what is to be done.
+    """
+
+    decisions: list[Decision]
+    events: list[dict[str, Any]]
+    block_end_tick: int | None
+    passages: tuple[Passage, ...] = ()
+    actions: tuple[Action, ...] = ()
+
+
+class Follower:
+    """Follows the streams of one run of `n_cycles` cycles (0: until stopped); subclasses decide on blocks, gaps and open ends.
+
+    A run that lost its device and found it again goes on in another stream: `begin` ends the old one and starts the next.
+    """
+
+    def __init__(self, plan: Plan, n_cycles: int) -> None:
+        self.start_tick = 0
+        self.completed = False
+        self.tracker = StreamTracker()
+        self.marks: dict[int, Mark] = {}
+        self.n_decisions = 0
+        self.n_abstained = 0
+        self.last_tick = 0
+        self.jitter_ticks = 0  # most that a block's end differed from the plan
+        self._plan = plan
+        self._exposure_ticks = plan.exposure_ticks
+        self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
+        self.end_exposure = self._exposures_of(n_cycles)
+        self._begun = False
+        self._status: Status | None = None  # the latest of this stream
+        self._told_end: int | None = None  # tick of the first STATUS that told of the end
+
+    # -- what subclasses do --------------------------------------------------------------------------------------------
+
+    def warm_up(self) -> None:
+        """Run every compiled kernel of the hot path once, before arming."""
+        raise NotImplementedError
+
+    def cycles_left(self, n_cycles: int) -> int:
+        """Return how many of a whole run's `n_cycles` cycles stand out when what is under way is given up."""
+        raise NotImplementedError
+
+    def _fits(self, block: ClickBlock | FrameBlock) -> bool:
+        raise NotImplementedError
+
+    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        """Decide on a block that fits and is the next one."""
+        raise NotImplementedError
+
+    def _skip_to(self, exposure_index: int, tick: int) -> Output:
+        """Settle what lies before `exposure_index`, which comes next."""
+        raise NotImplementedError
+
+    def _give_up(self) -> Output:
+        """Settle what is open, and be ready for another stream."""
+        raise NotImplementedError
+
+    def _nothing_left(self) -> bool:
+        """Whether another stream would have nothing to show."""
+        raise NotImplementedError
+
+    def _place(self) -> dict[str, Any] | None:
+        """What this core must be given to go on from here; None while something is open that the clicks so far are part of."""
+        return None
+
+    def _go_on_from(self, place: dict[str, Any]) -> None:
+        raise NotImplementedError
+
+    # -- parts of a recording ------------------------------------------------------------------------------------------
+
+    def part(self) -> dict[str, Any] | None:
+        """Begin a part of the recording here and return its place in the stream, JSON-able; None while that cannot be.
+
+        What the place does not hold is forgotten here too, so that `resume` in a replay goes on exactly as this core does.
+        """
+        stopped = self._status is not None and self._status.state in (DeviceState.IDLE, DeviceState.SAFE)
+        own = None if self.completed or stopped or not self._begun else self._place()
+        if own is None:
+            return None
+        for number in list(self.marks)[:-PART_MARKS]:
+            del self.marks[number]
+        marks = [
+            [*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks.values()
+        ]
+        numbers = {"decisions": self.n_decisions, "abstained": self.n_abstained, "last_tick": self.last_tick}
+        return {"tracker": list(self.tracker.position), "marks": marks, **numbers, "core": own}
+
+    def resume(self, place: dict[str, Any]) -> None:
+        """Go on from the place that `part` returned, right after `begin`."""
+        self.tracker.resume(tuple(place["tracker"]))
+        for mark in place["marks"]:
+            photons = math.nan if mark[5] is None else mark[5]
+            self._remember(Mark._make([*mark[:5], photons, *mark[6:]]))
+        self.n_decisions, self.n_abstained, self.last_tick = (
+            int(place[name]) for name in ("decisions", "abstained", "last_tick")
+        )
+        self._go_on_from(place["core"])
+
+    # -- one stream ----------------------------------------------------------------------------------------------------
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output:
+        """Follow the stream that an ARM starts; the output settles what the one before left open (INCOMPLETE, never guessed)."""
+        output = self.end()
+        if self._begun:
+            output = joined(output, self._give_up())
+            self.tracker.restart()
+            self.marks.clear()
+        self._begun, self.completed, self._told_end, self._status = True, False, None, None
+        self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
+        return output
+
+    def end(self) -> Output:
+        """End the stream: report what the device says that it exposed and never came, or that this is not known."""
+        if not self._begun or self.completed:
+            return Output([], [], None)
+        status = self._status
+        if status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE):
+            return self._finish(status)
+        self.completed = True
+        unknown = {"kind": "stream_end_unknown", "first_exposure": self.tracker.next_exposure}
+        output = Output([], [unknown], None)
+        if self._nothing_left():
+            output = joined(output, self._give_up())  # nothing is left for another stream: what is open stays open
+        return output
+
+    def _exposures_of(self, n_cycles: int) -> int:
+        return n_cycles * self._slots_per_cycle if n_cycles else 1 << 63
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
+        """Take stream messages from `place` on, at least one, up to the first of which something came; return how many, and that.
+
+        The outputs together are those of `step` on each of them. Subclasses may take many at once.
+        """
+        return 1, self.step(messages.frame(place))
+
+    def step(self, frame: Frame) -> Output:
+        """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
+        if frame.type == MessageType.STATUS:
+            return self._on_status(frame)
+        message, gap = self.tracker.accept(frame)
+        if message is None:
+            return Output([], [], None)
+        if isinstance(message, Mark):
+            self._remember(message)
+            return Output([], [], None)
+        events = [] if gap is None else [_gap_event(gap)]
+        n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
+        if message.exposure_index + n_exposures > self.end_exposure or not self._fits(message):
+            self.tracker.counters.malformed += 1
+            return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
+        end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
+        self.last_tick = end_tick
+        self._check_slot(message.exposure_index + n_exposures - 1, end_tick)
+        skipped = self._skip_to(message.exposure_index, message.tick)
+        taken = self._take(message, n_exposures, end_tick)
+        return joined(Output(skipped.decisions, events, None, skipped.passages, skipped.actions), taken, end_tick)
+
+    def _check_slot(self, exposure_index: int, end_tick: int) -> None:
+        """Compare when an exposure ended with when the plan says that it should."""
+        plan = self._plan
+        cycle, slot = divmod(exposure_index, plan.slots_per_cycle)
+        planned = self.start_tick + cycle * plan.cycle_ticks + int(plan.slot_offset_ticks[slot])
+        self.jitter_ticks = max(self.jitter_ticks, abs(end_tick - planned - plan.exposure_ticks))
+
+    def _on_status(self, frame: Frame) -> Output:
+        """When the device says that the plan is done, settle what will never be complete.
+
+        STATUS may overtake stream messages, so that with exposures missing only a second one settles them.
+        """
+        try:
+            status = decode_status(frame.payload)
+        except MalformedMessage:
+            return Output([], [], None)
+        if self.completed or status.tick < self.start_tick:  # an earlier run's news
+            return Output([], [], None)
+        self._status = status
+        if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
+            return Output([], [], None)
+        missing = min(status.next_exposure, self.end_exposure) > self.tracker.next_exposure
+        if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
+            self._told_end = status.tick
+            return Output([], [], None)
+        return self._finish(status)
+
+    def _finish(self, status: Status) -> Output:
+        self.completed = True
+        end = min(status.next_exposure, self.end_exposure)
+        gap = self.tracker.finish(end, status.drops)
+        return joined(Output([], [] if gap is None else [_gap_event(gap)], None), self._skip_to(end, status.tick))
+
+    def _remember(self, mark: Mark) -> None:
+        self.marks.pop(mark.object_index, None)
+        self.marks[mark.object_index] = mark
+        if len(self.marks) > MAX_MARKS:
+            del self.marks[next(iter(self.marks))]  # the one that was set longest ago
+
+
+def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Output:
+    """Return what two outputs say together, in their order."""
+    return Output(
+        first.decisions + then.decisions,
+        first.events + then.events,
+        block_end_tick,
+        first.passages + then.passages,
+        first.actions + then.actions,
+    )
+
+
+def _gap_event(gap: Gap) -> dict[str, Any]:
+    return {"kind": "gap", **gap._asdict()}

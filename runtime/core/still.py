@@ -1,0 +1,130 @@
+"""The deterministic core: one stream frame in, decisions and events out; no I/O, no clock, no randomness.
+
+A live run, a replay and a simulation all drive this class with the same frames, so that a recording gives the same decisions bit
+for bit. `Core.step` returns an `Output`; a window that overlaps a gap gives a decision that is flagged and abstains, never a guess.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.decide.backends import Decider
+from pans.runtime.record.format import NO_LABEL as NO_LABEL
+from pans.runtime.record.format import DecisionFlag
+from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
+
+from .dark_guard import DarkGuard
+from .follower import MAX_MARKS as MAX_MARKS
+from .follower import Decision as Decision
+from .follower import Follower
+from .follower import Output as Output
+from .plan import Plan
+from .window import DecisionWindows, Window
+
+NO_FLAGS = DecisionFlag(0)
+
+
+class Core(Follower):
+    """Stream tracker, windows and back end joined up, for objects that stand still."""
+
+    def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
+        super().__init__(plan, n_cycles)
+        self.guard = guard  # of the dark counts; None: they are only added up
+        self.windows = DecisionWindows(plan, decider.n_features, shots)
+        self.shots = shots
+        self._decider = decider
+        self._visits_before = 0  # in streams that have ended
+
+    @property
+    def tallies(self) -> NDArray[np.int64]:
+        """Dark exposures, dark clicks and wrong patterns, int64 (window.N_TALLIES,)."""
+        return self.windows.tallies
+
+    def warm_up(self) -> None:
+        """Run every compiled kernel of the hot path once, before arming."""
+        self.windows.warm_up()
+        if self.guard is not None:
+            self.guard.warm_up()
+
+    def cycles_left(self, n_cycles: int) -> int:
+        """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""
+        return n_cycles - (self._visits_before + self.windows.visits_begun) * self._cycles_per_object
+
+    def _fits(self, block: ClickBlock | FrameBlock) -> bool:
+        return self.windows.fits(block)
+
+    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+        decisions = []
+        events = [] if self.guard is None else self.guard.take(block)
+        for window in self.windows.push(block):
+            before_end = (block.exposure_index + n_exposures - 1 - window.last_exposure) * block.period_ticks
+            decisions.append(self._decide(window, end_tick - before_end))
+        return Output(decisions, events, None)
+
+    def _skip_to(self, exposure_index: int, tick: int) -> Output:
+        return Output([self._decide(window, tick) for window in self.windows.skip_to(exposure_index)], [], None)
+
+    def _give_up(self) -> Output:
+        self._visits_before += self.windows.visits_begun
+        if self.guard is not None:
+            self.guard.restart()
+        windows = self.windows.restart()
+        decisions = [self._decide(window, self.last_tick, DecisionFlag.INCOMPLETE) for window in windows]
+        return Output(decisions, [], None)
+
+    def _place(self) -> dict[str, Any] | None:
+        if self.guard is not None and self.guard.policy != "warn":
+            return None  # what it has learnt decides too
+        return None if self.windows.half_seen else {"windows": list(self.windows.position)}
+
+    def _go_on_from(self, place: dict[str, Any]) -> None:
+        visit, next_window, number = place["windows"]
+        self.windows.position = (int(visit), int(next_window), int(number))
+
+    def _nothing_left(self) -> bool:
+        return self.windows.visits_begun * self.windows.visit_exposures >= self.end_exposure
+
+    def _decide(self, window: Window, tick: int, flags: DecisionFlag = NO_FLAGS) -> Decision:
+        label, probability = NO_LABEL, 0.0
+        if window.missing:
+            flags |= DecisionFlag.GAP
+        if window.wrong:
+            flags |= DecisionFlag.WRONG_PATTERN
+        if flags:
+            flags |= DecisionFlag.ABSTAINED
+        elif self.guard is not None:
+            self.guard.take_object(window.counts, window.object_index)
+        decider = self._decider
+        if self.guard is not None:
+            flags |= self.guard.flags
+            decider = self.guard.decider(decider)
+        if flags & DecisionFlag.ABSTAINED:
+            self.n_abstained += 1
+        else:
+            label, probability = decider.decide(window.counts, self.shots)
+            if self.guard is not None:
+                self.guard.count_word(window.counts)
+            if not probability > 0:  # the scores were not finite: their label means nothing
+                flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
+                label, probability = NO_LABEL, 0.0
+                self.n_abstained += 1
+        mark = self.marks.get(window.object_index)
+        decision = Decision(
+            number=self.n_decisions,
+            tick=tick,
+            exposure_index=window.last_exposure,
+            object=window.object_index,
+            shot=window.first_shot,
+            clicks=int(window.counts.sum()),
+            label=label,
+            truth=UNKNOWN_TRUTH if mark is None or window.object_index == NO_OBJECT else mark.truth,
+            flags=int(flags),
+            probability=probability,
+            counts_crc=zlib.crc32(window.counts.tobytes()),
+        )
+        self.n_decisions += 1
+        return decision

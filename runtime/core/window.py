@@ -1,0 +1,231 @@
+"""Exposures -> windows: the K-shot click counts of each object, complete or reported incomplete, in a fixed order.
+
+Owns which exposure belongs to which window; never decides. `DecisionWindows.push` returns the windows that a block completes or
+that can no longer become complete; each exposure is counted once, in a compiled kernel, and dark slots are tallied apart.
+
+A *visit* is the time one object stands before the detector (`cycles_per_object` cycles); its shots are grouped by K into windows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.errors import PlanError
+from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
+
+from .plan import Plan
+
+MAX_VISIT_EXPOSURES = 1 << 24
+DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, N_TALLIES = 0, 1, 2, 3
+
+I64 = npt.NDArray[np.int64]
+
+
+class Window(NamedTuple):
+    """One object's K shots: `counts` int64 (d_f,) clicks per pattern, a view that is valid until the next `push`.
+
+    `first_shot` counts within the visit. `missing` exposures never came, `wrong` ones showed another pattern than planned: with
+    either above 0 no decision may be made from it.
+    """
+
+    object_index: int
+    first_shot: int
+    last_exposure: int
+    counts: I64
+    missing: int
+    wrong: int
+
+
+@numba.njit(cache=True, nogil=True)
+def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
+    """Add exposures `relative`... of a visit to its windows; see tests/naive_window.py for the meaning in plain loops.
+
+    patterns uint16 (n,), bits uint8 (n,), feature_at int32 and window_at int32 (visit,), counts int64 (windows, d_f),
+    seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
+    """
+    for i in range(patterns.shape[0]):
+        feature = feature_at[relative + i]
+        shown = patterns[i]
+        if feature < 0:
+            if shown == DARK_PATTERN:
+                tallies[DARK_EXPOSURES] += 1
+                tallies[DARK_CLICKS] += bits[i]
+            else:
+                tallies[WRONG_PATTERNS] += 1
+            continue
+        window = window_at[relative + i]
+        if shown == feature:
+            counts[window, feature] += bits[i]
+            seen[window, 0] += 1
+        else:
+            tallies[WRONG_PATTERNS] += 1
+            seen[window, 1] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def add_frames(relative, words, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
+    """Add frames of all channels `relative`... of a visit: words uint8 (n, bytes), bit c of a word is channel c.
+
+    window_at int32 (visit,), -1 for a dark frame; counts int64 (windows, d_f), seen int64 (windows, 2), tallies int64 (3,).
+    """
+    n_features = counts.shape[1]
+    for i in range(words.shape[0]):
+        window = window_at[relative + i]
+        for feature in range(n_features):
+            bit = (words[i, feature >> 3] >> (feature & 7)) & 1
+            if window < 0:
+                tallies[DARK_EXPOSURES] += 1
+                tallies[DARK_CLICKS] += bit
+            else:
+                counts[window, feature] += bit
+        if window >= 0:
+            seen[window, 0] += n_features
+
+
+class DecisionWindows:
+    """Follows the visits of a run; all memory is allocated here, before arming."""
+
+    def __init__(self, plan: Plan, n_features: int, shots: int) -> None:
+        shots_per_object = plan.shots_per_cycle * plan.cycles_per_object
+        if shots < 1 or shots_per_object % shots:
+            raise PlanError(
+                f"{shots_per_object} shots per object cannot be cut into windows of {shots}",
+                remedy="choose a multiple: --trials N gives N windows of --shots K each",
+            )
+        self.shots = shots
+        self.n_windows = shots_per_object // shots
+        self.parallel = plan.mode == "parallel"
+        self.visit_exposures = plan.slots_per_cycle * plan.cycles_per_object
+        if self.visit_exposures > MAX_VISIT_EXPOSURES:
+            raise PlanError(f"an object takes {self.visit_exposures} exposures, allowed {MAX_VISIT_EXPOSURES}")
+        self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
+        self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
+        self._out: I64 = np.zeros_like(self._counts)
+        self._seen: I64 = np.zeros((self.n_windows, 2), np.int64)
+        self._need = shots * n_features
+        self._feature_at, self._window_at = _visit_maps(plan, shots)
+        self._last = _last_exposures(self._window_at, self.n_windows, self.visit_exposures)
+        self._visit = 0
+        self._next_window = 0
+        self._object = NO_OBJECT
+
+    def fits(self, block: ClickBlock | FrameBlock) -> bool:
+        """Whether `block` is of the plan's kind, lies within one visit and has a bit for every channel: what `push` relies on."""
+        if isinstance(block, FrameBlock):
+            n_exposures, word_bytes = block.words.shape
+            if not self.parallel or 8 * word_bytes < self._counts.shape[1]:
+                return False
+        else:
+            n_exposures = len(block.patterns)
+            if self.parallel:
+                return False
+        return block.exposure_index % self.visit_exposures + n_exposures <= self.visit_exposures
+
+    def push(self, block: ClickBlock | FrameBlock) -> list[Window]:
+        """Count a block and return the windows that are settled by it, oldest first."""
+        visit, relative = divmod(block.exposure_index, self.visit_exposures)
+        settled = self._advance_to(visit)
+        self._object = block.object_index
+        if isinstance(block, FrameBlock):
+            n_exposures = len(block.words)
+            add_frames(relative, block.words, self._window_at, self._counts, self._seen, self.tallies)
+        else:
+            n_exposures = len(block.patterns)
+            add_exposures(
+                relative, block.patterns, block.bits, self._feature_at, self._window_at, self._counts, self._seen, self.tallies
+            )  # fmt: skip
+        settled += self._settle(relative + n_exposures)
+        return settled
+
+    def skip_to(self, exposure_index: int) -> list[Window]:
+        """Report every window before `exposure_index` that will never be complete (a gap, or the end of the stream)."""
+        visit, relative = divmod(exposure_index, self.visit_exposures)
+        return self._advance_to(visit) + self._settle(relative)
+
+    @property
+    def position(self) -> tuple[int, int, int]:
+        """The visit under way, its next window to be settled, and the object before the detector; stream.py continues from here."""
+        return self._visit, self._next_window, self._object
+
+    @position.setter
+    def position(self, value: tuple[int, int, int]) -> None:
+        self._visit, self._next_window, self._object = value
+
+    @property
+    def half_seen(self) -> bool:
+        """Whether a window that is not settled holds exposures already."""
+        return bool(self._seen[self._next_window :].any())
+
+    def arrays(self) -> tuple[npt.NDArray[np.int32], I64, I64, I64, I64]:
+        """Return the arrays that hold the visit under way: window and last exposure, counts, seen, tallies."""
+        return self._window_at, self._last, self._counts, self._seen, self.tallies
+
+    @property
+    def visits_begun(self) -> int:
+        """Visits of which something has been seen or settled."""
+        return self._visit + (self._next_window > 0 or bool(self._seen.any()))
+
+    def restart(self) -> list[Window]:
+        """Give up the visit under way and count from exposure 0 again; return its windows that were still open."""
+        open_windows = self._advance_to(self.visits_begun)
+        self._visit = 0
+        return open_windows
+
+    def warm_up(self) -> None:
+        """Compile or load the kernel that `push` will use, without counting anything."""
+        if self.parallel:
+            # a block's words are a read-only view of its message, which is a type of its own to the compiler
+            no_words = np.frombuffer(b"", np.uint8).reshape(0, 1)
+            add_frames(0, no_words, self._window_at, self._counts, self._seen, self.tallies)
+        else:
+            add_exposures(
+                0, np.zeros(0, np.uint16), np.zeros(0, np.uint8),
+                self._feature_at, self._window_at, self._counts, self._seen, self.tallies,
+            )  # fmt: skip
+
+    def _advance_to(self, visit: int) -> list[Window]:
+        settled: list[Window] = []
+        while self._visit < visit:
+            settled += [window._replace(counts=window.counts.copy()) for window in self._settle(self.visit_exposures)]
+            self._visit += 1
+            self._next_window = 0
+            self._object = NO_OBJECT
+            self._counts[:] = 0
+            self._seen[:] = 0
+        return settled
+
+    def _settle(self, relative_end: int) -> list[Window]:
+        """Windows stay in order: one that is complete waits for none, since shots end in the order of their last exposure."""
+        settled: list[Window] = []
+        while self._next_window < self.n_windows:
+            index = self._next_window
+            right, wrong = int(self._seen[index, 0]), int(self._seen[index, 1])
+            if right < self._need and self._last[index] >= relative_end:
+                break
+            self._out[index] = self._counts[index]
+            last = self._visit * self.visit_exposures + int(self._last[index])
+            missing = self._need - right - wrong
+            settled.append(Window(self._object, index * self.shots, last, self._out[index], missing, wrong))
+            self._next_window += 1
+        return settled
+
+
+def _visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Return, for each exposure of a visit, its pattern (-1: dark) and its window, both int32 (visit,)."""
+    pattern = plan.slot_pattern.astype(np.int32)
+    feature = np.where(pattern == DARK_PATTERN, -1, pattern)
+    cycles = np.arange(plan.cycles_per_object, dtype=np.int64)[:, None]
+    shot = cycles * plan.shots_per_cycle + plan.slot_shot.astype(np.int64)[None, :]
+    window = np.where(feature[None, :] < 0, -1, shot // shots)
+    return np.tile(feature, plan.cycles_per_object).astype(np.int32), window.ravel().astype(np.int32)
+
+
+def _last_exposures(window_at: npt.NDArray[np.int32], n_windows: int, visit_exposures: int) -> I64:
+    last: I64 = np.full(n_windows, -1, np.int64)
+    lit = window_at >= 0
+    np.maximum.at(last, window_at[lit], np.arange(visit_exposures, dtype=np.int64)[lit])
+    return last

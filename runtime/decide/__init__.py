@@ -1,0 +1,1 @@
+"""Clicks to label and probability: the back ends behind one call."""

@@ -1,0 +1,109 @@
+"""The decision back ends behind one call, chosen by measurement when a bundle is loaded.
+
+Owns the choice and its reasons; never counts clicks (window.py) and never abstains (core.py). `make_decider` returns a back end that has
+been held against the bundle's golden vectors before it answers anything. What a decision is stands in verdict.py, the back ends in
+decide_table.py, decide_mlp.py and decide_onnx.py; numba and onnxruntime are imported only by those that need them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.errors import UsageError
+
+from .onnx import OnnxDecider as OnnxDecider
+from .picture import PictureDecider as PictureDecider
+from .table import CountTableDecider, fits_count_table
+from .table import TableDecider as TableDecider
+from .verdict import Decider as Decider
+from .verdict import Verdict as Verdict
+from .verdict import softmax_winner as softmax_winner
+
+BACKENDS = ("auto", "table", "count-table", "sparse", "onnx", "int8", "int8-onnx", "float64")
+MEASURED_CALLS = 200
+
+
+def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> Decider:
+    """Return a warmed-up back end that has answered the golden vectors of `bundle`.
+
+    `auto` takes the table for single shots where there is one, and else the one whose median time for a decision is the least here, among
+    those that answer as the float head does (`choice` says what was measured). UsageError for a back end that the bundle does not have
+    or that cannot answer `shots`; DamagedFileError when it contradicts the golden vectors.
+    """
+    if backend not in BACKENDS:
+        raise UsageError(f"back end {backend!r}, allowed: {', '.join(BACKENDS)}")
+    if shots < 1:
+        raise UsageError(f"shots is {shots}, allowed: 1 or more")
+    if bundle.picture_shape is not None:
+        if backend not in ("auto", PictureDecider.name):
+            raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
+        return PictureDecider(bundle)
+    if backend == "auto":
+        return _choose(bundle, shots)
+    return _make(bundle, shots, backend)
+
+
+def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
+    if backend == "table":
+        return _table_decider(bundle, shots)
+    if backend == "count-table":
+        return CountTableDecider(bundle, shots)
+    if backend in ("onnx", "int8-onnx"):
+        return OnnxDecider(bundle, int8=backend == "int8-onnx")
+    from . import mlp as decide_mlp
+
+    makers: dict[str, Callable[[Bundle], Decider]] = {
+        "sparse": decide_mlp.SparseDecider,
+        "int8": decide_mlp.Int8Decider,
+        "float64": decide_mlp.ReferenceDecider,
+    }
+    return makers[backend](bundle)
+
+
+def _choose(bundle: Bundle, shots: int) -> Decider:
+    """One look-up needs no measurement; otherwise every exact back end that can be made is timed on clicks as they come."""
+    if shots == 1 and bundle.table is not None:
+        table = TableDecider(bundle)
+        table.choice = {"chosen": table.name, "why": "one look-up per decision"}
+        return table
+    if bundle.head_onnx is None:
+        raise UsageError(
+            f"{bundle.name} has only a table of single clicks, which cannot answer {shots} shots",
+            remedy="use --shots 1, or a bundle with an ONNX head",
+        )
+    candidates: list[Decider] = [OnnxDecider(bundle)]
+    with suppress(UsageError):  # a head that is no plain chain of layers: onnxruntime runs it
+        candidates.append(_make(bundle, shots, "sparse"))
+    if fits_count_table(bundle.n_features, shots):
+        candidates.append(CountTableDecider(bundle, shots))
+    medians = {decider.name: median_us(decider, shots) for decider in candidates}
+    best = min(candidates, key=lambda decider: medians[decider.name])
+    measured = {name: round(value, 3) for name, value in medians.items()}
+    best.choice = {"chosen": best.name, "why": "least median time", "p50_us": measured}  # type: ignore[attr-defined]
+    return best
+
+
+def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> float:
+    """Return the median time of one decision in microseconds, over varied clicks with a fixed seed."""
+    rng = np.random.default_rng(20250103)
+    counts: NDArray[np.int64] = rng.integers(0, shots + 1, size=(calls, decider.n_features))
+    times: list[int] = []
+    for row in counts:
+        start_ns = time.perf_counter_ns()
+        decider.decide(row, shots)
+        times.append(time.perf_counter_ns() - start_ns)
+    return float(np.median(times)) / 1000
+
+
+def _table_decider(bundle: Bundle, shots: int) -> TableDecider:
+    if bundle.table is None:
+        raise UsageError(f"{bundle.name} has no table ({bundle.n_features} patterns)", remedy="use the back end onnx")
+    if shots != 1:
+        raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx, or one shot")
+    return TableDecider(bundle)

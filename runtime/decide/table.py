@@ -1,0 +1,166 @@
+"""Tables as back ends: every click word, or every vector of click counts, decided beforehand.
+
+Owns the way from clicks to a row and the winners of all rows; never evaluates a head while it decides. A table is exactly the head
+that it was made from: no decision differs, ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pans.runtime.bundle.head import open_head
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.errors import UsageError
+
+from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winners
+
+COUNT_TABLE_ROWS_MAX = 1 << 16  # of a table that is made when a bundle is loaded: a fraction of a second
+
+
+class TableDecider:
+    """Every click word's label and probability, computed once: a decision is one look-up (K = 1 only, exactly the head)."""
+
+    name = "table"
+
+    def __init__(self, bundle: Bundle) -> None:
+        if bundle.table is None:
+            raise UsageError(f"{bundle.name} has no table")
+        self.choice: Mapping[str, Any] = {}
+        self.n_features = bundle.n_features
+        self.n_classes = bundle.n_classes
+        self._scores = bundle.table
+        self.radix: NDArray[np.int64] = 1 << np.arange(self.n_features, dtype=np.int64)
+        self.labels: NDArray[Any]  # (2**d_f,), uint8 up to 256 classes, else uint16
+        self.probabilities: NDArray[np.float32]  # (2**d_f,), of the winning class
+        self._words_kernel: Callable[[NDArray[Any], NDArray[Any]], int] | None = (
+            None  # made when the first stream comes
+        )
+        wide, self.probabilities = softmax_winners(bundle.table)
+        self.labels = wide.astype(np.uint8) if self.n_classes <= 256 else wide
+        binary = ((bundle.golden_means == 0) | (bundle.golden_means == 1)).all(axis=1)
+        found = self.scores_batch(bundle.golden_means[binary].astype(np.int64), 1)
+        demand_golden(self.name, found, bundle.golden_scores[binary], bundle)
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """Decide from single clicks, int64 (d_f,); UsageError for anything but zeros and ones of one shot."""
+        if shots != 1 or int(counts @ counts) != int(counts.sum()):  # c * c == c only for 0 and 1
+            raise UsageError(f"the table answers single shots of 0 or 1, not {counts.tolist()} of {shots}")
+        return self.decide_word(int(counts @ self.radix))
+
+    def decide_word(self, word: int) -> Verdict:
+        """Decide from a packed click word (bit i is pattern i), 0 <= word < 2**d_f; IndexError beyond."""
+        return Verdict(int(self.labels[word]), float(self.probabilities[word]))
+
+    def decide_words(self, words: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return the labels (n,), dtype of `labels`, of uint16, uint32 or uint64 click words (n,), written to `out` if given."""
+        if words.dtype not in (np.uint16, np.uint32, np.uint64) or words.ndim != 1:
+            raise UsageError(f"click words are {words.dtype} {words.shape}, allowed: uint16, uint32 or uint64 (n,)")
+        result = np.empty(len(words), dtype=self.labels.dtype) if out is None else out
+        if result.shape != words.shape or result.dtype != self.labels.dtype:
+            allowed = f"{self.labels.dtype} {words.shape}"
+            raise UsageError(f"out is {result.dtype} {result.shape}, allowed: {allowed}")
+        if self._words_kernel is None:
+            self._words_kernel = words_kernel(self.labels)
+        bad = self._words_kernel(words, result)
+        if bad >= 0:
+            raise UsageError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
+        return result
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """Return the table's rows, float32 (n, classes), for single clicks (n, d_f)."""
+        return self._scores[self._index(counts, shots)]
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), for single clicks (n, d_f)."""
+        return self.labels[self._index(counts, shots)].astype(np.int64)
+
+    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
+        """Return labels and probabilities for single clicks (n, d_f)."""
+        index = self._index(counts, shots)
+        return Verdicts(self.labels[index].astype(np.uint16), self.probabilities[index])
+
+    def _index(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        if shots != 1:
+            raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx")
+        return checked_counts(counts, shots, self.n_features) @ self.radix
+
+
+def words_kernel(labels: NDArray[Any]) -> Callable[[NDArray[Any], NDArray[Any]], int]:
+    """Return what labels words (n,) into out (n,) with a table of 2^d_f labels; it returns -1, or where the first word beyond it stands.
+
+    Tables that fit into vector registers are looked up there, where the processor can.
+    """
+    from . import vectors as decide_vectors
+    from .kernels import label_checked_words
+
+    plain = partial(label_checked_words, labels)
+    if not decide_vectors.AVAILABLE or labels.dtype != np.uint8 or len(labels) > decide_vectors.ENTRIES:
+        return plain
+    held = np.zeros(decide_vectors.ENTRIES, np.uint8)
+    held[: len(labels)] = labels
+    fast = partial(decide_vectors.label_words_in_registers, held, len(labels))
+
+    def label(words: NDArray[Any], out: NDArray[Any]) -> int:
+        whole = words.flags.c_contiguous and out.flags.c_contiguous
+        return int(fast(words, out) if whole else plain(words, out))
+
+    return label
+
+
+class CountTableDecider:
+    """The head's answer to every vector of counts 0..K, (K+1)^d_f rows, made when the bundle is loaded."""
+
+    name = "count-table"
+
+    def __init__(self, bundle: Bundle, shots: int, rows_max: int = COUNT_TABLE_ROWS_MAX) -> None:
+        if bundle.head_onnx is None:
+            raise UsageError(f"{bundle.name} has no ONNX head to make a table of counts from")
+        if not fits_count_table(bundle.n_features, shots, rows_max):
+            rows = (shots + 1) ** bundle.n_features
+            raise UsageError(
+                f"a table of counts for {shots} shots of {bundle.n_features} patterns has {rows:.3g} rows, allowed {rows_max}"
+            )
+        self.choice: Mapping[str, Any] = {}
+        self.n_features, self.n_classes, self.shots = bundle.n_features, bundle.n_classes, shots
+        self.radix: NDArray[np.int64] = (shots + 1) ** np.arange(self.n_features, dtype=np.int64)
+        head = open_head(bundle.head_onnx, bundle.n_features, bundle.n_classes, bundle.name)
+        demand_golden(self.name, head.scores(bundle.golden_means), bundle.golden_scores, bundle)
+        rows = np.arange((shots + 1) ** self.n_features, dtype=np.int64)
+        counts = rows[:, None] // self.radix[None, :] % (shots + 1)
+        self.scores = head.scores(counts.astype(np.float32) / np.float32(shots))
+        self.labels, self.probabilities = softmax_winners(self.scores)
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots."""
+        if shots != self.shots:
+            raise UsageError(f"this table of counts answers {self.shots} shots, not {shots}")
+        row = int(counts @ self.radix)
+        return Verdict(int(self.labels[row]), float(self.probabilities[row]))
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """Return the head's scores, float32 (n, classes), for click counts (n, d_f)."""
+        return self.scores[self._index(counts, shots)]
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), for click counts (n, d_f)."""
+        return self.labels[self._index(counts, shots)].astype(np.int64)
+
+    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
+        """Return labels and probabilities for click counts (n, d_f)."""
+        index = self._index(counts, shots)
+        return Verdicts(self.labels[index], self.probabilities[index])
+
+    def _index(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        if shots != self.shots:
+            raise UsageError(f"this table of counts answers {self.shots} shots, not {shots}")
+        return checked_counts(counts, shots, self.n_features) @ self.radix
+
+
+def fits_count_table(n_features: int, shots: int, rows_max: int = COUNT_TABLE_ROWS_MAX) -> bool:
+    """Whether (shots+1)**n_features rows are at most `rows_max`, decided without forming the number."""
+    return n_features * np.log2(shots + 1) <= np.log2(rows_max) + 1e-9

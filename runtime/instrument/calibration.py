@@ -1,0 +1,188 @@
+"""The calibration file: what was measured on one instrument, when and how; beside the profile, never a rewrite of it.
+
+Owns the file (strict JSON with a checksum over all of it), its checks, and what a run takes from it: the brightness of the
+projector, the dark rates and their intervals. Never measures (calibrate.py) and never watches (dark_watch.py, light_watch.py).
+`load_calibration` returns a `Calibration` whose every figure is possible, or raises DamagedFileError; `find_objections` says
+why a run must not use one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
+from pans.runtime.errors import ConfigError, DamagedFileError
+
+from .click_law import ClickLaw, log_no_click
+from .profile import Profile
+
+FORMAT = "pans-calibration"
+VERSION = 1
+MAX_BYTES = 4 << 20
+MAX_AGE_H = 24.0
+F64 = NDArray[np.float64]
+_NUMBERS = ("photons_per_level", "dark_per_exposure", "exposure_us", "peak_photoelectrons_hz")
+_INTERVALS = ("photons_per_level_ci", "dark_ci", "peak_photoelectrons_hz_ci")
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """The facts of one file; `text` are its bytes' SHA-256, `values` everything that stands in it."""
+
+    path: str
+    sha256: str
+    values: Mapping[str, Any]
+
+    @property
+    def made(self) -> datetime:
+        """When it was measured, UTC."""
+        return datetime.fromisoformat(self.values["made_utc"])
+
+    def age_h(self, now: datetime) -> float:
+        """Its age in hours at `now` (UTC)."""
+        return (now - self.made).total_seconds() / 3600
+
+    def dark_probability(self, profile: Profile, exposure_us: float, channels: int) -> tuple[F64, F64, F64]:
+        """Click probability of a dark exposure of `exposure_us`, with the ends of its 95 % interval, each float64 (channels,).
+
+        What is above the false clicks of read noise grows with the exposure, as dark counts do.
+        """
+        rows = self.values["channels"]
+        measured = np.array([[row["dark_per_exposure"], *row["dark_ci"]] for row in rows], np.float64)
+        law = ClickLaw(0.0, profile.detector.read_noise_e, profile.detector.threshold_e)
+        noise = -float(log_no_click(law, 0.0))
+        with np.errstate(divide="ignore"):
+            excess = np.maximum(-np.log1p(-np.minimum(measured, 1 - 1e-12)) - noise, 0.0)
+        scaled = -np.expm1(-(noise + excess * (exposure_us / self.values["exposure_us"])))
+        chosen = scaled[np.arange(channels) % len(rows)]
+        return chosen[:, 0], chosen[:, 1], chosen[:, 2]
+
+    def dark_clicks(self, channels: int) -> NDArray[np.int64]:
+        """How many dark clicks each channel's rate was estimated from, int64 (channels,)."""
+        rows = self.values["channels"]
+        return np.array([int(row["dark_clicks"]) for row in rows], np.int64)[np.arange(channels) % len(rows)]
+
+    def applied_to(self, profile: Profile) -> Profile:
+        """The profile with the projector's measured brightness, so that plans expose for the light that is there.
+
+        Where the profile's own figure lies within the measured interval it stays: the measurement does not contradict it.
+        """
+        low, high = self.values["peak_photoelectrons_hz_ci"]
+        said = profile.projector.peak_photoelectrons_hz
+        if low <= said and (high is None or said <= high):
+            return profile
+        projector = replace(profile.projector, peak_photoelectrons_hz=self.values["peak_photoelectrons_hz"])
+        return replace(profile, projector=projector)
+
+
+def save_calibration(path: str | Path, values: Mapping[str, Any]) -> str:
+    """Write `values` (JSON-able, with all keys of the format but the checksum) whole or not at all; return the file's SHA-256."""
+    body = {"format": FORMAT, "version": VERSION, **values}
+    sealed = {**body, "sha256": hashlib.sha256(canonical_json(body)).hexdigest()}
+    data = (json.dumps(sealed, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+    parse_calibration(data, str(path))
+    replace_file(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Return what `path` holds; UsageError without a file, else DamagedFileError."""
+    return parse_calibration(read_file(path, MAX_BYTES), str(path))
+
+
+def parse_calibration(data: bytes, where: str) -> Calibration:
+    """Check the bytes of a calibration file; DamagedFileError names the first thing that cannot be."""
+    values = parse_json_object(data, where)
+    if values.get("format") != FORMAT or values.get("version") != VERSION:
+        found = f"{ascii(values.get('format'))[:40]} {ascii(values.get('version'))[:20]}"
+        raise DamagedFileError(f"{where}: format {found}, allowed: {FORMAT} {VERSION}")
+    body = {key: value for key, value in values.items() if key != "sha256"}
+    found = hashlib.sha256(canonical_json(body)).hexdigest()
+    if values.get("sha256") != found:
+        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
+    try:
+        _check(values)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedFileError(f"{where}: {error}") from error
+    return Calibration(where, hashlib.sha256(data).hexdigest(), values)
+
+
+def is_calibration(start: bytes) -> bool:
+    """Whether a file that begins like this is meant as a calibration."""
+    return start.lstrip()[:1] == b"{"
+
+
+def find_objections(calibration: Calibration, profile: Profile, serial: str | None) -> None:
+    """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another
+    device.
+    """
+    made_for = calibration.values["profile"]
+    if made_for["sha256"] != profile.sha256:
+        raise ConfigError(
+            f"{calibration.path}: made for the profile {made_for['name']} ({made_for['sha256'][:12]}…), this run uses {profile.name} "
+            f"({profile.sha256[:12]}…)",
+            remedy="calibrate with this profile: pans calibrate --profile " + profile.name,
+        )
+    of_device = calibration.values["device"].get("serial")
+    if serial is not None and of_device is not None and of_device != serial:
+        raise ConfigError(
+            f"{calibration.path}: made on the device {of_device}, this is {serial}", remedy="calibrate this device"
+        )
+
+
+def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
+    """Return a sentence for each reason to distrust: none given, or stale."""
+    if calibration is None:
+        return [
+            "no calibration: the light and the dark rates are the profile's, not this instrument's (pans calibrate)"
+        ]
+    age = calibration.age_h(now)
+    if age > max_age_h:
+        return [f"the calibration is {age:.1f} h old, allowed are {max_age_h:g} h: calibrate again"]
+    if age < -0.1:
+        return [f"the calibration is from {-age:.1f} h in the future: check this machine's clock"]
+    return []
+
+
+def now_utc() -> datetime:
+    """This machine's date, to the second."""
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+def _check(values: Mapping[str, Any]) -> None:
+    for key in _NUMBERS:
+        _demand(_possible(values[key]), f"{key} is {ascii(values[key])[:40]}, allowed: a finite number of at least 0")
+    for key in _INTERVALS:
+        low, high = values[key]
+        fine = _possible(low) and (high is None or (_possible(high) and high >= low))
+        _demand(fine, f"{key} is {ascii(values[key])[:60]}, allowed: low and high, or null where nothing bounds it")
+    _demand(values["exposure_us"] > 0, "exposure_us is 0, allowed: above 0")
+    made = datetime.fromisoformat(values["made_utc"])
+    _demand(made.utcoffset() is not None, f"made_utc {values['made_utc']} has no time zone")
+    rows = values["channels"]
+    _demand(isinstance(rows, list) and len(rows) > 0, "channels is empty, allowed: one row for each channel")
+    for number, row in enumerate(rows):
+        low, high = row["dark_ci"]
+        fine = 0 <= low <= row["dark_per_exposure"] <= high <= 1
+        _demand(fine, f"channel {number}: dark rate {row['dark_per_exposure']} not within {row['dark_ci']} of 0 to 1")
+    for key, part in (("name", "profile"), ("sha256", "profile")):
+        _demand(isinstance(values[part][key], str), f"{part}.{key} is no text")
+    _demand(isinstance(values["device"], dict), "device holds no facts")
+
+
+def _possible(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+
+
+def _demand(holds: bool, message: str) -> None:
+    if not holds:
+        raise ValueError(message)

@@ -1,0 +1,320 @@
+"""Change detection on dark clicks: one exact CUSUM per channel and side, and two over all channels, in whole numbers.
+
+Owns the running sums and says when one passes its threshold; never names the cause (channels.py) and never acts. What comes in are dark
+exposures, or exposures of an empty stretch, in the order of time; what comes out are `Alarm`s. A sum changes by the same amount
+with every silent exposure, so the kernel works per click and is still exact per exposure: integer arithmetic, the same on every
+machine and in a replay.
+
+Tests, each designed by watch_design.py: every channel against twice and half its rate; with several channels, their sum against
+ten times (a light leak, soon) and one and a half times (a drift, surely). `WatchSettings.arl_exposures` is for all of them
+together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from .cusum_design import RATE_MAX, CusumDesign, design_cusum
+
+I64 = npt.NDArray[np.int64]
+F64 = npt.NDArray[np.float64]
+FLOOR_RATE = 1e-9  # a detector that is said to have no dark clicks at all is watched as one with this rate
+ALL_CHANNELS = -1
+SHARES = {"rise": 0.6, "fall": 0.2, "burst": 0.1, "drift": 0.1}  # of the false alarms, by test
+MAX_CHANNELS = 4096
+_ALARM_ROOM = 256  # alarms of one call; more are counted, not kept
+# columns of a test's state
+SUM, THRESHOLD, CLICK_STEP, SILENT_STEP, LAST, SINCE, N_STATE = 0, 1, 2, 3, 4, 5, 6
+
+
+@dataclass(frozen=True, slots=True)
+class WatchSettings:
+    """What to look for: ratios of the present to the expected rate; `arl_exposures` lie between two false alarms, of any test,
+    in the mean."""
+
+    arl_exposures: float = 1e8
+    rise_ratio: float = 2.0
+    fall_ratio: float = 0.5
+    burst_ratio: float = 10.0
+    drift_ratio: float = 1.5
+
+
+class Alarm(NamedTuple):
+    """One test that passed its threshold at dark exposure `exposure` (they alone are counted, from 0).
+
+    `test` is rise, fall, burst or drift; `channel` is ALL_CHANNELS for the last two. The change is put at `since`, where the
+    sum last was 0; `clicks` are those of each channel from there to the alarm (int64 (n,)), so that `rate` is their estimate
+    per exposure and channel."""
+
+    test: str
+    channel: int
+    exposure: int
+    since: int
+    clicks: I64
+    expected: float
+
+    @property
+    def exposures(self) -> int:
+        """Exposures from the estimated change to the alarm."""
+        return max(1, self.exposure - self.since)
+
+    @property
+    def rate(self) -> float:
+        """Clicks per exposure and channel since the estimated change: of the channel, or of all."""
+        if self.channel != ALL_CHANNELS:
+            return float(self.clicks[self.channel]) / self.exposures
+        return float(self.clicks.sum()) / (self.exposures * len(self.clicks))
+
+
+class ChannelWatch:
+    """Follows the dark rates of `n_channels`; all memory is allocated here, before arming.
+
+    `expected` float64 (n,) are click probabilities of a dark exposure; `guard_low`, `guard_high` (n,) the ends of their
+    intervals where they are estimates: the false-alarm rate then holds up to there."""
+
+    def __init__(
+        self,
+        n_channels: int,
+        expected: F64,
+        settings: WatchSettings | None = None,
+        guard_low: F64 | None = None,
+        guard_high: F64 | None = None,
+    ) -> None:
+        if not 1 <= n_channels <= MAX_CHANNELS or np.shape(expected) != (n_channels,):
+            raise ValueError(
+                f"{n_channels} channels and rates of shape {np.shape(expected)}, allowed: 1 to {MAX_CHANNELS}, (n,)"
+            )
+        self.settings = settings or WatchSettings()
+        self.n_channels = n_channels
+        self.expected = np.clip(np.asarray(expected, np.float64), FLOOR_RATE, RATE_MAX)
+        self.clicks: I64 = np.zeros(n_channels, np.int64)
+        self.exposures = 0
+        self.dropped_alarms = 0
+        high = self.expected if guard_high is None else np.clip(guard_high, self.expected, RATE_MAX)
+        low = self.expected if guard_low is None else np.clip(guard_low, FLOOR_RATE, self.expected)
+        self.high = high  # up to here a rate is what was expected
+        self.designs = _designs(self.expected, low, high, self.settings)
+        self._tests = [name for name, _, _ in self.designs]
+        self._channel_of = np.array([channel for _, channel, _ in self.designs], np.int64)
+        self._state: I64 = np.zeros((len(self.designs), N_STATE), np.int64)
+        for row, (_, _, design) in enumerate(self.designs):
+            self._state[row, THRESHOLD : SILENT_STEP + 1] = design.threshold, design.click_step, design.silent_step
+        self._at_zero: I64 = np.zeros(
+            (len(self.designs), n_channels), np.int64
+        )  # clicks of each channel when the sum was last 0
+        self._room: I64 = np.zeros((_ALARM_ROOM, 3 + n_channels), np.int64)
+
+    def update_words(self, words: npt.NDArray[np.uint8]) -> list[Alarm]:
+        """Take dark exposures in the order of time, words uint8 (n, bytes), bit c is channel c; exact for each exposure."""
+        n = take_words(words, self.exposures, self.clicks, self._state, self._channel_of, self._at_zero, self._room)
+        self.exposures += len(words)
+        return self._alarms(int(n))
+
+    def update_bits(self, bits: npt.NDArray[np.uint8]) -> list[Alarm]:
+        """Take dark exposures of one detector, uint8 (n,) of 0 or 1: `update_words` for one channel."""
+        return self.update_words(bits.reshape(-1, 1))
+
+    def update(self, dark_exposures: int, clicks_per_channel: I64, first_exposure: int | None = None) -> list[Alarm]:
+        """Take a block of which only the counts are known: clicks int64 (n,) in `dark_exposures` exposures.
+
+        The sums are then looked at where blocks end: `S = max(0, S + clicks and silences)`. That is never above the exact sum
+        and at most the silent step times the exposures of one block below it, whatever the number of blocks: no more false
+        alarms than stated, and an alarm at most about a block later. `first_exposure`, if given, must be the number of
+        exposures taken before; ValueError otherwise."""
+        if first_exposure not in (None, self.exposures):
+            raise ValueError(f"dark exposures from {first_exposure} on, expected from {self.exposures} on")
+        clicks = np.asarray(clicks_per_channel, np.int64)
+        if clicks.shape != (self.n_channels,) or clicks.min() < 0 or clicks.max() > dark_exposures:
+            raise ValueError(
+                f"clicks {clicks.tolist()} of {self.n_channels} channels in {dark_exposures} exposures cannot be"
+            )
+        n = take_counts(
+            dark_exposures,
+            clicks,
+            self.exposures,
+            self.clicks,
+            self._state,
+            self._channel_of,
+            self._at_zero,
+            self._room,
+        )
+        self.exposures += dark_exposures
+        return self._alarms(int(n))
+
+    def warm_up(self) -> None:
+        """Compile or load the kernels, without counting anything."""
+        self.update_words(np.zeros((0, 1), np.uint8))
+        self.update_words(np.frombuffer(b"", np.uint8).reshape(0, 1))  # a view of a message is a type of its own
+        self.update(0, np.zeros(self.n_channels, np.int64))
+
+    def restart(self) -> None:
+        """Begin every test from 0: what their sums hold belongs to a state that is over."""
+        self._state[:, SUM] = 0
+        self._state[:, SINCE] = self._state[:, LAST]
+        self._at_zero[:] = self.clicks
+
+    def sums(self) -> F64:
+        """Return every test's sum as a fraction of its threshold, float64 (tests,), for a live view; 1 is an alarm."""
+        return self._state[:, SUM] / self._state[:, THRESHOLD]
+
+    def _alarms(self, n: int) -> list[Alarm]:
+        self.dropped_alarms += max(0, n - _ALARM_ROOM)
+        alarms = []
+        for row in self._room[: min(n, _ALARM_ROOM)]:
+            test = int(row[0])
+            channel = int(self._channel_of[test])
+            expected = float(self.expected.mean() if channel == ALL_CHANNELS else self.expected[channel])
+            alarms.append(Alarm(self._tests[test], channel, int(row[1]), int(row[2]), row[3:].copy(), expected))
+        return alarms
+
+
+def _designs(expected: F64, low: F64, high: F64, settings: WatchSettings) -> list[tuple[str, int, CusumDesign]]:
+    n = len(expected)
+    shares = dict(SHARES)
+    if n == 1:  # the one channel's own test sees a drift
+        shares["burst"] += shares.pop("drift")
+    arl = {test: settings.arl_exposures / share for test, share in shares.items()}
+    designs = []
+    for channel in range(n):
+        rate = float(expected[channel])
+        designs.append(("rise", channel, _design(rate, settings.rise_ratio, n * arl["rise"], float(high[channel]))))
+        designs.append(("fall", channel, _design(rate, settings.fall_ratio, n * arl["fall"], float(low[channel]))))
+    pool, guard = (
+        float(expected.mean()),
+        float(high.mean()),
+    )  # the pool's trial is one channel in one exposure: n of them
+    designs.append(("burst", ALL_CHANNELS, _design(pool, settings.burst_ratio, n * arl["burst"], guard)))
+    if n > 1:
+        designs.append(("drift", ALL_CHANNELS, _design(pool, settings.drift_ratio, n * arl["drift"], guard)))
+    return designs
+
+
+@lru_cache(maxsize=512)
+def _design(rate: float, ratio: float, arl: float, guard: float) -> CusumDesign:
+    """As design_cusum; near 1/2 a rate cannot be doubled, so the test looks for half the way to 1."""
+    if ratio > 1 and rate * ratio > 0.5 * (1 + rate):
+        ratio = 0.5 * (1 + rate) / rate
+    return design_cusum(rate, ratio, arl, guard)
+
+
+@numba.njit(cache=True, nogil=True)
+def _silence(state, row, until, zero, clicks):  # type: ignore[no-untyped-def]
+    """Take the silent trials before number `until`; return the trial at which the threshold was passed, else -1."""
+    n = until - state[row, LAST]
+    if n <= 0:
+        return -1
+    step, before = state[row, SILENT_STEP], state[row, SUM]
+    if step > 0:
+        needed = -((before - state[row, THRESHOLD]) // step)  # rounded up
+        if needed <= n:
+            state[row, LAST] += needed
+            return state[row, LAST]
+        state[row, SUM] = before + n * step
+    elif before + n * step > 0:
+        state[row, SUM] = before + n * step
+    else:
+        state[row, SUM] = 0
+        state[row, SINCE] = until
+        zero[row] = clicks
+    state[row, LAST] = until
+    return -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _note(alarms, n, test, exposure, trials, state, zero, clicks):  # type: ignore[no-untyped-def]
+    """Write down an alarm and start the test again from 0."""
+    if n < alarms.shape[0]:
+        alarms[n, 0], alarms[n, 1], alarms[n, 2] = test, exposure, state[test, SINCE] // trials
+        alarms[n, 3:] = clicks - zero[test]
+    state[test, SUM] = 0
+    state[test, SINCE] = state[test, LAST]
+    zero[test] = clicks
+    return n + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _catch_up(state, row, until, trials, zero, clicks, alarms, n):  # type: ignore[no-untyped-def]
+    """Take silent trials up to `until`, as many alarms as they give."""
+    while True:
+        passed = _silence(state, row, until, zero, clicks)
+        if passed < 0:
+            return n
+        n = _note(alarms, n, row, passed // trials, trials, state, zero, clicks)
+
+
+@numba.njit(cache=True, nogil=True)
+def _click(state, row, trial, trials, zero, clicks, alarms, n):  # type: ignore[no-untyped-def]
+    """Take the click of trial `trial`; the silent ones before it have been taken, and `clicks` holds it already."""
+    total = state[row, SUM] + state[row, CLICK_STEP]
+    state[row, LAST] = trial + 1
+    state[row, SUM] = total
+    if total <= 0:
+        state[row, SUM], state[row, SINCE] = 0, trial + 1
+        zero[row] = clicks
+    elif total >= state[row, THRESHOLD]:
+        n = _note(alarms, n, row, trial // trials + 1, trials, state, zero, clicks)
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def take_words(words, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
+    """Take exposures `first`..., words uint8 (n, bytes); returns the number of alarms. Rows 2c and 2c+1 of `state` are channel c's tests,
+    the others the pool's, whose trials are counted channel by channel. clicks int64 (channels,) are totals, updated."""
+    channels, found = clicks.size, 0
+    for t in range(words.shape[0]):
+        for byte in range(words.shape[1]):
+            rest = np.int64(words[t, byte])
+            while rest:
+                bit = 0
+                while not (rest >> bit) & 1:
+                    bit += 1
+                rest &= rest - 1
+                channel = 8 * byte + bit
+                if channel >= channels:
+                    break
+                trial = (first + t) * channels + channel
+                for row in (2 * channel, 2 * channel + 1):
+                    found = _catch_up(state, row, first + t, 1, zero, clicks, alarms, found)
+                for row in range(2 * channels, channel_of.size):
+                    found = _catch_up(state, row, trial, channels, zero, clicks, alarms, found)
+                clicks[channel] += 1
+                for row in (2 * channel, 2 * channel + 1):
+                    found = _click(state, row, first + t, 1, zero, clicks, alarms, found)
+                for row in range(2 * channels, channel_of.size):
+                    found = _click(state, row, trial, channels, zero, clicks, alarms, found)
+    return _end(first + words.shape[0], channels, state, channel_of, zero, clicks, alarms, found)
+
+
+@numba.njit(cache=True, nogil=True)
+def _end(until, channels, state, channel_of, zero, clicks, alarms, found):  # type: ignore[no-untyped-def]
+    for row in range(channel_of.size):
+        trials = 1 if channel_of[row] >= 0 else channels
+        found = _catch_up(state, row, until * trials, trials, zero, clicks, alarms, found)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def take_counts(exposures, block, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
+    """Take a block of counts, int64 (channels,), as one step of every sum; returns the number of alarms."""
+    channels, found = clicks.size, 0
+    clicks += block
+    until = first + exposures
+    for row in range(channel_of.size):
+        own = channel_of[row] >= 0
+        trials = 1 if own else channels
+        n_clicks = block[channel_of[row]] if own else block.sum()
+        silent = exposures * trials - n_clicks
+        state[row, SUM] += n_clicks * state[row, CLICK_STEP] + silent * state[row, SILENT_STEP]
+        state[row, LAST] = until * trials
+        if state[row, SUM] <= 0:
+            state[row, SUM], state[row, SINCE] = 0, until * trials
+            zero[row] = clicks
+        elif state[row, SUM] >= state[row, THRESHOLD]:
+            found = _note(alarms, found, row, until, trials, state, zero, clicks)
+    return found

@@ -1,0 +1,347 @@
+"""Maximum likelihood under the click law: the photon level, the dark rate and the non-uniformity behind counts of clicks.
+
+Owns the likelihood of known drives (lit levels of a pattern on a clear field), its maximum, and intervals where it has fallen
+by what 95 % allow; never shows a pattern (calibration_run.py) and never writes a file (calibration.py). The estimate is of
+photoelectrons per level and exposure: flux, transmission and efficiency together; clicks cannot tell them apart.
+
+Model: an exposure of drive s has mean `mu = s theta + delta`, counted as `mu / (1 + mu f)` where dead time matters; it stays
+silent with the click law's probability, times (1 - p_ap) after a click, times what crosstalk leaves. Afterpulsing, crosstalk,
+dead time, read noise and threshold are the profile's; they are not fitted. Intervals by profile likelihood: right to second
+order, one-sided at 0 and at saturation, where Wald's break down."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import UsageError
+from pans.runtime.intervals import CHI2_95, chi2_quantile, chi2_tail
+
+from .click_law import ClickLaw, survival_coefficients
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+SATURATED = 60.0  # photoelectrons: from here on every exposure clicks, whatever the law
+_FLOOR = 1e-14  # photoelectrons per exposure: less is none
+_STEPS_MAX = 200
+
+
+class Counts(NamedTuple):
+    """Exposures that are alike, (g,) each: drive in levels, clicks (int64) of exposures (int64), the log probability that
+    nothing but light and dark counts fired it (float64), and the number of the pattern (-1: dark).
+    """
+
+    drive: F64
+    clicks: I64
+    exposures: I64
+    log_other: F64
+    pattern: I64
+
+
+class Interval(NamedTuple):
+    """A maximum-likelihood estimate with its 95 % interval; `high` is inf where the data set no bound."""
+
+    value: float
+    low: float
+    high: float
+
+
+class LightFit(NamedTuple):
+    """Photoelectrons per level and exposure, dark photoelectrons per exposure, both with intervals, and the log likelihood."""
+
+    level: Interval
+    dark: Interval
+    log_likelihood: float
+
+
+class Spread(NamedTuple):
+    """Non-uniformity of patterns: relative standard deviation (random effects) with its interval, and the test that there is
+    none.
+    """
+
+    relative: Interval
+    p_value: float
+    patterns: int
+    mean: Interval  # of the patterns' levels relative to the fit's: what the mean pattern has
+
+
+@dataclass(frozen=True, slots=True)
+class CountModel:
+    """What of the detector is taken as known: the law without its dark counts, and dead time as a fraction of the exposure."""
+
+    law: ClickLaw
+    dead_fraction: float = 0.0
+
+    def log_miss(self, mean: F64) -> F64:
+        """Log probability that `mean` photoelectrons (any shape, up to some hundreds) leave the exposure silent."""
+        counted = mean / (1.0 + self.dead_fraction * mean)
+        return -counted if self._plain else np.log(_series(_survival(self.law)[0], counted)) - counted
+
+    def log_miss_slope(self, mean: F64) -> F64:
+        """Its derivative."""
+        inner = 1.0 / (1.0 + self.dead_fraction * mean) ** 2
+        if self._plain:
+            return -inner
+        counted = mean / (1.0 + self.dead_fraction * mean)
+        powers, slopes = _survival(self.law)
+        return (_series(slopes, counted) / _series(powers, counted) - 1.0) * inner
+
+    @property
+    def _plain(self) -> bool:
+        return self.law.read_noise_e == 0 and self.law.threshold_e <= 1
+
+
+@lru_cache(maxsize=16)
+def _survival(law: ClickLaw) -> tuple[F64, F64]:
+    """The coefficients of exp(mean) times the survival, and of the derivative of that series; all are positive."""
+    powers = survival_coefficients(law)
+    return powers, powers[1:] * np.arange(1, len(powers)) if len(powers) > 1 else np.zeros(1)
+
+
+def _series(coefficients: F64, x: F64) -> F64:
+    total = np.full(np.shape(x), coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
+def log_likelihood(counts: Counts, model: CountModel, level: float, dark: float) -> float:
+    """Return the log likelihood without its binomial constants; -inf where the rates forbid what was seen."""
+    log_miss = model.log_miss(counts.drive * level + dark) + counts.log_other
+    with np.errstate(divide="ignore", invalid="ignore"):
+        hits = np.where(counts.clicks > 0, counts.clicks * np.log(-np.expm1(log_miss)), 0.0)
+    return float((hits + (counts.exposures - counts.clicks) * log_miss).sum())
+
+
+def fit_light(counts: Counts, model: CountModel) -> LightFit:
+    """Return the photon level and the dark rate that make `counts` most likely, with their 95 % intervals.
+
+    UsageError without lit exposures. All silent: the level is 0 and `high` bounds it; all clicked: the level is inf and `low`
+    bounds it.
+    """
+    counts = _merged(counts)
+    lit = counts.drive > 0
+    if not counts.exposures[lit].sum():
+        raise UsageError("no exposure with light: nothing to estimate a photon level from")
+    top = SATURATED / float(counts.drive[lit].min())
+    fit = _Profile(counts, model, top)
+    level, dark, best = fit.maximum()
+    silent, full = not counts.clicks[lit].any(), bool((counts.clicks[lit] == counts.exposures[lit]).all())
+    low = 0.0 if silent else fit.bound(fit.over_level, level, best, upward=False)
+    high = math.inf if full else fit.bound(fit.over_level, level, best, upward=True)
+    no_dark = best - fit.over_dark(_FLOOR)[0] < 0.5 * CHI2_95
+    dark_low = 0.0 if no_dark else fit.bound(fit.over_dark, dark, best, upward=False)
+    dark_high = fit.bound(fit.over_dark, dark, best, upward=True)
+    shown_level = 0.0 if silent else math.inf if full else level
+    return LightFit(
+        Interval(shown_level, low, high), Interval(0.0 if dark <= 2 * _FLOOR else dark, dark_low, dark_high), best
+    )
+
+
+def _merged(counts: Counts) -> Counts:
+    """Add up what is alike but for the number of its pattern."""
+    keys, own = np.unique(np.column_stack([counts.drive, counts.log_other]), axis=0, return_inverse=True)
+    clicks, exposures = np.zeros(len(keys), np.int64), np.zeros(len(keys), np.int64)
+    np.add.at(clicks, own.ravel(), counts.clicks)
+    np.add.at(exposures, own.ravel(), counts.exposures)
+    return Counts(keys[:, 0], clicks, exposures, keys[:, 1], np.full(len(keys), -1))
+
+
+class _Profile:
+    """The two-parameter likelihood of one data set: its maximum, and its height along one parameter with the other at its best."""
+
+    def __init__(self, counts: Counts, model: CountModel, top: float) -> None:
+        self.counts, self.model, self.top = counts, model, top
+        self._lit = counts.drive > 0
+        self._warm = {True: 0.0, False: 0.0}
+
+    def maximum(self) -> tuple[float, float, float]:
+        """Return level, dark and log likelihood at the maximum, by Fisher scoring in both."""
+        counts = self.counts
+        unlit = ~self._lit
+        n_dark, k_dark = int(counts.exposures[unlit].sum()), int(counts.clicks[unlit].sum())
+        dark = -math.log1p(-min(k_dark, n_dark - 0.5) / n_dark) if n_dark and k_dark else _FLOOR
+        drive = float(np.average(counts.drive[self._lit], weights=counts.exposures[self._lit]))
+        share = counts.clicks[self._lit].sum() / counts.exposures[self._lit].sum()
+        level = min(max(-math.log1p(-min(share, 1 - 1e-9)) - dark, 1e-3) / drive, self.top)
+        value = log_likelihood(counts, self.model, level, dark)
+        for _ in range(_STEPS_MAX):
+            score, information = self._scores(level, dark)
+            step = _solve(information, score, at_floor=dark <= _FLOOR and score[1] < 0)
+            moved = self._move((level, dark), step, value)
+            if moved is None or moved[2] - value < 1e-10 * (1 + 1e-3 * abs(value)):
+                level, dark, value = moved or (level, dark, value)
+                break
+            level, dark, value = moved
+        return float(level), float(dark), value
+
+    def over_level(self, level: float) -> tuple[float, float]:
+        """Return the height at `level` with the best dark rate, and that rate."""
+        return self._best_other(level, level_is_fixed=True)
+
+    def over_dark(self, dark: float) -> tuple[float, float]:
+        """Return the height at `dark` with the best level, and that level."""
+        return self._best_other(dark, level_is_fixed=False)
+
+    def bound(self, height: object, best_at: float, best: float, *, upward: bool) -> float:
+        """Return where twice the fall from `best` is the 95 % quantile of chi-square(1), by bisection of the logarithm."""
+        assert callable(height)
+
+        def fall(log_x: float) -> float:
+            return 2.0 * (best - height(math.exp(log_x))[0]) - CHI2_95
+
+        inside = math.log(max(best_at, _FLOOR))
+        reach = 0.02
+        while fall(inside + (reach if upward else -reach)) < 0:
+            inside += reach if upward else -reach
+            reach *= 2.0
+            if inside > 40 or inside < math.log(_FLOOR):
+                return math.inf if upward else 0.0
+        outside = inside + (reach if upward else -reach)
+        low, high = fall(inside), fall(outside)
+        side = 0
+        for _ in range(60):  # regula falsi with the Illinois correction
+            middle = (inside * high - outside * low) / (high - low)
+            value = fall(middle)
+            if abs(value) < 1e-7 or abs(outside - inside) < 1e-12:
+                return math.exp(middle)
+            if value > 0:
+                outside, high = middle, value
+                low, side = (0.5 * low if side == 1 else low), 1
+            else:
+                inside, low = middle, value
+                high, side = (0.5 * high if side == -1 else high), -1
+        return math.exp(0.5 * (inside + outside))
+
+    def _best_other(self, fixed: float, *, level_is_fixed: bool) -> tuple[float, float]:
+        """Fisher scoring in the free parameter, from where it was best last time."""
+        top = SATURATED if level_is_fixed else self.top
+        free = min(max(self._warm[level_is_fixed], _FLOOR), top) or _FLOOR
+        index = 1 if level_is_fixed else 0
+
+        def pair(x: float) -> tuple[float, float]:
+            return (fixed, x) if level_is_fixed else (x, fixed)
+
+        value = log_likelihood(self.counts, self.model, *pair(free))
+        if value == -math.inf:
+            free = 1e-3 if level_is_fixed else 1e-3 * self.top
+            value = log_likelihood(self.counts, self.model, *pair(free))
+        for _ in range(_STEPS_MAX):
+            score, information = self._scores(*pair(free))
+            step = score[index] / information[index, index] if information[index, index] > 0 else 0.0
+            gained = False
+            for _ in range(40):
+                trial = min(max(free + step, 0.1 * free, _FLOOR), top)
+                found = log_likelihood(self.counts, self.model, *pair(trial))
+                if found > value:
+                    gained = True
+                    break
+                step *= 0.5
+                if abs(step) < 1e-12 * free:
+                    break
+            if not gained or found - value < 1e-10:
+                free, value = (trial, found) if gained else (free, value)
+                break
+            free, value = trial, found
+        self._warm[level_is_fixed] = free
+        return value, free
+
+    def _scores(self, level: float, dark: float) -> tuple[F64, F64]:
+        """Score (2,) and expected information (2, 2) in level and dark."""
+        counts, mean = self.counts, self.counts.drive * level + dark
+        log_miss = self.model.log_miss(mean) + counts.log_other
+        p = np.maximum(-np.expm1(log_miss), 1e-300)
+        q = np.maximum(np.exp(log_miss), 1e-300)
+        slope = -q * self.model.log_miss_slope(mean)
+        weight = slope / (p * q)
+        residual = weight * (counts.clicks - counts.exposures * p)
+        load = counts.exposures * weight * slope
+        score = np.array([residual @ counts.drive, residual.sum()])
+        cross = load @ counts.drive
+        return score, np.array([[load @ counts.drive**2, cross], [cross, load.sum()]])
+
+    def _move(self, at: tuple[float, float], step: F64, value: float) -> tuple[float, float, float] | None:
+        """Return the first point along `step` that is higher, or None; no parameter falls by more than nine tenths at once."""
+        for halving in range(40):
+            part = step * 0.5**halving
+            level = min(max(at[0] + part[0], 0.1 * at[0], _FLOOR), self.top)
+            dark = min(max(at[1] + part[1], 0.1 * at[1], _FLOOR), SATURATED)
+            found = log_likelihood(self.counts, self.model, level, dark)
+            if found > value:
+                return level, dark, found
+        return None
+
+
+def _solve(information: F64, score: F64, *, at_floor: bool) -> F64:
+    """The scoring step; only in the level where the dark rate is at its floor, or where the two cannot be told apart."""
+    determinant = information[0, 0] * information[1, 1] - information[0, 1] ** 2
+    alone = np.array([score[0] / information[0, 0] if information[0, 0] > 0 else 0.0, 0.0])
+    if at_floor or not determinant > 1e-14 * information[0, 0] * information[1, 1]:
+        return alone
+    return np.asarray(np.linalg.solve(information, score), np.float64)
+
+
+def fit_spread(counts: Counts, model: CountModel, level: float, dark: float) -> Spread:
+    """Return the non-uniformity of the patterns: is each one's light what its drive says, times one common level?
+
+    Each pattern's own level is fitted, relative to `level`; patterns that were always or never seen say nothing and are left
+    out. The spread is Paule and Mandel's estimate, its interval the Q profile (Viechtbauer, Statistics in Medicine 26, 2007),
+    the test Cochran's Q."""
+    log_levels, variances = _pattern_levels(counts, model, level, dark)
+    n = len(log_levels)
+    if n < 3:
+        return Spread(Interval(0.0, 0.0, math.inf), 1.0, n, Interval(1.0, 0.0, math.inf))
+
+    def heterogeneity(tau2: float) -> float:
+        weights = 1.0 / (variances + tau2)
+        centre = weights @ log_levels / weights.sum()
+        return float(weights @ (log_levels - centre) ** 2)
+
+    def spread_at(q: float) -> float:
+        """The tau at which the heterogeneity is q; it falls with tau."""
+        if heterogeneity(0.0) <= q:
+            return 0.0
+        low, high = 0.0, 1.0
+        while heterogeneity(high) > q:
+            high *= 4.0
+        for _ in range(100):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if heterogeneity(middle) > q else (low, middle)
+        return math.sqrt(high)
+
+    tau = spread_at(n - 1.0)
+    ends = spread_at(chi2_quantile(0.975, n - 1)), spread_at(chi2_quantile(0.025, n - 1))
+    weights = 1.0 / (variances + tau * tau)
+    centre, half = float(weights @ log_levels / weights.sum()), 1.959963984540054 / math.sqrt(weights.sum())
+    mean = Interval(math.exp(centre), math.exp(centre - half), math.exp(centre + half))
+    return Spread(Interval(tau, *ends), chi2_tail(heterogeneity(0.0), n - 1), n, mean)
+
+
+def _pattern_levels(counts: Counts, model: CountModel, level: float, dark: float) -> tuple[F64, F64]:
+    """Log of each pattern's level relative to `level` and its variance, both (patterns that say something,), by scoring all at
+    once.
+    """
+    lit = counts.pattern >= 0
+    _, own = np.unique(counts.pattern[lit], return_inverse=True)
+    drive, clicks, exposures = counts.drive[lit], counts.clicks[lit], counts.exposures[lit]
+    n_patterns = int(own.max()) + 1
+    seen, shown = np.bincount(own, clicks, n_patterns), np.bincount(own, exposures, n_patterns)
+    log_levels, information = np.zeros(n_patterns), np.ones(n_patterns)
+    for _ in range(30):
+        light = drive * level * np.exp(log_levels)[own]
+        log_miss = model.log_miss(light + dark) + counts.log_other[lit]
+        p, q = np.maximum(-np.expm1(log_miss), 1e-300), np.maximum(np.exp(log_miss), 1e-300)
+        slope = -q * model.log_miss_slope(light + dark) * light  # with respect to the log of the level
+        score = np.bincount(own, slope / (p * q) * (clicks - exposures * p), n_patterns)
+        information = np.maximum(np.bincount(own, exposures * slope**2 / (p * q), n_patterns), 1e-300)
+        step = np.clip(score / information, -1.0, 1.0)
+        log_levels = np.clip(log_levels + step, -8.0, 8.0)
+        if np.abs(step).max() < 1e-10:
+            break
+    telling = (seen > 0) & (seen < shown) & (information > 1e-6)
+    return log_levels[telling], 1.0 / information[telling]

@@ -1,0 +1,194 @@
+"""Hardware profile: a TOML file -> frozen facts about one instrument. docs/PROFILES.md explains every key.
+
+Owns the facts, and reading files and shipped profiles (profile_check.py holds the rules); never holds what a calibration
+measured (calibration.py), and never decides whether a bundle fits (plan.py). `load_profile` and `parse_profile` return a
+`Profile` whose numbers are all possible ones, or raise a ConfigError that starts with file:line:col. Detector effects that
+the file does not declare are 0 and cost nothing.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from pans.runtime.errors import ConfigError
+
+from .profile_schema import ProfileCheck
+from .toml_position import read_toml
+
+MAX_PROFILE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Projector:
+    """What shows the patterns; `peak_photoelectrons_hz`: what one pixel at the top level yields through a clear object."""
+
+    kind: str
+    width_px: int
+    height_px: int
+    levels: int
+    pixel_pitch_um: float
+    pattern_rate_max_hz: float
+    pattern_memory: int
+    peak_photoelectrons_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectModulator:
+    """What shows test images as objects; `contrast` is brightest over darkest transmission, inf for perfect black.
+
+    `black_transmission` is what a black pixel lets through at the object in fact, where that was measured; else 1/contrast.
+    """
+
+    contrast: float
+    levels: int
+    black_transmission: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Detector:
+    """What clicks; effects left at 0 are absent."""
+
+    kind: str
+    channels: int
+    efficiency: float
+    dark_rate_hz: float
+    read_noise_e: float = 0.0
+    threshold_e: float = 0.5
+    dead_time_ns: float = 0.0
+    afterpulse_probability: float = 0.0
+    crosstalk_probability: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How long the detector may be open; `readout_us` is the time after an exposure before the next may start."""
+
+    min_us: float
+    max_us: float
+    readout_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The device clock: all plan times are whole ticks of it."""
+
+    tick_hz: int
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """A decision follows the last exposure within the deadline; the device goes dark when the lease is not renewed."""
+
+    decision_deadline_us: float
+    lease_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One instrument; `sources`: "section.key" -> where the figure comes from, `measure`: the keys to measure oneself."""
+
+    name: str
+    description: str
+    mode: str
+    projector: Projector
+    object_modulator: ObjectModulator | None
+    detector: Detector
+    exposure: Exposure
+    clock: Clock
+    timing: Timing
+    sources: Mapping[str, str]
+    measure: tuple[str, ...]
+    text: str = field(repr=False)
+
+    @property
+    def sha256(self) -> str:
+        """Hex digest of the file's text: what a recording stores beside its figures."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def min_transmission(self) -> float:
+        """Transmission of a black object pixel: as declared, else 1/contrast of the modulator, 0 without one."""
+        modulator = self.object_modulator
+        if modulator is None:
+            return 0.0
+        return 1.0 / modulator.contrast if modulator.black_transmission is None else modulator.black_transmission
+
+
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Read the shipped profile of that name, or the profile file at that path.
+
+    Raises ConfigError if there is neither, or if the file is not a valid profile (then it starts with file:line:col).
+    """
+    if isinstance(name_or_path, str) and name_or_path in shipped_profiles():
+        shipped = resources.files("pans.hw_profiles").joinpath(f"{name_or_path}.toml")
+        return parse_profile(_decoded(shipped.read_bytes(), shipped.name), shipped.name)
+    path = Path(name_or_path)
+    if not path.is_file():
+        known = ", ".join(shipped_profiles())
+        near = difflib.get_close_matches(str(name_or_path), shipped_profiles(), n=1)
+        raise ConfigError(
+            f"there is no profile {str(name_or_path)!r}: neither a file nor one of the shipped profiles ({known})",
+            remedy=f"did you mean {near[0]}?" if near else "give a shipped name or the path of a .toml file",
+        )
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_PROFILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    return parse_profile(_decoded(data, str(path)), str(path))
+
+
+def shipped_profiles() -> tuple[str, ...]:
+    """Names of the profiles that come with the package, sorted."""
+    entries = resources.files("pans.hw_profiles").iterdir()
+    return tuple(sorted(entry.name.removesuffix(".toml") for entry in entries if entry.name.endswith(".toml")))
+
+
+def parse_profile(text: str, where: str) -> Profile:
+    """Check the TOML `text` (named `where` in messages) and return its facts; raises ConfigError at the first fault."""
+    if len(text.encode()) > MAX_PROFILE_BYTES:
+        raise _too_large(where)
+    tables, positions = read_toml(text, where)
+    check = ProfileCheck(tables, positions, where)
+    values = check.values()
+    profile = Profile(
+        name=values["profile"]["name"],
+        description=values["profile"].get("description", ""),
+        mode=values["profile"]["mode"],
+        projector=Projector(**values["projector"]),
+        object_modulator=ObjectModulator(**values["object"]) if "object" in values else None,
+        detector=Detector(**values["detector"]),
+        exposure=Exposure(**values["exposure"]),
+        clock=Clock(**values["clock"]),
+        timing=Timing(**values["timing"]),
+        sources=check.sources(values),
+        measure=check.measure(values),
+        text=text,
+    )
+    check.across(profile)
+    return profile
+
+
+def _decoded(data: bytes, where: str) -> str:
+    if len(data) > MAX_PROFILE_BYTES:
+        raise _too_large(where)
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")  # the same hash and positions whichever system saved it
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
+        raise ConfigError(
+            f"{where}:{line}:{column}: byte 0x{data[error.start]:02x} is not UTF-8", remedy="save the file as UTF-8"
+        ) from error
+
+
+def _too_large(where: str) -> ConfigError:
+    return ConfigError(
+        f"{where}:1:1: a profile may hold at most {MAX_PROFILE_BYTES} bytes, found more",
+        remedy="is this a profile? see docs/PROFILES.md",
+    )

@@ -1,0 +1,262 @@
+"""The rules of a profile file: which keys there are, what they may hold, and what must hold between them.
+
+Owns the schema and the words of its error messages; never reads files and never makes a Profile (profile.py does). `ProfileCheck`
+returns checked values, or raises a ConfigError that starts with file:line:col.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.errors import ConfigError
+
+from .toml_position import KeyPath, Position, position_of
+from .toml_rules import Key, found, near, type_remedy
+
+if TYPE_CHECKING:
+    from .profile import Profile
+
+MODES = ("sequential", "parallel")
+MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
+
+
+_PROBABILITY = Key("number", 0, 1, required=False)
+_SCHEMA: dict[str, dict[str, Key]] = {
+    "profile": {
+        "name": Key("text"),
+        "description": Key("text", required=False),
+        "mode": Key("text", choices=MODES),
+    },
+    "projector": {
+        "kind": Key("text"),
+        "width_px": Key("whole", 1, 65535),
+        "height_px": Key("whole", 1, 65535),
+        "levels": Key("whole", 2, 65536),
+        "pixel_pitch_um": Key("number", 0, 1e5, above=True),
+        "pattern_rate_max_hz": Key("number", 0, 1e9, above=True),
+        "pattern_memory": Key("whole", 1, 65535),  # 65535 patterns are 0..0xFFFE: 0xFFFF is the dark pattern
+        "peak_photoelectrons_hz": Key("number", 0, 1e15, above=True),
+    },
+    "object": {
+        "contrast": Key("number", 1, 1e12, above=True, infinite=True),
+        "levels": Key("whole", 2, 65536),
+        "black_transmission": Key("number", 0, 0.99, required=False),
+    },
+    "detector": {
+        "kind": Key("text"),
+        "channels": Key("whole", 1, 4096),
+        "efficiency": Key("number", 0, 1, above=True),
+        "dark_rate_hz": Key("number", 0, 1e9),
+        "read_noise_e": Key("number", 0, 3, required=False),  # beyond 3 e- a single photon is not visible at all
+        "threshold_e": Key("number", 0, 10, above=True, required=False),
+        "dead_time_ns": Key("number", 0, 1e9, required=False),
+        "afterpulse_probability": _PROBABILITY,
+        "crosstalk_probability": _PROBABILITY,
+    },
+    "exposure": {
+        "min_us": Key("number", 0, 1e9, above=True),
+        "max_us": Key("number", 0, 1e9, above=True),
+        "readout_us": Key("number", 0, 1e9),
+    },
+    "clock": {"tick_hz": Key("whole", 1000, 10_000_000_000)},
+    "timing": {
+        "decision_deadline_us": Key("number", 0, 1e9, above=True),
+        "lease_ms": Key("whole", 1, 3_600_000),
+    },
+}
+_OPTIONAL_SECTIONS = ("object", "sources")
+_UNIT = re.compile(r"_(?:ps|ns|us|ms|s|sec|hz|khz|mhz|ghz|cps|e|nm|um|mm|m|px|percent|pct)$")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileCheck:
+    """One file under check; its methods return checked values or raise with the position."""
+
+    tables: dict[str, Any]
+    positions: Mapping[KeyPath, Position]
+    where: str
+
+    def values(self) -> dict[str, dict[str, Any]]:
+        """Every section's checked values, without [sources] and profile.measure."""
+        self._sections()
+        return {name: self._section(name) for name in _SCHEMA if name in self.tables}
+
+    def fault(self, path: KeyPath, message: str, remedy: str = "") -> ConfigError:
+        """The error to raise: `message` with the place of `path` before it."""
+        line, column = position_of(path, self.positions)
+        return ConfigError(f"{self.where}:{line}:{column}: {message}", remedy=remedy)
+
+    def _sections(self) -> None:
+        known = [*_SCHEMA, "sources"]
+        for name, table in self.tables.items():
+            if name not in known:
+                owners = [section for section, keys in _SCHEMA.items() if name in keys]
+                hint = f"[{owners[0]}] has a key of that name" if owners else near(name, known, "[{}]")
+                raise self.fault((name,), f"{name} is not a section of a profile; allowed: {_listed(known)}", hint)
+            if not isinstance(table, dict):
+                raise self.fault((name,), f"{name} must be a section, found {found(table)}", f"write [{name}]")
+        for name in known:
+            if name not in self.tables and name not in _OPTIONAL_SECTIONS:
+                keys = ", ".join(key for key, rule in _SCHEMA[name].items() if rule.required)
+                raise self.fault((), f"section [{name}] is missing", f"add [{name}] with {keys}")
+
+    def _section(self, section: str) -> dict[str, Any]:
+        rules = _SCHEMA[section]
+        table = {key: value for key, value in self.tables[section].items() if (section, key) != ("profile", "measure")}
+        for key in table:
+            if key not in rules:
+                raise self._unknown(section, key)
+        for key, rule in rules.items():
+            if rule.required and key not in table:
+                raise self.fault(
+                    (section,), f"{section}.{key} is missing", f"add `{key} = ...` to [{section}]: {rule.allowed}"
+                )
+        return {key: self._value(section, key, value, rules[key]) for key, value in table.items()}
+
+    def _value(self, section: str, key: str, value: Any, rule: Key) -> str | int | float:
+        if rule.fits(value) and rule.within(value):
+            if (section, key) == ("profile", "name"):
+                return self._checked_name(value)
+            return float(value) if rule.kind == "number" else value
+        remedy = "" if rule.fits(value) else type_remedy(value, rule.kind)
+        raise self.fault((section, key), f"{section}.{key} must be {rule.allowed}, found {found(value)}", remedy)
+
+    def _checked_name(self, name: str) -> str:
+        if not _NAME.fullmatch(name):
+            raise self.fault(
+                ("profile", "name"),
+                "profile.name must be 1 to 64 letters, digits, dots, dashes or underscores and start with a letter or "
+                f"digit, found {found(name)}",
+            )
+        return name
+
+    def _unknown(self, section: str, key: str) -> ConfigError:
+        rules = _SCHEMA[section]
+        stem = _UNIT.sub("", key)
+        other = next((name for name in rules if name != key and _UNIT.sub("", name) == stem), None)
+        if other is not None:
+            unit = other.removeprefix(stem).removeprefix("_")
+            return self.fault(
+                (section, key),
+                f"{section}.{key} is not a key: the unit is part of the name, and this one is {other}",
+                f"convert the value to {unit} and name it {other}" if unit else f"name it {other}",
+            )
+        owner = next((name for name, keys in _SCHEMA.items() if key in keys), None)
+        hint = f"{key} belongs in [{owner}]" if owner else near(key, list(rules), "{}")
+        return self.fault((section, key), f"{section}.{key} is not a key; [{section}] takes {', '.join(rules)}", hint)
+
+    def sources(self, values: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+        """[sources], each of whose keys names a key in `values`."""
+        sources = self.tables.get("sources", {})
+        for name, text in sources.items():
+            if isinstance(text, dict):
+                raise self.fault(
+                    ("sources", name),
+                    f"sources.{name} must be text, found a table",
+                    f'quote the whole key: "{name}.{next(iter(text), "key")}" = "where the figure comes from"',
+                )
+            if not isinstance(text, str) or not text.strip():
+                raise self.fault(("sources", name), f"sources.{name} must be text in quotes, found {found(text)}")
+            self._names_a_key(("sources", name), name, values)
+        return dict(sources)
+
+    def measure(self, values: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+        """profile.measure, each of whose entries names a key in `values`."""
+        names = self.tables["profile"].get("measure", [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise self.fault(
+                ("profile", "measure"),
+                f"profile.measure must be a list of keys in quotes, found {found(names)}",
+                'for example measure = ["detector.dark_rate_hz"]',
+            )
+        for name in names:
+            self._names_a_key(("profile", "measure"), name, values)
+        return tuple(names)
+
+    def _names_a_key(self, path: KeyPath, name: str, values: Mapping[str, Mapping[str, Any]]) -> None:
+        known = [f"{section}.{key}" for section, table in values.items() for key in table]
+        if name not in known:
+            list_name = path[0] if path[0] == "sources" else ".".join(path)
+            raise self.fault(
+                path, f'{list_name} names "{name}", which is not a key of this profile', near(name, known, "{}")
+            )
+
+    def across(self, profile: Profile) -> None:
+        """Check what needs more than one key."""
+        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease):
+            check(profile, self.fault)
+
+
+_Fault = Callable[..., ConfigError]
+
+
+def _check_channels(profile: Profile, fault: _Fault) -> None:
+    channels, path = profile.detector.channels, ("detector", "channels")
+    if profile.mode == "sequential" and channels != 1:
+        raise fault(
+            path,
+            f"detector.channels must be 1 in sequential mode (one detector, pattern after pattern), found {channels}",
+            'set channels = 1, or mode = "parallel" if all channels click at once',
+        )
+    if profile.mode == "parallel" and channels < 2:
+        raise fault(
+            path,
+            f"detector.channels must be at least 2 in parallel mode (one per pattern), found {channels}",
+            'set the number of channels, or mode = "sequential"',
+        )
+    if profile.detector.crosstalk_probability > 0 and channels < 2:
+        raise fault(
+            ("detector", "crosstalk_probability"),
+            "detector.crosstalk_probability must be 0 with 1 channel (there is no neighbour), "
+            f"found {profile.detector.crosstalk_probability:g}",
+            "remove the line",
+        )
+
+
+def _check_exposure(profile: Profile, fault: _Fault) -> None:
+    low, high = profile.exposure.min_us, profile.exposure.max_us
+    if low > high:
+        message = f"exposure.min_us must be at most exposure.max_us = {high:g}, found {low:g}"
+        raise fault(("exposure", "min_us"), message)
+
+
+def _check_dead_time(profile: Profile, fault: _Fault) -> None:
+    dead_us = profile.detector.dead_time_ns / 1000
+    spacing_us = profile.exposure.min_us + profile.exposure.readout_us
+    if dead_us > spacing_us:
+        raise fault(
+            ("detector", "dead_time_ns"),
+            f"detector.dead_time_ns must be at most exposure.min_us + exposure.readout_us = {1000 * spacing_us:g} ns "
+            f"(a click would blind whole exposures after it), found {profile.detector.dead_time_ns:g}",
+            f"raise exposure.min_us or exposure.readout_us by {dead_us - spacing_us:g} us",
+        )
+
+
+def _check_ticks(profile: Profile, fault: _Fault) -> None:
+    least_us = MIN_EXPOSURE_TICKS * 1e6 / profile.clock.tick_hz
+    if profile.exposure.min_us < least_us * (1 - 1e-9):
+        raise fault(
+            ("exposure", "min_us"),
+            f"exposure.min_us must be at least {MIN_EXPOSURE_TICKS} ticks = {least_us:g} us at clock.tick_hz = "
+            f"{profile.clock.tick_hz}, found {profile.exposure.min_us:g}",
+            "give the device's true tick rate, or a longer shortest exposure",
+        )
+
+
+def _check_lease(profile: Profile, fault: _Fault) -> None:
+    lease_us, deadline_us = 1000 * profile.timing.lease_ms, profile.timing.decision_deadline_us
+    if lease_us <= deadline_us:
+        raise fault(
+            ("timing", "lease_ms"),
+            f"timing.lease_ms must be above timing.decision_deadline_us = {deadline_us / 1000:g} ms, "
+            f"found {profile.timing.lease_ms}",
+            "the lease is what the device waits before it goes dark: some hundred ms",
+        )
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"[{name}]" for name in names)

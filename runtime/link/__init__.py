@@ -1,0 +1,1 @@
+"""A port: device URL to stamped bytes to connection."""

@@ -1,0 +1,66 @@
+"""Device URLs -> an open link: bytes in, bytes out, and the clock they are stamped with.
+
+Owns the schemes and what a link is; never looks into the bytes. `open_link` returns a `Link` (link_serial.py, link_usb.py, or a driver
+by entry point, see docs/LINKS.md); link_reader.py reads from any of them.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+from pans.runtime.errors import UsageError
+
+from .serial import SerialLink
+from .usb import UsbLink
+
+
+class Link(Protocol):
+    """An open connection to an instrument; a lab's own driver implements these and an opener (`pans.devices`).
+
+    `read` is called by two threads, never at once, and `write` by one of them, maybe while the other reads.
+    A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again.
+    """
+
+    name: str
+    simulated: bool
+    virtual: bool  # True: time passes only inside `read`, in one thread (the in-process simulator)
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what has arrived, b"" after `timeout_s` without data; LinkError when the link is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`; LinkError when the link is gone."""
+
+    def now_ns(self) -> int:
+        """Return this link's host clock in nanoseconds (monotonic; its zero means nothing)."""
+
+    def close(self) -> None:
+        """Release the port; idempotent."""
+
+
+def open_link(url: str) -> Link:
+    """Open the device that `url` names: `serial:...`, `usb:...`, or a scheme of the entry points `pans.devices` (`sim:` is one).
+
+    Raises UsageError for a URL that cannot be meant and LinkError for a device that cannot be reached.
+    """
+    scheme, colon, rest = url.partition(":")
+    if not colon or not rest:
+        raise UsageError(
+            f"{url!r} is no device URL", remedy="write scheme:target, for example sim:ideal or serial:/dev/ttyACM0"
+        )
+    if scheme == "serial":
+        return SerialLink(rest.removeprefix("//"))
+    if scheme == "usb":
+        return UsbLink(rest)
+    points = {point.name: point for point in entry_points(group="pans.devices")}
+    if scheme not in points:
+        known = ", ".join(sorted({"serial", "usb", *points}))
+        raise UsageError(f"unknown device scheme {scheme!r} in {url!r}", remedy=f"known: {known}")
+    link: Link = points[scheme].load()(url)
+    return link
+
+
+def link_facts(link: Link) -> dict[str, Any]:
+    """Return what a recording should say about the link."""
+    return {"name": link.name, "simulated": link.simulated, "virtual_time": link.virtual}

@@ -1,0 +1,277 @@
+"""A session on an open link: moves bytes between them, and does the steps before arming.
+
+Owns the pump (read, decode, answer, send) and the conversation of set-up: handshake, checks, uploads, clock. Never interprets
+clicks. `pump` returns the stream frames that came, stamped; the set-up calls return when the device has agreed, or raise
+LinkError (it is silent or gone) or DeviceError (it refused).
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.plan import Plan
+from pans.runtime.errors import DeviceError, LinkError
+from pans.runtime.timing.clock import ClockModel, ClockStep
+from pans.runtime.timing.evidence import Evidence, Stamped
+from pans.runtime.wire.commands import (
+    MAX_PIXELS_PER_CHUNK,
+    MAX_SLOTS_PER_CHUNK,
+    MODES,
+    PatternChunk,
+    PlanChunk,
+    pack_pattern,
+    pack_plan,
+)
+from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, Frame, FrameDecoder, MalformedMessage, Opcode, Welcome
+from pans.runtime.wire.session import HostSession
+
+from .base import Link
+from .reader import Chunk, LinkReader
+
+if TYPE_CHECKING:
+    from pans.runtime.wire.bulk import BulkDecoder
+
+NS_PER_S = 1_000_000_000
+# for ARM and GRANT to arrive, one retransmission, and a host that does not run for some 50 ms
+ARM_LEAD_NS = NS_PER_S // 10
+SETUP_POLL_S = 0.02
+CLOCK_BURST = 16
+PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for
+REQUIRED_FACTS = ("tick_hz", "mode", "channels", "levels", "pattern_memory", "pattern_pixels", "slot_memory")
+
+
+class Arrived(NamedTuple):
+    """A frame for the core, or many stream messages of one read (valid until the next `pump`), and when their bytes were read."""
+
+    arrival_ns: int
+    what: Frame | Messages
+
+
+class Connection:
+    """Link, reader, decoder, session and clock of one session; `on_sent` sees every outgoing byte string (for the recording)."""
+
+    def __init__(self, link: Link, on_sent: Callable[[int, bytes], None] | None = None) -> None:
+        self.link = link
+        self.reader = LinkReader(link)
+        self.decoder = FrameDecoder()
+        self.session = HostSession(secrets.randbelow(0xFFFFFFFF) + 1)
+        self.clock: ClockModel | None = None
+        self.clock_steps: list[ClockStep] = []  # since the last look
+        self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
+        self.on_sent = on_sent
+
+    def pump(self, timeout_s: float) -> list[Arrived]:
+        """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
+        self.session.poll(self.link.now_ns())
+        asked = self.flush()
+        stream: list[Arrived] = []
+        began_ns = self.link.now_ns()
+        chunks = self.reader.wait(timeout_s, eager=asked)
+        if self.evidence is not None:
+            self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
+            for chunk in chunks:
+                self.evidence.arrived(chunk.arrival_ns)
+        bulk = self.decoder.bulk
+        for place, chunk in enumerate(chunks):
+            if bulk is None:
+                for frame in self.decoder.feed(chunk.data):
+                    if self.session.on_frame(frame, chunk.arrival_ns):
+                        stream.append(Arrived(chunk.arrival_ns, frame))
+            else:
+                self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
+        if self.clock is not None:
+            while self.session.pongs:
+                pong, arrival_ns = self.session.pongs.popleft()
+                step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
+                if step is not None:
+                    self.clock_steps.append(step)
+                if self.evidence is not None:
+                    reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
+                    self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
+        return stream
+
+    def _digest(self, bulk: BulkDecoder, chunk: Chunk, stream: list[Arrived], *, last: bool) -> None:
+        """Decode a chunk and sort its messages: runs of stream messages stay together; unless they are the `last`, as a copy."""
+        session, arrival_ns = self.session, chunk.arrival_ns
+        parts = bulk.pieces(chunk.data)
+        for number, part in enumerate(parts):
+            spans = bulk.take(part)
+            place, stays = 0, last and number + 1 == len(parts)
+            while place < len(spans):
+                stop = bulk.stream_stop(spans, place, session.nonce)
+                if stop > place:
+                    session.heard_ns = arrival_ns
+                    messages = Messages(bulk.buffer, spans[place:stop])
+                    stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
+                if stop < len(spans):
+                    frame = bulk.frame(*spans[stop].tolist())
+                    if session.on_frame(frame, arrival_ns):
+                        stream.append(Arrived(arrival_ns, frame))
+                place = stop + 1
+
+    def flush(self) -> bool:
+        """Send what the session has to say; return whether that was anything."""
+        data = self.session.take_output()
+        if data:
+            self.link.write(data)
+            if self.on_sent is not None:
+                self.on_sent(self.link.now_ns(), data)
+        return bool(data)
+
+    def handshake(self) -> Welcome:
+        """Open the session and return what the device says of itself; the device leaves SAFE if it was latched there."""
+        self.session.start(self.link.now_ns())
+        while self.session.welcome is None:
+            self.pump(SETUP_POLL_S)
+        welcome = self.session.welcome
+        missing = [key for key in REQUIRED_FACTS if key not in welcome.facts]
+        if missing:
+            raise DeviceError(
+                f"the device's WELCOME lacks {', '.join(missing)}", remedy="see docs/PROTOCOL.md, section 3"
+            )
+        self.clock = ClockModel(int(welcome.facts["tick_hz"]))
+        self.session.submit(Opcode.RESET)
+        self.settle()
+        return welcome
+
+    def settle(self) -> None:
+        """Wait until every command has been acknowledged."""
+        while not self.session.settled:
+            self.pump(SETUP_POLL_S)
+
+    def upload(self, plan: Plan, bundle: Bundle) -> None:
+        """Send the patterns and the plan, and wait until the device has them."""
+        for index, levels in enumerate(bundle.pattern_levels):
+            for first in range(0, len(levels), MAX_PIXELS_PER_CHUNK):
+                part = levels[first : first + MAX_PIXELS_PER_CHUNK]
+                while not self.session.has_room:
+                    self.pump(SETUP_POLL_S)
+                self.session.submit(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, first, len(levels), part)))
+        for chunk in plan_chunks(plan):
+            while not self.session.has_room:
+                self.pump(SETUP_POLL_S)
+            self.session.submit(Opcode.LOAD_PLAN, pack_plan(chunk))
+        self.settle()
+
+    def synchronise(self) -> ClockModel:
+        """Measure the device clock with a burst of probes and return the model; LinkError when none is answered."""
+        clock = self.known_clock()
+        for _ in range(CLOCK_BURST):
+            wanted = clock.n_probes + 1
+            now_ns = self.link.now_ns()
+            self.session.probe(now_ns)
+            while clock.n_probes < wanted and self.link.now_ns() - now_ns < PROBE_GIVE_UP_NS:
+                self.pump(SETUP_POLL_S)
+        if clock.n_probes == 0:
+            raise LinkError("the device answered no clock probe", remedy="check that its firmware answers PING")
+        return clock
+
+    def known_clock(self) -> ClockModel:
+        """Return the clock model, which exists from the handshake on; LinkError before it."""
+        if self.clock is None:
+            raise LinkError("the device's clock is not known before the handshake")
+        return self.clock
+
+    def detach(self) -> None:
+        """Stop reading and leave the link as it is, for whoever opens it again."""
+        self.reader.stop()
+
+    def close(self) -> None:
+        """Close the link and its reader."""
+        self.reader.close()
+
+
+def plan_chunks(plan: Plan) -> list[PlanChunk]:
+    """Return the plan as LOAD_PLAN bodies."""
+    slots = np.zeros(plan.slots_per_cycle, SLOT_DTYPE)
+    slots["offset_ticks"] = plan.slot_offset_ticks
+    slots["pattern"] = plan.slot_pattern
+    slots["shot"] = plan.slot_shot
+    return [
+        PlanChunk(
+            MODES[plan.mode],
+            plan.n_patterns,
+            len(slots),
+            first,
+            plan.exposure_ticks,
+            plan.slot_period_ticks,
+            plan.cycle_ticks,
+            plan.block_exposures,
+            plan.cycles_per_object,
+            slots[first : first + MAX_SLOTS_PER_CHUNK],
+        )
+        for first in range(0, len(slots), MAX_SLOTS_PER_CHUNK)
+    ]
+
+
+def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
+    """Raise DeviceError when what the device says of itself cannot carry out the plan."""
+    limits = [
+        ("pattern memory (patterns)", bundle.n_shown, int(facts["pattern_memory"])),
+        ("pixels of a pattern", bundle.n_pixels, int(facts["pattern_pixels"])),
+        ("projector levels", bundle.levels, int(facts["levels"])),
+        ("slot memory (slots)", plan.slots_per_cycle, int(facts["slot_memory"])),
+        ("detectors", bundle.n_features if plan.mode == "parallel" else 1, int(facts["channels"])),
+    ]
+    for what, needed, held in limits:
+        if needed > held:
+            raise DeviceError(
+                f"the device's {what}: {held}, needed {needed}", remedy="use a device or a bundle that fits"
+            )
+    _check_optics(facts, bundle)
+    if facts["mode"] != plan.mode:
+        raise DeviceError(f"the device measures in {facts['mode']} mode, the profile says {plan.mode}")
+    if int(facts["tick_hz"]) != tick_hz:
+        raise DeviceError(
+            f"the device counts {facts['tick_hz']} ticks per second, the profile says {tick_hz}",
+            remedy="give the profile of this device with --profile",
+        )
+
+
+def _check_optics(facts: Any, bundle: Bundle) -> None:
+    """A device may say which passive optics it looks through (their fingerprint); it must then be the bundle's."""
+    held = facts.get("optics_sha256")
+    wanted = None if bundle.analyser is None else bundle.analyser.fingerprint
+    if (held is None and facts.get("simulated") is not True) or held == wanted:
+        return
+    has = "a projector and no passive optics" if held is None else f"passive optics {str(held)[:12]}"
+    needs = "a projector" if wanted is None else f"passive optics {wanted[:12]}"
+    raise DeviceError(
+        f"the device has {has}, {bundle.name} needs {needs}",
+        remedy="a simulated instrument gets the optics of a bundle by optics=BUNDLE.pans in its URL",
+    )
+
+
+def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:
+    """Invert `plan_chunks`: the plan that a device was sent; MalformedMessage when slots are missing."""
+    if not chunks:
+        raise MalformedMessage("no plan was sent to the device")
+    slots = np.zeros(chunks[-1].n_slots, SLOT_DTYPE)
+    covered = 0
+    for chunk in chunks:
+        slots[chunk.first_slot : chunk.first_slot + len(chunk.slots)] = chunk.slots
+        covered += len(chunk.slots)
+    head = chunks[-1]
+    if covered < len(slots):
+        raise MalformedMessage(f"{covered} of {len(slots)} slots of the plan were sent")
+    lit = slots["pattern"] != DARK_PATTERN
+    return Plan(
+        mode={number: mode for mode, number in MODES.items()}[head.mode],
+        n_patterns=head.n_patterns,
+        slot_offset_ticks=slots["offset_ticks"].astype(np.int64),
+        slot_pattern=slots["pattern"].copy(),
+        slot_shot=slots["shot"].copy(),
+        exposure_ticks=head.exposure_ticks,
+        slot_period_ticks=head.slot_period_ticks,
+        cycle_ticks=head.cycle_ticks,
+        shots_per_cycle=int(slots["shot"][lit].max()) + 1,
+        cycles_per_object=head.cycles_per_object,
+        block_exposures=head.block_exposures,
+        exposure_us=head.exposure_ticks * 1e6 / tick_hz,
+    )

@@ -1,0 +1,158 @@
+"""Stamped chunks from a link: the loop reads for itself while it waits, and a thread stands in while the loop is busy.
+
+Owns who reads, the queue between the two, and the reader's death; never looks into the bytes. A hand-over between threads costs more
+than a round trip to the instrument, so whoever waits for bytes reads them: `wait` takes the one chair before the link. Away
+from it for longer than LOOK_EVERY_S, the loop finds the stand-in reading into the queue, which gives the chair back when `wait`
+is called. Every chunk is stamped right after its read by whoever read it, and one reader at a time keeps their order.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from .base import Link
+
+LOOK_EVERY_S = 0.002  # how often the stand-in looks whether the loop has left
+STAND_IN_POLL_S = 0.005  # and how long it may keep a loop that has come back from the chair, if nothing arrives
+EAGER_NS = 200_000
+MAX_QUEUED_BYTES = 1 << 24
+
+
+class Chunk(NamedTuple):
+    """Bytes as they came from the link, with the host time at which they were there."""
+
+    arrival_ns: int
+    data: bytes
+
+
+class LinkReader:
+    """Stamped chunks from a link; a thread stands in for a busy loop, unless the link's time is virtual.
+
+    The queue is bounded by MAX_QUEUED_BYTES: above it the stand-in stops reading, so that the transport and then the receive
+    window hold the device back. The end of a link, or of the thread, is kept and raised by every further `wait`.
+    """
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._chair = threading.Lock()  # whoever holds it reads the link
+        self._chunks: deque[Chunk] = deque()
+        self._queued_bytes = 0
+        self._ready = threading.Condition()
+        self._death: BaseException | None = None
+        self._away = True  # the loop, from the chair
+        self._visits = 0  # of the loop to the chair
+        self._standing_in = False
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+        if not link.virtual:
+            self._thread = threading.Thread(target=self._watch, name="pans-link-reader", daemon=True)
+            self._thread.start()
+
+    @property
+    def thread_id(self) -> int | None:
+        """Native id of the stand-in's thread, for the scheduler; None without one."""
+        return None if self._thread is None else self._thread.native_id
+
+    def wait(self, timeout_s: float, *, eager: bool = False) -> list[Chunk]:
+        """Return the chunks that are there, waiting at most `timeout_s` for the first; LinkError when the link is gone.
+
+        `eager` when an answer is due at once: the first EAGER_NS are waited awake, since falling asleep and waking take
+        about as long as the answer itself.
+        """
+        self._away = False
+        self._visits += 1
+        try:
+            if self._chair.acquire(blocking=False):
+                try:
+                    if not self._chunks and self._death is None:
+                        data = self._read_awake() if eager and self._thread is not None else b""
+                        data = data or self._link.read(timeout_s)
+                        return [Chunk(self._link.now_ns(), data)] if data else []
+                except Exception as error:
+                    self._death = error
+                    raise
+                finally:
+                    self._chair.release()
+            return self._queued(timeout_s)
+        finally:
+            self._away = True
+
+    def stop(self) -> None:
+        """Stop the thread; the link stays as it is."""
+        self._stopping = True
+        if self._thread is not None and self._thread is not threading.current_thread():
+            with self._ready:
+                self._ready.notify_all()
+            self._thread.join(timeout=2.0)
+
+    def close(self) -> None:
+        """Stop the thread and close the link."""
+        self.stop()
+        self._link.close()
+
+    def _read_awake(self) -> bytes:
+        link = self._link
+        until_ns = link.now_ns() + EAGER_NS
+        while not (data := link.read(0.0)) and link.now_ns() < until_ns:
+            pass
+        return data
+
+    def _queued(self, timeout_s: float) -> list[Chunk]:
+        """Take what the stand-in has read, or is about to; nothing as soon as it has given the chair back."""
+        deadline_s = time.monotonic() + timeout_s
+        with self._ready:
+            while self._standing_in and not self._chunks and self._death is None:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0:
+                    break
+                self._ready.wait(left_s)
+            chunks = list(self._chunks)
+            self._chunks.clear()
+            self._queued_bytes = 0
+            self._ready.notify_all()
+        if not chunks and self._death is not None:
+            raise self._death
+        return chunks
+
+    def _watch(self) -> None:
+        seen = -1
+        try:
+            while not self._stopping:
+                time.sleep(LOOK_EVERY_S)
+                if self._away and self._visits == seen:
+                    self._stand_in()
+                seen = self._visits
+        except BaseException as error:  # whatever ends the thread must end the run loudly, not leave it waiting
+            with self._ready:
+                self._death = error
+                self._standing_in = False
+                self._ready.notify_all()
+
+    def _stand_in(self) -> None:
+        """Read until the loop is back."""
+        self._standing_in = True  # before the chair is taken: who finds it taken may wait
+        try:
+            if self._chair.acquire(blocking=False):
+                try:
+                    while self._away and not self._stopping:
+                        data = self._link.read(STAND_IN_POLL_S)
+                        if data:
+                            self._put(Chunk(self._link.now_ns(), data))
+                finally:
+                    self._chair.release()
+        finally:
+            with self._ready:
+                self._standing_in = False
+                self._ready.notify_all()
+
+    def _put(self, chunk: Chunk) -> None:
+        with self._ready:
+            while self._queued_bytes > MAX_QUEUED_BYTES and not self._stopping:
+                self._ready.wait(STAND_IN_POLL_S)
+            self._chunks.append(chunk)
+            self._queued_bytes += len(chunk.data)
+            self._ready.notify_all()

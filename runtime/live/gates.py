@@ -1,0 +1,227 @@
+"""Acting on decisions: pulses at absolute device ticks, on time or not at all.
+
+Owns the queue of pulses that wait for room in the session, what became of each, and the actuators other than the instrument's own output.
+Never decides. A pulse whose tick has passed, or will have before the command can be there, is not sent: it expires, as an event. What is
+acted upon is on record before its command leaves. The instrument refuses what comes too late; that is an event too.
+
+`--act` may name a second instrument (second_device.py): a pulse's tick is then converted to the host's time and on to the other
+clock's tick, and what both conversions may be off stands in the event beside it. An actuator of a laboratory's own is found by
+entry point (`pans.actuators`): a function from the URL's rest to an object with `fire` and `close`, see docs/FLOW.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+from pans.runtime.core.follower import Action
+from pans.runtime.errors import DeviceError, LinkError, UsageError
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.timing.clock import ClockModel
+from pans.runtime.wire.commands import Gate, pack_gate
+from pans.runtime.wire.messages import Opcode
+from pans.runtime.wire.session import COMMAND_WINDOW, HostSession
+
+from .journal import Journal
+from .second_device import SecondInstrument
+
+GROUP = "pans.actuators"
+OWN = "device"
+DEVICES = "pans.devices"
+LINKS = ("serial", "tcp", "usb")
+MAX_WAITING = 4096
+FREE_COMMANDS = 2  # of the command window, for what is not a pulse
+
+
+class Actuator(Protocol):
+    """Something that makes a pulse at a time of the host's clock."""
+
+    def fire(self, at_ns: int, duration_us: float, channel: int) -> str:
+        """Arrange a pulse at `at_ns` (time.perf_counter_ns) and return at once: "" when it will be made, else why not."""
+
+    def close(self) -> None:
+        """Let go of the hardware; nothing is pulsed afterwards."""
+
+
+@dataclass(slots=True)
+class GateCounters:
+    """What became of the pulses that decisions asked for; what is none of the other three is not known yet."""
+
+    asked: int = 0
+    done: int = 0  # accepted before their tick
+    refused: int = 0  # by the instrument or the actuator
+    expired: int = 0  # not sent: it would have been late
+
+
+class GateDesk:
+    """Takes actions from outputs and gets them done within the session's window; `failed` is told the decision of each that was not."""
+
+    def __init__(self, recorder: AnyRecorder | None, journal: Journal) -> None:
+        self.counters = GateCounters()
+        self.actuator: Actuator | None = None  # None: a GATE command, to the instrument itself or to the second one
+        self.second: SecondInstrument | None = None
+        self._lost = ""  # why the second instrument is gone
+        self.failed: Callable[[int], None] = lambda number: None
+        self._recorder, self._journal = recorder, journal
+        self._waiting: deque[Action] = deque()
+        self._sent: deque[tuple[int, Action]] = deque()  # command id, action
+        self._session: HostSession | None = None
+
+    def take(self, actions: Iterable[Action]) -> None:
+        """Queue pulses; beyond MAX_WAITING the oldest expires."""
+        for action in actions:
+            self.counters.asked += 1
+            self._waiting.append(action)
+        while len(self._waiting) > MAX_WAITING:
+            self._expire(self._waiting.popleft(), "too many pulses wait")
+
+    def turn(self, session: HostSession, clock: ClockModel, now_ns: int) -> bool:
+        """Note what the device has answered and submit what there is room for; return whether there is something to send at once."""
+        if self.second is not None:
+            self._turn_second(self.second, now_ns)
+        if not self._waiting and not self._sent:
+            return False
+        target = session if self.second is None else self.second.connection.session
+        self._collect(target)
+        now_tick = clock.to_tick(now_ns)
+        first = True
+        while self._waiting:
+            action = self._waiting[0]
+            if action.tick <= now_tick:
+                late_us = (now_tick - action.tick) * 1e6 / clock.tick_hz
+                self._expire(self._waiting.popleft(), f"its time passed {late_us:.0f} us before it could be sent")
+                continue
+            if self.actuator is None and target.in_flight >= COMMAND_WINDOW - FREE_COMMANDS:
+                break
+            if first and self._recorder is not None:
+                self._recorder.flush_decisions()
+            first = False
+            self._do(self._waiting.popleft(), session, clock)
+        return not first
+
+    def finish(self, session: HostSession) -> None:
+        """The run is over: what was answered counts, what waits expires, what has no answer was refused as far as is known."""
+        if self.second is not None:
+            if not self._lost:
+                try:
+                    self.second.finish()
+                except (LinkError, DeviceError) as error:
+                    self._lose_second(error)
+            session = self.second.connection.session
+        self._collect(session)
+        for _, action in self._sent:
+            self._refuse(action, "no answer before the end of the run")
+        self._sent.clear()
+        while self._waiting:
+            self._expire(self._waiting.popleft(), "the run ended")
+
+    def _do(self, action: Action, session: HostSession, clock: ClockModel) -> None:
+        if self.actuator is None and self.second is None:
+            body = pack_gate(Gate(action.tick, action.duration_ticks, action.channel))
+            self._session = session
+            self._sent.append((session.submit(Opcode.GATE, body, may_be_refused=True), action))
+            return
+        at_ns, uncertainty_ns = clock.to_host_ns(action.tick)
+        if self.second is not None:
+            self._send_on(self.second, action, at_ns, uncertainty_ns, action.duration_ticks * 1e6 / clock.tick_hz)
+            return
+        assert self.actuator is not None
+        reason = self.actuator.fire(at_ns, action.duration_ticks * 1e6 / clock.tick_hz, action.channel)
+        self._journal.event({"kind": "fired", "decision": action.number, "tick": action.tick, "refusal": reason})
+        if reason:
+            self._refuse(action, reason)
+        else:
+            self.counters.done += 1
+
+    def _send_on(
+        self, second: SecondInstrument, action: Action, at_ns: int, uncertainty_ns: int, duration_us: float
+    ) -> None:
+        """Let the second instrument pulse at `at_ns` of the host's clock, which is known to `uncertainty_ns`."""
+        if self._lost:
+            self._refuse(action, self._lost)
+            return
+        try:
+            sent = second.submit(at_ns, duration_us, action.channel)
+        except (LinkError, DeviceError) as error:
+            self._lose_second(error)
+            self._refuse(action, self._lost)
+            return
+        self._session = second.connection.session
+        self._sent.append((sent.command_id, action))
+        off_ns = uncertainty_ns + sent.uncertainty_ns
+        second.worst_uncertainty_ns = max(second.worst_uncertainty_ns, off_ns)
+        facts = {"host_ns": at_ns, "second_tick": sent.tick, "uncertainty_us": off_ns / 1000}
+        self._journal.event({"kind": "gate_sent", "decision": action.number, "tick": action.tick, **facts})
+
+    def _turn_second(self, second: SecondInstrument, now_ns: int) -> None:
+        if self._lost:
+            return
+        try:
+            second.turn(now_ns, waits=bool(self._sent))
+        except (LinkError, DeviceError) as error:
+            self._lose_second(error)
+
+    def _lose_second(self, error: LinkError | DeviceError) -> None:
+        """The second instrument is gone: the run goes on, and every pulse is refused from here on."""
+        self._lost = f"the second instrument was lost: {error.message}"
+        self._journal.event({"kind": "actuator_lost", "words": self._lost})
+        for _, action in self._sent:
+            self._refuse(action, self._lost)
+        self._sent.clear()
+
+    def _collect(self, session: HostSession) -> None:
+        """Match acknowledgements with pulses, in the order of their commands."""
+        if self._session is not None and session is not self._session:  # the old session took its answers with it
+            for _, action in self._sent:
+                self._refuse(action, "the link was lost before the device answered")
+            self._sent.clear()
+        refusals = {}
+        while session.refusals:
+            refusal = session.refusals.popleft()
+            refusals[refusal.command_id] = refusal
+        while self._sent and self._sent[0][0] <= session.answered:
+            command_id, action = self._sent.popleft()
+            if command_id in refusals:
+                self._refuse(action, refusals.pop(command_id).text)
+            else:
+                self.counters.done += 1
+        for refusal in refusals.values():
+            self._journal.event({"kind": "gate_refused", **refusal._asdict()})
+
+    def _refuse(self, action: Action, why: str) -> None:
+        self.counters.refused += 1
+        self._journal.event({"kind": "gate_refused", "decision": action.number, "tick": action.tick, "text": why})
+        self.failed(action.number)
+
+    def _expire(self, action: Action, why: str) -> None:
+        self.counters.expired += 1
+        self._journal.event({"kind": "gate_expired", "decision": action.number, "tick": action.tick, "text": why})
+        self.failed(action.number)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counters by name."""
+        return asdict(self.counters)
+
+
+def open_actuator(url: str, profile: Profile) -> Actuator | SecondInstrument | None:
+    """Return what `url` names: None for the instrument's own output, an actuator (NAME or NAME:REST), or a second instrument.
+
+    That is one of `profile` behind a device URL (`tcp:HOST:PORT` too). UsageError for an unknown one, LinkError for a port that
+    cannot be opened.
+    """
+    name, _, rest = url.partition(":")
+    if name == OWN:
+        return None
+    found = {point.name: point for point in entry_points(group=GROUP)}
+    if name in found:
+        actuator: Actuator = found[name].load()(rest)
+        return actuator
+    links = {*LINKS, *(point.name for point in entry_points(group=DEVICES))}
+    if name not in links:
+        names = ", ".join([OWN, *sorted(found), *(f"{link}:..." for link in sorted(links))])
+        raise UsageError(f"no actuator {name!r}, known: {names}", remedy=f"offer one by the entry point group {GROUP}")
+    return SecondInstrument.open(url, profile)

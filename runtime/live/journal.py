@@ -1,0 +1,60 @@
+"""What a live run notes beside its clicks: events, the session it belongs to, the clock's probes and jumps, refused gates.
+
+Owns the short list of events that a summary shows and the way of all of them into the recording; never judges one. Without a
+recorder only the list is kept.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from pans.runtime.link.connection import Connection
+from pans.runtime.record.parts_writer import AnyRecorder
+
+MAX_EVENTS = 1000  # of the summary; the recording has them all
+MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
+TROUBLE = ("blame", "gap", "link_lost", "clock_step", "gate_refused", "parts_trouble", "beyond_plan")
+
+
+class Journal:
+    """The notes of one run, across reconnections."""
+
+    def __init__(self, recorder: AnyRecorder | None) -> None:
+        self.events: list[dict[str, Any]] = []
+        self.trouble: dict[str, Any] | None = None  # the latest
+        self.recorder = recorder
+        self._kept: Counter[str] = Counter()
+
+    def event(self, event: dict[str, Any]) -> None:
+        """Note one event: a map with its `kind` and what belongs to it, units in the keys."""
+        kind = event["kind"]
+        if kind in TROUBLE:
+            self.trouble = event
+        if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
+            self._kept[kind] += 1
+            self.events.append(event)
+        if self.recorder is not None:
+            self.recorder.add_event(event)
+
+    def session(self, connection: Connection) -> None:
+        """Note which session and device clock the following ticks belong to."""
+        welcome = connection.session.welcome
+        facts = {} if welcome is None else welcome.facts
+        self.event({"kind": "session", "nonce": connection.session.nonce, "epoch": str(facts.get("epoch", "unknown"))})
+        self.clock(connection)
+
+    def clock(self, connection: Connection) -> None:
+        """Note the probes and the jumps of the device's clock since the last time."""
+        for step in connection.clock_steps:
+            self.event({"kind": "clock_step", "tick": step.tick, "off_ns": step.off_ns, "allowed_ns": step.allowed_ns})
+        connection.clock_steps.clear()
+        samples = connection.known_clock().take_samples()
+        if self.recorder is not None and len(samples):
+            self.recorder.add_clock(samples)
+
+    def refusals(self, connection: Connection) -> None:
+        """Note the gates that the device has refused."""
+        refusals = connection.session.refusals
+        while refusals:
+            self.event({"kind": "gate_refused", **refusals.popleft()._asdict()})

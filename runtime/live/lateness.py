@@ -1,0 +1,94 @@
+"""What a live run does about late work: wakes when a block is overdue, asks the device then, and closes incidents with a verdict.
+
+Owns the witnesses of one run (evidence.py) and when they are heard; the judgement is blame.py's, late decisions are counted by timing.py.
+`settled` returns the verdicts that are ready as events for the recording. Costs a block one comparison and one short call.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pans.runtime.core.plan import Plan
+from pans.runtime.link.base import Link
+from pans.runtime.link.connection import Connection
+from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.timing.attribution import Incidents, LateWork
+from pans.runtime.timing.evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
+from pans.runtime.wire.messages import Status
+
+POLL_S = 0.02
+LEAST_SLACK_NS = 500_000
+LEAST_WAIT_S = 0.0002
+
+
+class Lateness:
+    """The witnesses of one run, across reconnections; `attach` before each ARM, `close` at the end."""
+
+    def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: AnyRecorder | None) -> None:
+        pause_ns = longest_pause_ns(plan)
+        self.evidence = Evidence(link.now_ns, deadline_ns, pause_ns=pause_ns, virtual=link.virtual)
+        self.incidents = Incidents(self.evidence)
+        self.block_ns = 0  # when the latest block came
+        self._patience_ns = pause_ns + max(deadline_ns // 2, LEAST_SLACK_NS)
+        self._asked = True  # the device, in the silence under way
+        self._damaged = 0
+        if recorder is not None and not link.virtual:
+            recorder.watch_write = self._wrote
+
+    def attach(self, connection: Connection, start_ns: int) -> None:
+        """Hear the witnesses of `connection` from here on; its exposures begin at `start_ns`."""
+        connection.evidence = self.evidence
+        self.evidence.watch([connection.reader.thread_id])
+        self.block_ns, self._asked, self._damaged = start_ns, False, 0
+
+    def close(self) -> None:
+        """Let the witnesses go; idempotent."""
+        self.evidence.close()
+
+    # -- during a turn -------------------------------------------------------------------------------------------------
+
+    def poll_s(self, now_ns: int) -> float:
+        """How long to wait for bytes: until the next block is overdue. Waking then shows that the host was awake."""
+        if self._asked:
+            return POLL_S
+        return min(POLL_S, max((self.block_ns + self._patience_ns - now_ns) / NS_PER_S, LEAST_WAIT_S))
+
+    def stepped(self, begin_ns: int, end_ns: int) -> None:
+        """Note how long the core took over one frame."""
+        self.evidence.worked(INFERENCE, begin_ns, end_ns)
+
+    def block_came(self, arrival_ns: int) -> None:
+        """Note that the stream goes on."""
+        self.block_ns, self._asked = arrival_ns, False
+
+    def status_came(self, connection: Connection, status: Status, arrival_ns: int) -> None:
+        """Note a STATUS: it says when it left the device."""
+        left_ns, _ = connection.known_clock().to_host_ns(status.tick)
+        self.evidence.stamped(Stamped(None, None, left_ns, arrival_ns))
+
+    def late(self, number: int, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> None:
+        """Take a late decision with its times, as `TimingLedger.judge` did."""
+        self.incidents.late(LateWork(number, marks_ns[0], marks_ns[1], marks_ns[3], uncertainty_ns))
+
+    def lost(self, gap: dict[str, Any], connection: Connection, now_ns: int) -> dict[str, Any]:
+        """Return the verdict on exposures that never came."""
+        counters = connection.decoder.counters
+        damaged = counters.crc_errors + counters.cobs_errors + counters.short_frames + counters.oversized_frames
+        event = self.incidents.lost(gap, min(self.block_ns, now_ns), now_ns, damaged - self._damaged)
+        self._damaged = damaged
+        return event
+
+    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> dict[str, Any] | None:
+        """Do what is due after a turn that brought something, or nothing (`idle`); return a verdict that is ready."""
+        if idle and not self._asked and now_ns >= self.block_ns + self._patience_ns:
+            connection.session.probe(now_ns)  # is the link open while the block is overdue?
+            self._asked = True
+        self.evidence.read_if_stale(now_ns)
+        return self.incidents.verdict(now_ns)
+
+    def last_words(self, now_ns: int) -> list[dict[str, Any]]:
+        """Return the verdicts on what the end of the run cuts short."""
+        return list(iter(lambda: self.incidents.verdict(now_ns, final=True), None))
+
+    def _wrote(self, begin_ns: int, end_ns: int) -> None:
+        self.evidence.worked(DISK, begin_ns, end_ns)

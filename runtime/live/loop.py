@@ -1,0 +1,212 @@
+"""The live loop: from an open device to timed, recorded decisions. One screen, in the order in which data flows.
+
+    handshake -> check -> upload -> clock -> [arm] -> pump -> core.step -> judge the timing -> record -> show -> ... -> stop -> close
+                     ^----------- come back (bounded) <---- the link broke, the device fell silent or went dark
+
+Owns the order of things and the ends of a run; a turn is live_run.py's, an outage outage.py's, and the physics, the protocol and the
+decisions live in the modules that they call. `run_live` returns a `RunResult`, also when the link is lost for good (`link_lost`); a
+device that cannot be armed raises LinkError. However a run ends, the device is told to stop; one that cannot be told goes dark when
+its lease runs out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.dark_guard import DarkGuard
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
+from pans.runtime.errors import LinkError, RecordingError
+from pans.runtime.instrument.click_law import click_law, click_probability
+from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.link.base import Link, link_facts
+from pans.runtime.link.connection import Connection, check_device
+from pans.runtime.link.recovery import Recovery
+from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.timing.cpu import kept_awake
+from pans.runtime.timing.ledger import TimingLedger, arm_realtime
+
+from .outage import come_back
+from .run import LiveCore as LiveCore
+from .run import LiveRun as LiveRun
+from .run import Watcher as Watcher
+from .signals import INTERRUPTED, Stop
+from .tally import RunTally
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """What to run: `shots` per decision, how many cycles (0: until `seconds` have passed or the device stops).
+
+    `started_ns` is the time from which "armed after" counts, on time.perf_counter_ns (0: from the call of run_live).
+    """
+
+    shots: int = 1
+    n_cycles: int = 0
+    seconds: float = 0.0
+    deadline_us: float = 0.0
+    lease_ms: int = 1000
+    realtime: bool = True
+    started_ns: int = 0
+    core: int | None = None  # that the loop is bound to, and kept awake
+
+
+@dataclass(frozen=True, slots=True)
+class Onlookers:
+    """Who looks on: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
+
+    watch: Watcher | None = None
+    prepared: Callable[[LiveRun], None] | None = None
+    stop: Stop | None = None
+
+
+NOBODY = Onlookers()
+
+
+@dataclass(slots=True)
+class RunResult:
+    """Everything a report needs; figures are measured, none is inferred from the configuration."""
+
+    tally: RunTally
+    timing: TimingLedger
+    dark: DarkReport
+    stream: dict[str, int]
+    decoder: dict[str, int]
+    clock: dict[str, Any]
+    realtime: dict[str, Any]
+    device: dict[str, Any]
+    slot_jitter_us: float
+    wrong_patterns: int
+    armed_after_s: float
+    seconds: float
+    ended: str
+    link_lost: bool
+    reconnects: int = 0
+    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
+    lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
+    decisions_sha256: str = ""
+    events: list[dict[str, Any]] = field(default_factory=list)
+
+
+def run_live(
+    link: Link,
+    profile: Profile,
+    bundle: Bundle,
+    plan: Plan,
+    core: LiveCore,
+    config: RunConfig,
+    recorder: AnyRecorder | None = None,
+    recovery: Recovery | None = None,
+    onlookers: Onlookers = NOBODY,
+) -> RunResult:
+    """Run `plan` on the device behind `link` and let `core` decide until it is done; see the module's docstring.
+
+    `recovery` says how to come back when the device is lost; without it the run ends there.
+    """
+    started_ns = config.started_ns or time.perf_counter_ns()
+    on_sent = None if recorder is None else recorder.add_command
+
+    def prepare(opened: Link) -> Connection:
+        """Open a session, check that it is the right device, and bring it to where ARM can follow."""
+        connection = Connection(opened, on_sent)
+        try:
+            facts = connection.handshake().facts
+            check_device(facts, plan, bundle, profile.clock.tick_hz)
+            connection.upload(plan, bundle)
+            connection.synchronise()
+            connection.decoder.use_kernels()
+        except BaseException:
+            connection.detach()
+            raise
+        return connection
+
+    try:
+        connection = prepare(link)
+    except BaseException:
+        link.close()
+        raise
+    run = LiveRun(connection, plan, core, len(bundle.classes), config, recorder, started_ns)
+    try:
+        core.warm_up()
+        reader = connection.reader.thread_id
+        wanted = config.realtime and not link.virtual
+        with (
+            kept_awake(None if link.virtual else config.core) as awake,
+            arm_realtime(wanted, [] if reader is None else [reader]) as granted,
+        ):
+            run.realtime = granted | awake
+            try:
+                if onlookers.prepared is not None:
+                    onlookers.prepared(run)
+                run.arm()
+                _until_ended(run, recovery, prepare, onlookers)
+            except KeyboardInterrupt as interrupt:
+                run.ended = str(interrupt) or INTERRUPTED
+            except RecordingError:
+                run.drop_recorder()
+                raise
+            finally:  # whatever went wrong: light off first
+                run.stop()
+        return _result(run, profile)
+    finally:
+        run.connection.close()
+
+
+def _until_ended(
+    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], onlookers: Onlookers
+) -> None:
+    stop = onlookers.stop or Stop()
+    while not run.ended:
+        try:
+            stop.polled = True
+            run.turn(onlookers.watch)
+            run.ended = run.ended or stop.word
+            stop.polled = False
+        except LinkError as error:
+            stop.polled = False
+            if recovery is None:
+                run.lose_link(error)
+            else:
+                come_back(run, error, recovery, prepare)
+
+
+def _result(run: LiveRun, profile: Profile) -> RunResult:
+    """Return the run's figures."""
+    run.count_decoded()
+    welcome = run.connection.session.welcome
+    facts = dict({} if welcome is None else welcome.facts)
+    device = facts | link_facts(run.connection.link)
+    # a simulator behind an ordinary port says so itself
+    device["simulated"] = bool(device["simulated"] or facts.get("simulated"))
+    dark = DarkMonitor(float(click_probability(click_law(profile, run.plan.exposure_us), 0.0)))
+    tallies, stream = run.core.tallies, run.core.tracker.counters
+    found = dark.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
+    guard: DarkGuard | None = getattr(run.core, "guard", None)
+    fit = run.connection.known_clock().fit
+    return RunResult(
+        tally=run.tally,
+        timing=run.timing,
+        dark=found if guard is None else guard.report(found),
+        stream={name: getattr(stream, name) for name in stream.__slots__},
+        decoder=dict(run.decoded),
+        clock={} if fit is None else {"drift_ppm": fit.drift_ppm, "uncertainty_us": fit.uncertainty_ns / 1000},
+        realtime=run.realtime,
+        device=device,
+        slot_jitter_us=run.core.jitter_ticks * run.plan.tick_us,
+        wrong_patterns=int(tallies[WRONG_PATTERNS]),
+        armed_after_s=run.armed_after_s,
+        seconds=(run.now_ns() - run.start_ns) / NS_PER_S,
+        ended=run.ended,
+        link_lost=run.link_lost,
+        reconnects=run.reconnects,
+        late_cause=dict(run.lateness.incidents.causes),
+        lost_cause=dict(run.lateness.incidents.missing),
+        events=run.journal.events,
+    )

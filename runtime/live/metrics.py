@@ -1,0 +1,98 @@
+"""The run's figures for Prometheus: a small HTTP server that answers with the same picture as the state file.
+
+Owns names, types and the address; the figures are state_file.py's. On this machine only, unless another address is given: there is no
+password. Needs the extra `metrics`; its server runs in a thread of its own, and an answer costs the loop what that thread's Python does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from pans.runtime.errors import UsageError
+
+LOOPBACK = "127.0.0.1"
+# picture key -> (metric, counts up, help)
+FIGURES = {
+    "decisions": ("pans_decisions", True, "Decisions made"),
+    "late": ("pans_late_decisions", True, "Decisions later than the deadline"),
+    "lost_exposures": ("pans_lost_exposures", True, "Exposures that never came"),
+    "gaps": ("pans_gaps", True, "Gaps in the stream"),
+    "exposures": ("pans_exposures", True, "Exposures received"),
+    "reconnects": ("pans_reconnects", True, "Times the device was lost and found again"),
+    "dark_exposures": ("pans_dark_exposures", True, "Exposures without light"),
+    "dark_clicks": ("pans_dark_clicks", True, "Clicks in exposures without light"),
+    "latency_p99_us": ("pans_latency_p99_microseconds", False, "Exposure end to decision, 99 % quantile of the run"),
+    "latency_max_us": ("pans_latency_max_microseconds", False, "Exposure end to decision, longest of the run"),
+    "rss_bytes": ("pans_resident_memory_bytes", False, "Resident memory"),
+    "handles": ("pans_open_handles", False, "Open file handles"),
+    "threads": ("pans_threads", False, "Threads"),
+    "uptime_s": ("pans_uptime_seconds", False, "Since the start of the command"),
+    "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
+}
+CAUSES = {
+    "late_cause": ("pans_late_decisions_by_cause", "Late decisions by who is to blame"),
+    "lost_cause": ("pans_lost_exposures_by_cause", "Lost exposures by who is to blame"),
+}
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Read `PORT`, `HOST:PORT` or `[HOST]:PORT`; a port alone means this machine only."""
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]") if colon else ""
+    if not port.isdecimal() or not 0 <= int(port) <= 65535:
+        raise UsageError(f"--metrics {text!r}: no address", remedy="write 127.0.0.1:PORT, for example 127.0.0.1:9464")
+    return host or LOOPBACK, int(port)
+
+
+class Collector:
+    """What prometheus_client asks for figures, at each scrape."""
+
+    def __init__(self, look: Callable[[], dict[str, Any]]) -> None:
+        self._look = look
+
+    def collect(self) -> Iterator[Any]:
+        """Yield one family for each figure that the picture holds."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        picture = self._look()
+        for key, (name, counts, words) in FIGURES.items():
+            if key in picture:
+                yield (CounterMetricFamily if counts else GaugeMetricFamily)(name, words, value=picture[key])
+        for key, (name, words) in CAUSES.items():
+            family = CounterMetricFamily(name, words, labels=["cause"])
+            for cause, count in picture.get(key, {}).items():
+                family.add_metric([cause], count)
+            yield family
+        running = GaugeMetricFamily("pans_running", "1 while the device measures")
+        running.add_metric([], float(picture.get("state") == "running"))
+        yield running
+
+
+class MetricsServer:
+    """Serves the figures until `close`; `port` is the one that was given, or found for port 0."""
+
+    def __init__(self, address: str, look: Callable[[], dict[str, Any]]) -> None:
+        host, port = parse_address(address)
+        try:
+            from prometheus_client import CollectorRegistry, start_http_server
+        except ImportError as error:
+            raise UsageError(
+                "--metrics needs prometheus-client, which is not installed",
+                remedy="pip install 'pans-runtime[metrics]'",
+            ) from error
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(Collector(look))
+        try:
+            self._server, self._thread = start_http_server(port, addr=host, registry=registry)
+        except OSError as error:
+            raise UsageError(
+                f"--metrics {address}: cannot listen there: {error.strerror or error}", remedy="choose another port"
+            ) from error
+        self.host, self.port = host, int(self._server.server_port)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

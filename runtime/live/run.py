@@ -1,0 +1,329 @@
+"""One live run in progress, turn by turn: wait for bytes, decide on them, judge the time, record, renew the lease.
+
+Owns the state of a run while it lives and what is due in a turn; the order of a whole run is loop.py's, its outages are outage.py's, and
+what a frame means is the core's. Any core with the shape of `LiveCore` can be driven. `turn` sets `ended` when the run is over.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.still import Output
+from pans.runtime.errors import LinkError
+from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
+from pans.runtime.record.parts_writer import AnyRecorder, PartedRecorder, repeated_setup
+from pans.runtime.timing.ledger import TimingLedger
+from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
+from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, pack_body
+from pans.runtime.wire.tracker import StreamTracker
+
+from .gates import GateDesk
+from .journal import Journal
+from .lateness import Lateness
+from .outage import why_ended
+from .tally import RunTally
+
+if TYPE_CHECKING:
+    from .loop import RunConfig
+
+NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
+PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
+RECEIVE_WINDOW = 4096  # stream messages
+FLUSH_EVERY_NS = 500 * NS_PER_MS
+POLL_S = 0.02
+STOP_GIVE_UP_NS = 1 * NS_PER_S
+
+
+class LiveCore(Protocol):
+    """What a live run needs of a core (core.Core is one): stream frames in, outputs out, deterministic, no clock.
+
+    `tracker` accounts for the stream, `marks` are the objects' marks by number, `tallies` int64 (window.N_TALLIES,) the dark
+    exposures, dark clicks and wrong patterns, in that order.
+    """
+
+    start_tick: int
+    completed: bool
+    n_decisions: int
+    jitter_ticks: int
+    tracker: StreamTracker
+
+    @property
+    def marks(self) -> Mapping[int, Mark]: ...
+
+    @property
+    def tallies(self) -> npt.NDArray[np.int64]: ...
+
+    def warm_up(self) -> None: ...
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output: ...
+
+    def step(self, frame: Frame) -> Output: ...
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]: ...
+
+    def end(self) -> Output: ...
+
+    def cycles_left(self, n_cycles: int) -> int: ...
+
+    def part(self) -> dict[str, Any] | None: ...
+
+
+Watcher = Callable[["LiveRun", Output], None]
+
+
+class LiveRun:
+    """One run in progress: what `run_live` calls in turn, and what a live view may look at."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        plan: Plan,
+        core: LiveCore,
+        n_classes: int,
+        config: RunConfig,
+        recorder: AnyRecorder | None,
+        started_ns: int,
+    ) -> None:
+        self.connection, self.plan, self.core, self.config = connection, plan, core, config
+        self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
+        self.tally = RunTally(n_classes, config.shots)
+        self.journal = Journal(recorder)
+        self.gates = GateDesk(recorder, self.journal)
+        self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
+        self.realtime: dict[str, Any] = {}
+        self.ended = ""
+        self.link_lost = False
+        self.reconnects = 0
+        self.outage_ns: int | None = None  # since when there has been no block
+        self.decoded: Counter[str] = Counter()  # what the decoders of connections that are gone have counted
+        self.armed_after_s = 0.0
+        self.start_ns = self.last_data_ns = 0
+        self._counted: Connection | None = None
+        self._recorder = recorder
+        self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
+        self._setup: list[bytes] = []  # what each part of the recording must repeat
+        self._started_ns = started_ns
+        self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
+        self._granted_until = 0
+
+    def now_ns(self) -> int:
+        """The link's host clock."""
+        return self.connection.link.now_ns()
+
+    # -- arming and stopping -------------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Start the exposures a little in the future, at an absolute device tick."""
+        n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
+        self.journal.session(self.connection)
+        now_ns = self.now_ns()
+        start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
+        self.lateness.attach(self.connection, now_ns + ARM_LEAD_NS)
+        self.settle(self.core.begin(start_tick, n_cycles))
+        arm = Arm(start_tick, n_cycles, self.config.lease_ms)
+        self.connection.session.submit(Opcode.ARM, pack_arm(arm))
+        if isinstance(self._recorder, PartedRecorder):
+            self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
+        self.last_data_ns = now_ns + ARM_LEAD_NS
+        self._flush_due_ns = now_ns + FLUSH_EVERY_NS
+        if not self.reconnects:
+            self.start_ns = now_ns + ARM_LEAD_NS
+            self.armed_after_s = (time.perf_counter_ns() - self._started_ns) / NS_PER_S
+        self._renew(now_ns)
+
+    def stop(self) -> None:
+        """Tell the device to go dark. One that does not answer any more does so by itself when its lease runs out."""
+        session = self.connection.session
+        give_up_ns = self.now_ns() + (0 if self.link_lost else STOP_GIVE_UP_NS)
+        try:
+            session.submit(Opcode.STOP)
+            while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
+                self.take(self.connection.pump(POLL_S))
+        except LinkError as error:
+            self.lose_link(error)
+        except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
+            self.ended = self.ended or "interrupted"
+        self.settle(self.core.end())
+        self.gates.finish(session)
+        for verdict in self.lateness.last_words(self.now_ns()):
+            self.journal.event(verdict)
+        self.lateness.close()
+        self.journal.clock(self.connection)
+
+    def _is_dark(self) -> bool:
+        status = self.connection.session.status
+        return status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE)
+
+    def lose_link(self, error: LinkError) -> None:
+        """End the run because the link is gone; what was decided so far stands."""
+        self.ended = self.ended or f"the link was lost: {error.message}"
+        self.link_lost = True
+
+    # -- acting --------------------------------------------------------------------------------------------------------
+
+    @property
+    def next_command_id(self) -> int:
+        """The id that the next command of this session will have."""
+        return self.connection.session.next_id
+
+    def gate(self, tick: int, duration_ticks: int, channel: int) -> int:
+        """Ask for a pulse at an absolute device tick and return the command's id; a refusal (too late) becomes an event.
+
+        What is acted upon must be on record first, so the recording is flushed before the command leaves.
+        """
+        if self._recorder is not None:
+            self._recorder.flush_decisions()
+        body = pack_gate(Gate(tick, duration_ticks, channel))
+        return self.connection.session.submit(Opcode.GATE, body, may_be_refused=True)
+
+    # -- one turn ------------------------------------------------------------------------------------------------------
+
+    def turn(self, watch: Watcher | None) -> None:
+        """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
+        outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
+        now_ns = self.now_ns()
+        self._act(now_ns)
+        self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
+        self.journal.refusals(self.connection)
+        if watch is not None:
+            for output in outputs:
+                watch(self, output)
+        if now_ns >= self._probe_due_ns:
+            self.connection.session.probe(now_ns)
+            self._probe_due_ns = now_ns + PROBE_EVERY_NS
+        if now_ns >= self._lease_due_ns or self._granted_until - self.core.tracker.next_seq < RECEIVE_WINDOW // 2:
+            self._renew(now_ns)
+        if self._recorder is not None and now_ns >= self._flush_due_ns:
+            self.journal.clock(self.connection)
+            self._recorder.flush()
+            self._flush_due_ns = now_ns + FLUSH_EVERY_NS
+        self._turn_page(now_ns)
+        self.ended = why_ended(self, now_ns)
+
+    def _act(self, now_ns: int) -> None:
+        """Send the pulses that wait, at once: a pulse does not wait for the rest of what has to be done."""
+        if self.gates.turn(self.connection.session, self.connection.known_clock(), now_ns):
+            self.connection.session.poll(now_ns)
+            self.connection.flush()
+
+    def take(self, arrived: list[Arrived]) -> list[Output]:
+        """Decide on what came for the core and account for what came of it."""
+        outputs: list[Output] = []
+        for arrival_ns, what in arrived:
+            if isinstance(what, Messages):
+                self._take_messages(arrival_ns, what, outputs)
+                continue
+            decoded_ns = self.now_ns()
+            output = self.core.step(what)
+            self.lateness.stepped(decoded_ns, self.now_ns())
+            if self._recorder is not None:
+                self._recorder.add_message(arrival_ns, pack_body(what))
+            self._book(output, arrival_ns, decoded_ns, outputs)
+            if what.type == MessageType.STATUS and self.connection.session.status is not None:
+                self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
+        if self._broken is not None:
+            broken, self._broken = self._broken, None
+            raise broken
+        return outputs
+
+    def _take_messages(self, arrival_ns: int, messages: Messages, outputs: list[Output]) -> None:
+        """Give the core many stream messages at once: it stops at each of which something came, which must not wait for the rest."""
+        place, n = 0, len(messages.spans)
+        while place < n:
+            decoded_ns = self.now_ns()
+            taken, output = self.core.step_messages(messages, place)
+            self.lateness.stepped(decoded_ns, self.now_ns())
+            if self._recorder is not None:
+                self._recorder.add_messages(arrival_ns, messages, place, taken)
+            self._book(output, arrival_ns, decoded_ns, outputs)
+            place += taken
+
+    def _book(self, output: Output, arrival_ns: int, decoded_ns: int, outputs: list[Output]) -> None:
+        """Account for what a step brought."""
+        self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
+        if output.block_end_tick is not None:
+            self.last_data_ns = arrival_ns
+            self.outage_ns = None
+            self.lateness.block_came(arrival_ns)
+        if output.actions and self._broken is None:
+            try:
+                self._act(self.now_ns())
+            except LinkError as error:
+                self._broken = error
+        outputs.append(output)
+
+    def settle(self, output: Output) -> None:
+        """Account for what the core settled without a message."""
+        now_ns = self.now_ns()
+        self._account(output, (now_ns, now_ns, now_ns))
+
+    def _account(self, output: Output, times_ns: tuple[int, int, int]) -> None:
+        """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
+        for event in output.events:
+            self.journal.event(event)
+            if event["kind"] == "gap":
+                self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()))
+        if not output.decisions:
+            return
+        self.gates.take(output.actions)
+        end_ns = uncertainty_ns = 0
+        clock = self.connection.known_clock()
+        if output.block_end_tick is not None and not output.passages:
+            end_ns, uncertainty_ns = clock.to_host_ns(output.block_end_tick)
+        for place, decision in enumerate(output.decisions):
+            if output.passages and output.block_end_tick is not None:  # a time of its own, and its number is no mark's
+                end_ns, uncertainty_ns = clock.to_host_ns(output.passages[place].leave_tick)
+            mark = None if output.passages else self.core.marks.get(decision.object)
+            self.tally.add(decision, float("nan") if mark is None else mark.photons)
+            if self._recorder is not None:
+                self._recorder.add_decision(decision)
+            if output.block_end_tick is None:
+                continue
+            marks_ns = (end_ns, *times_ns, self.now_ns())
+            if self.timing.judge(marks_ns, uncertainty_ns):
+                latency_us = (marks_ns[3] - end_ns) / 1000
+                self.journal.event({"kind": "late", "decision": decision.number, "latency_us": latency_us})
+                self.lateness.late(decision.number, marks_ns, uncertainty_ns)
+            if self._recorder is not None:
+                self._recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
+
+    def _turn_page(self, now_ns: int) -> None:
+        """Go on in the recording's next part when this one is full and no window is open."""
+        recorder = self._recorder
+        if not isinstance(recorder, PartedRecorder):
+            return
+        for event in recorder.news():
+            self.journal.event(event)
+        if recorder.wants_part and (place := self.core.part()) is not None:
+            recorder.next_part(place, self._setup, now_ns)
+            recorder.add_clock(self.connection.known_clock().history())
+            self.journal.session(self.connection)
+
+    def drop_recorder(self) -> None:
+        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
+        self._recorder = self.journal.recorder = None
+        self.connection.on_sent = None
+
+    def _judge_late(self, verdict: dict[str, Any] | None) -> None:
+        if verdict is not None:
+            self.journal.event(verdict)
+
+    def _renew(self, now_ns: int) -> None:
+        self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW
+        self.connection.session.grant(self._granted_until, self.config.lease_ms)
+        self._lease_due_ns = now_ns + self.config.lease_ms * NS_PER_MS // 4
+
+    def count_decoded(self) -> None:
+        """Add up what the present connection's decoder has counted, once: before it goes, or at the end."""
+        if self._counted is not self.connection:
+            self._counted = self.connection
+            counters = self.connection.decoder.counters
+            self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})

@@ -1,0 +1,111 @@
+"""A run as one flat picture: what it has done, what went wrong last, what it uses; and the file that shows it to others.
+
+Owns the picture (`picture_of`) and its writing, beside and renamed once per second, by a thread of its own; never touches the run. The file
+is not synced: it is for whoever watches, not for after a power cut.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.container import canonical_json
+from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
+from pans.runtime.record.parts_writer import PartedRecorder
+
+if TYPE_CHECKING:
+    from pans.runtime.record.parts_writer import AnyRecorder
+
+    from .run import LiveRun
+
+FORMAT = "pans-state 1"
+EVERY_S = 1.0
+GOODBYE_S = 5.0
+
+
+def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: float) -> dict[str, Any]:
+    """Return the run's figures as they are now, JSON-able, units in the keys; `started_s` is on time.monotonic's scale."""
+    picture: dict[str, Any] = {
+        "format": FORMAT,
+        "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "state": "setting up",
+        "pid": os.getpid(),
+        "uptime_s": round(time.monotonic() - started_s, 3),
+        **resources_used(),
+    }
+    if isinstance(recorder, PartedRecorder):
+        picture |= {"recording": str(recorder.open_path), "parts": recorder.parts}
+    elif recorder is not None:
+        picture["recording"] = str(recorder.path)
+    if run is None:
+        return picture
+    timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
+    incidents, trouble = run.lateness.incidents, run.journal.trouble
+    return picture | {
+        "state": "stopped" if run.ended else "running" if run.outage_ns is None else "device lost",
+        "ended": run.ended,
+        "decisions": run.core.n_decisions,
+        "late": timing.late,
+        "late_cause": dict(incidents.causes),
+        "lost_exposures": stream.lost_exposures,
+        "lost_cause": dict(incidents.missing),
+        "gaps": stream.gaps,
+        "exposures": stream.exposures,
+        "latency_p99_us": timing.total.quantile_ns(0.99) / 1000,
+        "latency_max_us": timing.total.max_ns / 1000,
+        "dark_exposures": int(tallies[DARK_EXPOSURES]),
+        "dark_clicks": int(tallies[DARK_CLICKS]),
+        "reconnects": run.reconnects,
+        "last_error": "" if trouble is None else f"{trouble.get('kind')}: {_reason(trouble)}",
+    }
+
+
+def _reason(event: dict[str, Any]) -> str:
+    return str(event.get("why") or event.get("reason") or event.get("message") or event.get("text") or "")
+
+
+def resources_used() -> dict[str, int]:
+    """Return resident memory in bytes, open handles and threads of this process; 0 where the system does not tell."""
+    rss = handles = 0
+    with suppress(OSError, ValueError, IndexError):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        rss = pages * os.sysconf("SC_PAGE_SIZE")
+    with suppress(OSError):
+        handles = len(os.listdir("/proc/self/fd")) - 1  # the one that lists them
+    return {"rss_bytes": rss, "handles": handles, "threads": threading.active_count()}
+
+
+class StateFile:
+    """Writes what `look` returns to `path`, now, once per second and at the end."""
+
+    def __init__(self, path: Path, look: Callable[[], dict[str, Any]]) -> None:
+        self.path = path
+        self.trouble = ""
+        self._look, self._beside = look, path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self._ending = threading.Event()
+        self._write()
+        self._thread = threading.Thread(target=self._keep, name="pans-state", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write once more and stop."""
+        self._ending.set()
+        self._thread.join(GOODBYE_S)
+        self._write()
+
+    def _keep(self) -> None:
+        while not self._ending.wait(EVERY_S):
+            self._write()
+
+    def _write(self) -> None:
+        try:
+            self._beside.write_bytes(canonical_json(self._look()) + b"\n")
+            os.replace(self._beside, self.path)
+        except OSError as error:  # a run does not end because nobody can watch it
+            self.trouble = str(error)

@@ -1,0 +1,105 @@
+"""What the decisions of a run add up to: accuracy with both spreads, clicks, photons, confusion.
+
+Owns integer sums, updated per decision; never touches single photons. `RunTally.summary` returns the figures of the contract.
+Spread over trials: how much the mean accuracy of one pass over the objects varies. Spread over objects: the standard error from
+having measured only these objects.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.still import NO_LABEL, Decision
+from pans.runtime.record.recorder import DecisionFlag
+
+_ABSTAINED = int(DecisionFlag.ABSTAINED)
+MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
+
+
+class RunTally:
+    """Sums over decisions; memory is bounded by classes^2 and MAX_OBJECTS."""
+
+    def __init__(self, n_classes: int, shots: int) -> None:
+        self.confusion: npt.NDArray[np.int64] = np.zeros((n_classes, n_classes), np.int64)  # truth x decision
+        self.shots = shots
+        self.decisions = 0
+        self.abstained = 0
+        self.clicks = 0
+        self.photons = 0.0
+        self.photons_known = 0
+        self._trials: dict[int, list[int]] = {}  # window within the visit -> [decided, right]
+        self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
+        self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
+
+    def add(self, decision: Decision, photons_per_shot: float) -> None:
+        """Count one decision; `photons_per_shot` is NaN where the instrument does not know it."""
+        self.decisions += 1
+        self.clicks += decision.clicks
+        if not math.isnan(photons_per_shot):
+            self.photons += photons_per_shot * self.shots
+            self.photons_known += 1
+        if decision.flags & _ABSTAINED or decision.label == NO_LABEL:
+            self.abstained += 1
+        if decision.truth < 0 or decision.truth >= len(self.confusion):
+            return
+        right = int(decision.label == decision.truth)
+        if decision.label != NO_LABEL:
+            self.confusion[decision.truth, decision.label] += 1
+        trial = decision.shot // self.shots
+        for sums in (self._trials.setdefault(trial, [0, 0]), self._object_sums(decision.object)):
+            sums[0] += 1
+            sums[1] += right
+
+    def _object_sums(self, index: int) -> list[int]:
+        sums = self._objects.get(index)
+        if sums is None:
+            if len(self._objects) >= MAX_OBJECTS:
+                self._sum_up(next(iter(self._objects)))
+            sums = self._objects[index] = [0, 0]
+        return sums
+
+    def _sum_up(self, index: int) -> None:
+        """Keep of an object only what it adds to the sums; should it come back, it counts as another one."""
+        decided, right = self._objects.pop(index)
+        for place, value in enumerate((1, right / decided, (right / decided) ** 2)):
+            self._past[place] += value
+
+    def _spread_over_objects(self) -> float | None:
+        """Standard error of the mean accuracy from having measured only these objects; None below two."""
+        here = np.array([right / decided for decided, right in self._objects.values()])
+        if not self._past[0]:
+            return float(np.std(here, ddof=1) / math.sqrt(len(here))) if len(here) > 1 else None
+        n = self._past[0] + len(here)
+        mean = (self._past[1] + float(here.sum())) / n
+        squares = self._past[2] + float((here**2).sum())
+        return math.sqrt(max(squares - n * mean**2, 0.0) / (n - 1) / n)
+
+    @property
+    def objects(self) -> int:
+        """Distinct objects with a known truth."""
+        return int(self._past[0]) + len(self._objects)
+
+    @property
+    def accuracy(self) -> float | None:
+        """Right decisions over decisions with a known truth (an abstention is not right); None without any."""
+        total = sum(n for n, _ in self._trials.values())
+        return sum(right for _, right in self._trials.values()) / total if total else None
+
+    def summary(self) -> dict[str, Any]:
+        """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
+        per_trial = [right / n for n, right in self._trials.values() if n]
+        return {
+            "accuracy": self.accuracy,
+            "accuracy_std_trials": float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
+            "accuracy_stderr_objects": self._spread_over_objects(),
+            "objects": self.objects,
+            "trials": len(self._trials),
+            "decisions": self.decisions,
+            "abstained": self.abstained,
+            "clicks_mean": self.clicks / self.decisions if self.decisions else None,
+            "photons_mean": self.photons / self.photons_known if self.photons_known else None,
+        }

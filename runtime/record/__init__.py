@@ -1,0 +1,1 @@
+"""Append-only recordings: write, read, parts."""

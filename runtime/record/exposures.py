@@ -1,0 +1,121 @@
+"""The exposures of a recording, in the order of the device's clock: what was shown when, and what clicked.
+
+Owns the way from recorded messages to arrays, for exports and reports; never decides and never judges. Repeated and damaged messages are
+left out as in the run itself (ingest.py); what was lost is simply not there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.commands.replay import sent_plan
+from pans.runtime.core.plan import Plan
+from pans.runtime.errors import DamagedFileError
+from pans.runtime.link.connection import plan_from_chunks
+from pans.runtime.wire.messages import (
+    DARK_PATTERN,
+    ClickBlock,
+    FrameBlock,
+    MalformedMessage,
+    Mark,
+    MessageType,
+    unpack_body,
+)
+from pans.runtime.wire.tracker import StreamTracker
+
+from .recorder import Recording
+
+STREAM = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
+
+
+class Exposures(NamedTuple):
+    """Consecutive exposures of one message."""
+
+    arrival_ns: int
+    stream: int  # 0 until the device was lost for the first time
+    object: int
+    first: int  # number of the first exposure in its stream
+    start_tick: NDArray[np.int64]  # (n,): begin of each exposure
+    pattern: NDArray[np.uint16]  # (n,): the pattern shown, DARK_PATTERN in a dark slot; 0 where all shine at once
+    clicks: NDArray[np.bool_]  # (n, channels)
+
+
+def recorded_plan(recording: Recording) -> Plan:
+    """Return the plan that the device was sent; DamagedFileError if the recording does not hold it whole."""
+    try:
+        chunks, _ = sent_plan(recording)
+        return plan_from_chunks(chunks, int(recording.header["config"]["tick_hz"]))
+    except (KeyError, TypeError, ValueError, MalformedMessage) as error:
+        raise DamagedFileError(f"{recording.path}: its plan cannot be rebuilt: {error}") from error
+
+
+def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mark]:
+    """Yield the exposures and the marks of `recording`, message by message."""
+    tracker, session, stream = StreamTracker(), None, -1
+    for arrival_ns, body in recording.messages():
+        frame = unpack_body(body)
+        if frame.type not in STREAM:
+            continue
+        if frame.session != session:
+            session, stream = frame.session, stream + 1
+            tracker.restart()
+        message, _ = tracker.accept(frame)
+        if isinstance(message, Mark):
+            yield message
+        elif message is not None:
+            yield _exposures(message, arrival_ns, stream, plan)
+
+
+def _exposures(block: ClickBlock | FrameBlock, arrival_ns: int, stream: int, plan: Plan) -> Exposures:
+    if isinstance(block, ClickBlock):
+        pattern, clicks = block.patterns, block.bits[:, None].astype(bool)
+    else:
+        bits = np.unpackbits(block.words, axis=1, bitorder="little")
+        slot = (block.exposure_index + np.arange(len(bits))) % plan.slots_per_cycle
+        pattern, clicks = plan.slot_pattern[slot], bits[:, : plan.n_patterns].astype(bool)
+    ticks = block.tick + np.arange(len(clicks), dtype=np.int64) * block.period_ticks
+    return Exposures(arrival_ns, stream, block.object_index, block.exposure_index, ticks, pattern, clicks)
+
+
+class ClickList(NamedTuple):
+    """All clicks of a recording, one element each, in the order of time; `exposures` counts what could have clicked."""
+
+    start_tick: NDArray[np.int64]
+    exposure: NDArray[np.int64]
+    object: NDArray[np.int64]
+    channel: NDArray[np.int64]  # of the detector
+    pattern: NDArray[np.int64]  # shown; DARK_PATTERN: none
+    stream: NDArray[np.int64]
+    exposures: int
+    first_tick: int
+    last_tick: int  # end of the last exposure
+
+
+def click_list(recording: Recording, plan: Plan) -> ClickList:
+    """Return the clicks of `recording` as arrays."""
+    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(6)]
+    exposures, first_tick, last_tick = 0, 0, 0
+    for item in iter_exposures(recording, plan):
+        if isinstance(item, Mark):
+            continue
+        row, channels = np.nonzero(item.clicks)
+        same = np.full(len(row), item.object), np.full(len(row), item.stream)
+        for column, values in zip(
+            columns, (item.start_tick[row], item.first + row, same[0], channels, item.pattern[row], same[1])
+        ):
+            column.append(np.asarray(values, np.int64))
+        first_tick = first_tick if exposures else int(item.start_tick[0])
+        last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
+        exposures += len(item.clicks)
+    empty = [np.zeros(0, np.int64)]
+    start, number, thing, channel, shown, stream = (np.concatenate(column or empty) for column in columns)
+    return ClickList(start, number, thing, channel, shown, stream, exposures, first_tick, last_tick)
+
+
+def is_dark(pattern: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return where no light was shown."""
+    return np.asarray(pattern == DARK_PATTERN)

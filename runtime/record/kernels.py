@@ -1,0 +1,163 @@
+"""The compiled kernels of a recording: rows to runs, verdicts and codes of the compact decision log; messages to a block.
+
+Owns the loops over rows and bytes; what its output means is told in record_log.py, which also owns the arrays. Never allocates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
+
+# state, uint64 (N_STATE,): the run that is open, as its next row would have to be, and the verdicts known so far
+RUN_ROWS, NEXT_INDEX, NEXT_TICK, NEXT_EXPOSURE, NEXT_SHOT, OBJECT, TRUTH = range(7)
+TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_STATE = range(7, 13)
+
+_MESSAGE_HEAD = MESSAGE.size
+_U = np.uint64
+SLOTS_PER_VERDICT = _U(
+    8
+)  # at least: a look-up that meets no other verdict on its way is one whose branches are foreseen
+_ZERO, _ONE, _U32, _HALF_LEFT, _TRUTH_MASK = _U(0), _U(1), _U(1 << 32), _U(32), _U(0xFFFF)
+_LONG, _RUN_MAX = _U(LONG_VERDICT), _U(RUN_ROWS_MAX)
+_MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spreads keys over slots
+
+
+@njit(cache=True, nogil=True)
+def encode_rows(rows, state, keys, slots, runs, verdicts, codes):  # type: ignore[no-untyped-def]
+    """Encode rows, DECISION_DTYPE (n,), behind those before; return how many runs and how many verdicts were written.
+
+    state uint64 (N_STATE,), keys uint64 (LONG_VERDICT, 3) and slots uint16 (LONG_VERDICT: free) are the known verdicts;
+    runs RUN_DTYPE, verdicts VERDICT_DTYPE and codes uint16 have room for n.
+    """
+    n_runs, n_new = 0, 0
+    # Columns are taken out of the rows once: a row at a time would count references for each.
+    indices, ticks, exposures, objects = rows["index"], rows["tick"], rows["exposure_index"], rows["object"]
+    shots, truths, labels, flags = rows["shot"], rows["truth"], rows["label"], rows["flags"]
+    clicks, probabilities, checksums = rows["clicks"], rows["probability_bits"], rows["counts_crc"]
+    count, truth, number = state[RUN_ROWS], state[TRUTH], state[OBJECT]
+    index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
+    tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
+    n_known, mask = state[N_VERDICTS], state[SLOT_MASK]
+    part = 0  # rows of the open run that stand in this block
+    for i in range(_U(rows.size)):
+        here_tick, here_exposure, here_shot = _U(ticks[i]), _U(exposures[i]), _U(shots[i])
+        here_index, here_truth, here_object = _U(indices[i]), _U(truths[i]) & _TRUTH_MASK, _U(objects[i])
+        fits = here_index == index and here_object == number and here_truth == truth and count < _RUN_MAX
+        if count == _ONE:  # the second row says what the steps are
+            tick_step, exposure_step, shot_step = here_tick - tick, here_exposure - exposure, here_shot - shot
+            fits = fits and tick_step < _U32 and exposure_step < _U32 and shot_step < _U32
+        else:
+            fits = fits and here_tick == tick and here_exposure == exposure and here_shot == shot
+        if not fits or count == _ZERO:
+            if part:
+                _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
+            count, part = _ZERO, 0
+            number, truth, index = here_object, here_truth, here_index
+        if part == 0:
+            _open(runs[n_runs], rows[i], count != _ZERO)
+            n_runs += 1
+        count += _ONE
+        part += 1
+        index += _ONE
+        tick, exposure, shot = here_tick, here_exposure, here_shot
+        if count > _ONE:  # a run of one has no steps yet: the next row is compared with this one
+            tick, exposure, shot = tick + tick_step, exposure + exposure_step, shot + shot_step
+        first = _U(clicks[i]) << _HALF_LEFT | _U(labels[i])
+        second = _U(probabilities[i]) << _HALF_LEFT | _U(flags[i])
+        third = _U(checksums[i])
+        at = _slot_of(first, second, third) & mask
+        known = _U(slots[at])
+        while known != _LONG and (keys[known, 2] != third or keys[known, 1] != second or keys[known, 0] != first):
+            at = (at + _ONE) & mask
+            known = _U(slots[at])
+        if known != _LONG:
+            codes[i] = known
+            continue
+        codes[i] = n_known  # the next number, while there is room: LONG_VERDICT afterwards
+        _keep(rows[i], verdicts[n_new])
+        n_new += 1
+        if n_known < _LONG:
+            keys[n_known, 0], keys[n_known, 1], keys[n_known, 2] = first, second, third
+            slots[at] = n_known
+            n_known += _ONE
+            if SLOTS_PER_VERDICT * n_known > mask + _ONE:
+                mask = _widen(n_known, mask, keys, slots)
+    if part:
+        _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
+    state[RUN_ROWS], state[TRUTH], state[OBJECT] = count, truth, number
+    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
+    state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = tick_step, exposure_step, shot_step
+    state[N_VERDICTS], state[SLOT_MASK] = n_known, mask
+    return n_runs, n_new
+
+
+@njit(cache=True, nogil=True)
+def _open(run, row, continues):  # type: ignore[no-untyped-def]
+    run["index"] = row["index"]
+    run["tick"] = row["tick"]
+    run["exposure_index"] = row["exposure_index"]
+    run["object"] = row["object"]
+    run["shot"] = row["shot"]
+    run["truth"] = row["truth"]
+    run["continues"] = continues
+
+
+@njit(cache=True, nogil=True)
+def _close(run, part, tick_step, exposure_step, shot_step, count):  # type: ignore[no-untyped-def]
+    stepped = count != _ONE  # of a single row no steps are known
+    run["count"] = part
+    run["tick_step"] = tick_step if stepped else _U(0)
+    run["exposure_step"] = exposure_step if stepped else _U(0)
+    run["shot_step"] = shot_step if stepped else _U(0)
+
+
+@njit(cache=True, nogil=True)
+def _slot_of(first, second, third):  # type: ignore[no-untyped-def]
+    return ((first ^ (second * _MIX) ^ (third << _U(13))) * _MIX) >> _FOLD
+
+
+@njit(cache=True, nogil=True)
+def _widen(n_known, mask, keys, slots):  # type: ignore[no-untyped-def]
+    """Twice as many slots, whose mask is returned: few verdicts stay close together, where the cache has them."""
+    mask = _U(2) * mask + _ONE
+    for at in range(mask + _ONE):
+        slots[at] = _LONG
+    for number in range(n_known):
+        at = _slot_of(keys[number, 0], keys[number, 1], keys[number, 2]) & mask
+        while slots[at] != _LONG:
+            at = (at + _ONE) & mask
+        slots[at] = number
+    return mask
+
+
+@njit(cache=True, nogil=True)
+def _keep(row, verdict):  # type: ignore[no-untyped-def]
+    verdict["clicks"] = row["clicks"]
+    verdict["label"] = row["label"]
+    verdict["flags"] = row["flags"]
+    verdict["probability_bits"] = row["probability_bits"]
+    verdict["counts_crc"] = row["counts_crc"]
+
+
+@njit(cache=True, nogil=True)
+def pack_messages(buffer, spans, first, stop, host_ns, out, used):  # type: ignore[no-untyped-def]
+    """Put the bodies at spans[first:stop] of `buffer` behind out[:used], each with `host_ns` and its length (record_format.MESSAGE).
+
+    Ends at the first that does not fit; return its place, or `stop`, and the bytes used.
+    """
+    while first < stop:
+        begin, end = spans[first, 0], spans[first, 1]
+        if used + _MESSAGE_HEAD + end - begin > out.size:
+            break
+        for i in range(8):
+            out[used + i] = np.uint8(host_ns >> 8 * i & 0xFF)
+        for i in range(4):
+            out[used + 8 + i] = np.uint8(end - begin >> 8 * i & 0xFF)
+        used += _MESSAGE_HEAD
+        for i in range(end - begin):
+            out[used + i] = buffer[begin + i]
+        used += end - begin
+        first += 1
+    return first, used

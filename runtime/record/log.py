@@ -1,0 +1,249 @@
+"""The decision log on disk and its hash: what a decision needs in bytes, and the way back to the rows.
+
+Owns both forms that DECISIONS blocks have had (docs/FORMATS.md): the rows as they are (format version 1) and the compact form (version 2).
+Never touches a file and never decides. In the compact form each different verdict stands once and is named by its number; what else a
+row holds goes up in equal steps, so that a run of decisions needs its first row and the steps: 2 bytes for a decision of a fast, regular
+stream, not 52. Nothing is left out: the rows come back bit for bit. The hash does not depend on how the rows were cut into blocks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import DamagedFileError
+
+from .format import DECISION_DTYPE, LONG_VERDICT
+
+BLOCK_ROWS = 1 << 14  # of one block of ours: 1.2 MB when nothing repeats
+ROWS_MAX = 1 << 18  # of one block that is read, so that a small file cannot ask for much memory
+VERDICT_FIELDS = ("clicks", "label", "flags", "probability", "counts_crc")
+VERDICT_DTYPE = np.dtype([(name, DECISION_DTYPE[name]) for name in VERDICT_FIELDS])
+# The same layouts for the kernel, which compares probabilities by their bits.
+_ROW_BITS, _VERDICT_BITS = (
+    np.dtype(
+        [("probability_bits", "<u4") if name == "probability" else (name, dtype[name]) for name in dtype.names or ()]
+    )
+    for dtype in (DECISION_DTYPE, VERDICT_DTYPE)
+)
+RUN_DTYPE = np.dtype(
+    [
+        ("index", "<u8"),  # of the first decision; the following ones count up
+        ("tick", "<u8"),
+        ("exposure_index", "<u8"),
+        ("object", "<u4"),
+        ("shot", "<u4"),
+        ("count", "<u4"),  # decisions, 1 or more
+        ("tick_step", "<u4"),
+        ("exposure_step", "<u4"),
+        ("shot_step", "<u4"),
+        ("truth", "<i2"),
+        ("continues", "<u2"),  # 1: the rest of the last run of the block before
+    ]
+)
+_HEAD = struct.Struct("<III")  # runs, verdicts, decisions
+_FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # for record_kernels.SLOTS_PER_VERDICT
+
+
+class LogHash(Protocol):
+    """The hash of a decision log that grows."""
+
+    def update(self, rows: NDArray[np.void]) -> None:
+        """Take the next rows, DECISION_DTYPE (n,)."""
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 (hex) of all rows so far."""
+
+
+class LogReader(Protocol):
+    """DECISIONS blocks of one recording, in their order."""
+
+    def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
+        """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when its parts do not fit together."""
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 (hex) of all rows so far."""
+
+
+class LogEncoder:
+    """Rows in, blocks and their hash out; all memory is allocated here, before arming."""
+
+    def __init__(self) -> None:
+        from . import kernels  # numba: only who writes or replays decisions needs it
+
+        self._encode = kernels.encode_rows
+        self._hash = _CompactHash()
+        self._state = np.zeros(kernels.N_STATE, np.uint64)
+        self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
+        self._keys = np.zeros((LONG_VERDICT, 3), np.uint64)
+        self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
+        self._runs: NDArray[np.void] = np.zeros(BLOCK_ROWS, RUN_DTYPE)
+        self._verdicts: NDArray[np.void] = np.zeros(BLOCK_ROWS, VERDICT_DTYPE)
+        self._codes = np.zeros(BLOCK_ROWS, np.uint16)
+        self._take(np.zeros(0, DECISION_DTYPE))  # compiles the kernel, or loads it
+
+    def block(self, rows: NDArray[np.void]) -> bytes:
+        """Take the next rows, DECISION_DTYPE (n,), n at most BLOCK_ROWS, and return the payload that holds them."""
+        runs, verdicts, codes = self._take(rows)
+        head = _HEAD.pack(len(runs), len(verdicts), len(codes))
+        return b"".join((head, runs.tobytes(), verdicts.tobytes(), codes.tobytes()))
+
+    def update(self, rows: NDArray[np.void]) -> None:
+        """Take the next rows, DECISION_DTYPE (n,), for their hash alone."""
+        for start in range(0, len(rows), BLOCK_ROWS):
+            self._take(rows[start : start + BLOCK_ROWS])
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 (hex) of all rows so far."""
+        return self._hash.hexdigest()
+
+    def _take(self, rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.uint16]]:
+        bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
+        n_runs, n_verdicts = self._encode(
+            bits, self._state, self._keys, self._slots, self._runs, self._verdicts.view(_VERDICT_BITS), self._codes
+        )
+        parts = self._runs[:n_runs], self._verdicts[:n_verdicts], self._codes[: len(rows)]
+        self._hash.update(*parts)
+        return parts
+
+
+class CompactReader:
+    """DECISIONS blocks of format version 2."""
+
+    def __init__(self) -> None:
+        self._known: NDArray[np.void] = np.zeros(LONG_VERDICT, VERDICT_DTYPE)
+        self._n_known = 0
+        self._hash = _CompactHash()
+
+    def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
+        """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when its parts do not fit together."""
+        runs, verdicts, codes = _parts(payload, where)
+        long = codes == LONG_VERDICT
+        n_new = len(verdicts) - int(long.sum())
+        n_known = self._n_known + n_new
+        if n_new < 0 or n_known > LONG_VERDICT or (codes[~long] >= n_known).any():
+            raise DamagedFileError(f"{where}: its {len(verdicts)} verdicts do not fit its decisions")
+        self._known[self._n_known : n_known] = verdicts[:n_new]
+        self._n_known = n_known
+        self._hash.update(runs, verdicts, codes)
+        found = self._known[np.where(long, 0, codes)]
+        found[long] = verdicts[n_new:]
+        return _expand(runs, found)
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 (hex) of all rows so far."""
+        return self._hash.hexdigest()
+
+
+class RowReader:
+    """DECISIONS blocks of format version 1: rows, and the SHA-256 of their bytes; also the hash of such a log that is replayed."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
+        """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when it ends within a row."""
+        if len(payload) % DECISION_DTYPE.itemsize:
+            wanted = f"a multiple of {DECISION_DTYPE.itemsize}"
+            raise DamagedFileError(f"{where} has {len(payload)} bytes, allowed: {wanted}")
+        self._hash.update(payload)
+        return np.frombuffer(payload, DECISION_DTYPE)
+
+    def update(self, rows: NDArray[np.void]) -> None:
+        """Take the next rows, DECISION_DTYPE (n,)."""
+        self._hash.update(np.ascontiguousarray(rows, DECISION_DTYPE).tobytes())
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 (hex) of all rows so far."""
+        return self._hash.hexdigest()
+
+
+def log_reader(version: int) -> LogReader:
+    """Return what reads the decisions of a recording of this format version."""
+    return RowReader() if version == 1 else CompactReader()
+
+
+def log_hash(version: int) -> LogHash:
+    """Return what hashes decisions as a recording of this format version does: for a replay."""
+    return RowReader() if version == 1 else LogEncoder()
+
+
+def decision_log_sha256(records: NDArray[np.void]) -> str:
+    """Return the SHA-256 (hex) of decisions, DECISION_DTYPE (n,), in their order: what replay compares."""
+    log = LogEncoder()
+    log.update(records)
+    return log.hexdigest()
+
+
+class _CompactHash:
+    """SHA-256 over the three hashes of verdicts, codes and whole runs; a run that goes on in the next block is hashed when it ends."""
+
+    def __init__(self) -> None:
+        self._verdicts, self._codes, self._runs = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+        self._open: NDArray[np.void] = np.zeros(0, RUN_DTYPE)  # the last run, which may go on
+
+    def update(self, runs: NDArray[np.void], verdicts: NDArray[np.void], codes: NDArray[np.uint16]) -> None:
+        if not len(runs):
+            return
+        self._verdicts.update(verdicts.tobytes())
+        self._codes.update(codes.tobytes())
+        start = 0
+        if runs["continues"][0] and len(self._open):
+            start = 1
+            self._open["count"] += runs["count"][0]
+            for name in ("tick_step", "exposure_step", "shot_step"):
+                self._open[name] = runs[name][0]
+        if start < len(runs):
+            self._runs.update(self._open.tobytes())
+            self._runs.update(runs[start:-1].tobytes())
+            self._open = runs[-1:].copy()
+
+    def hexdigest(self) -> str:
+        runs = self._runs.copy()
+        runs.update(self._open.tobytes())
+        return hashlib.sha256(self._verdicts.digest() + self._codes.digest() + runs.digest()).hexdigest()
+
+
+def _parts(payload: bytes, where: str) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.uint16]]:
+    """Runs, verdicts and codes of one block, checked as far as they stand alone."""
+    if len(payload) < _HEAD.size:
+        raise DamagedFileError(f"{where} has {len(payload)} bytes, allowed: {_HEAD.size} or more")
+    n_runs, n_verdicts, n_rows = _HEAD.unpack_from(payload)
+    verdicts_at = _HEAD.size + n_runs * RUN_DTYPE.itemsize
+    codes_at = verdicts_at + n_verdicts * VERDICT_DTYPE.itemsize
+    wanted = codes_at + 2 * n_rows
+    if len(payload) != wanted or n_rows > ROWS_MAX:
+        what = f"{n_runs} runs, {n_verdicts} verdicts and {n_rows} decisions"
+        raise DamagedFileError(
+            f"{where} has {len(payload)} bytes for {what}, allowed: {wanted}, and {ROWS_MAX} decisions at most"
+        )
+    runs = np.frombuffer(payload, RUN_DTYPE, n_runs, _HEAD.size)
+    counts, later = runs["count"].astype(np.int64), runs["continues"][1:]
+    if int(counts.sum()) != n_rows or not counts.all() or later.any() or int(runs["continues"].max(initial=0)) > 1:
+        raise DamagedFileError(f"{where}: its runs do not add up to its {n_rows} decisions")
+    return (
+        runs,
+        np.frombuffer(payload, VERDICT_DTYPE, n_verdicts, verdicts_at),
+        np.frombuffer(payload, "<u2", n_rows, codes_at),
+    )
+
+
+def _expand(runs: NDArray[np.void], verdicts: NDArray[Any]) -> NDArray[np.void]:
+    """Rows from runs and one verdict each. What goes beyond a field counts on from 0 there, as the sums in the kernel do."""
+    counts = runs["count"].astype(np.int64)
+    n_rows = len(verdicts)
+    run = np.repeat(np.arange(len(counts)), counts)
+    within = (np.arange(n_rows) - np.repeat(np.cumsum(counts) - counts, counts)).astype(np.uint64)
+    rows: NDArray[np.void] = np.zeros(n_rows, DECISION_DTYPE)
+    firsts = runs[run]
+    rows["index"] = firsts["index"] + within
+    for name, step in (("tick", "tick_step"), ("exposure_index", "exposure_step"), ("shot", "shot_step")):
+        rows[name] = firsts[name].astype(np.uint64) + within * firsts[step].astype(np.uint64)
+    rows["object"], rows["truth"] = firsts["object"], firsts["truth"]
+    for name in VERDICT_FIELDS:
+        rows[name] = verdicts[name]
+    return rows

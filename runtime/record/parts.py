@@ -1,0 +1,87 @@
+"""Reading recordings that come in parts: a part's place in the run, the chain from one to the next, a folder of them.
+
+Owns the questions across files; blocks are recording.py's, what one file promises is verify.py's, and writing parts rotate.py's.
+`verify_folder` returns one verdict on the chain; a deleted beginning is no fault, a hole is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.errors import DamagedFileError, UsageError
+
+from .parts_writer import PART_EVENT, chained
+from .recording import Recording
+
+
+def part_of(recording: Recording) -> Mapping[str, Any] | None:
+    """Return how this part begins (number, first decision, what was before, place of the core), None for a recording that is whole.
+
+    DamagedFileError if it says that it is a part and does not say where it begins.
+    """
+    if "part" not in recording.header:
+        return None
+    event = next(recording.events(), None)
+    if event is None or event.get("kind") != PART_EVENT or not isinstance(event.get("place"), dict):
+        raise DamagedFileError(f"{recording.path}: a part of a run that does not say where it begins")
+    return event
+
+
+def place_of(recording: Recording) -> dict[str, Any] | None:
+    """Return the core's place at the beginning of a later part; None where the run itself begins."""
+    part = part_of(recording)
+    return None if part is None or part["number"] == 1 else dict(part["place"])
+
+
+def first_decision(recording: Recording) -> int:
+    """Return the number of the first decision: 0 but in a later part."""
+    part = part_of(recording)
+    return 0 if part is None else int(part["first_decision"])
+
+
+def parts_in(folder: str | Path) -> list[Path]:
+    """Return the parts in `folder`, in order; UsageError if there are none."""
+    paths = sorted(Path(folder).glob("*-[0-9]*.pansrec"), key=lambda path: (len(path.name), path.name))
+    if not paths:
+        raise UsageError(
+            f"{folder}: no parts of a recording are in this folder", remedy="parts are named like run-0001.pansrec"
+        )
+    return paths
+
+
+def chain_violations(recordings: list[Recording]) -> list[str]:
+    """Return what is wrong between parts that should follow each other; each by itself is verify.py's."""
+    violations = []
+    known = [(recording, part) for recording in recordings if (part := part_of(recording)) is not None]
+    violations += [f"{one.path}: not a part" for one in recordings if "part" not in one.header]
+    runs = {recording.header["part"].get("run") for recording, _ in known}
+    if len(runs) > 1:
+        violations.append(f"parts of {len(runs)} runs are in one folder")
+    for (earlier, first), (later, second) in pairwise(known):
+        where = f"{later.path.name}"
+        if second["number"] != first["number"] + 1:
+            violations.append(
+                f"{where}: part {second['number']} follows part {first['number']}: one is missing between"
+            )
+            continue
+        before = second.get("before") or {}
+        expected = {
+            "first_decision": first["first_decision"],
+            "decisions": earlier.n_decisions,
+            "decisions_sha256": earlier.decisions_sha256,
+            "chain_sha256": chained(_chain_before(first), earlier.decisions_sha256),
+        }
+        for key, found in expected.items():
+            if before.get(key) != found:
+                told = ascii(before.get(key))[:80]
+                violations.append(f"{where}: it says that the part before has {key} {told}, found {found}")
+        if second["first_decision"] != first["first_decision"] + earlier.n_decisions:
+            violations.append(f"{where}: it begins with decision {second['first_decision']}, which does not follow")
+    return violations
+
+
+def _chain_before(part: Mapping[str, Any]) -> str:
+    return str((part.get("before") or {}).get("chain_sha256", ""))

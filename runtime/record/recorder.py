@@ -1,0 +1,340 @@
+"""Append-only recordings: everything a run saw and decided, in one file that survives a power cut.
+
+Owns the writing, in bounded batches; reading is in recording.py and offered here too. Never decides what is worth keeping
+and never converts a time. `Recorder.close` returns the SHA-256 of the decision log, which a replay must give again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue, sync_folder
+from pans.runtime.errors import PansError, RecordingError, UsageError
+from pans.runtime.timing.clock import CLOCK_DTYPE
+from pans.runtime.wire.framing import Messages
+
+from .format import (
+    DECISION_DTYPE,
+    FORMAT_VERSION,
+    LIMITS,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_MAX_BYTES,
+    TIMING_DTYPE,
+    DecisionFlag,
+    Kind,
+)
+from .log import BLOCK_ROWS, LogEncoder, decision_log_sha256
+from .recording import Recording, read_recording
+
+__all__ = [
+    "DECISION_DTYPE",
+    "TIMING_DTYPE",
+    "DecisionFlag",
+    "Kind",
+    "Recorder",
+    "Recording",
+    "decision_log_sha256",
+    "read_recording",
+]
+
+_MESSAGE_BUFFER_BYTES = MIB // 4
+_EVENT_BUFFER_BYTES = MIB // 16
+_BUFFER_ROWS = 4096
+_COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
+
+
+class _Rows:
+    """A preallocated table of `_BUFFER_ROWS` rows that is emptied into a block."""
+
+    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
+        self.kind = kind
+        self.rows = np.zeros(_BUFFER_ROWS, dtype=dtype)
+        self.used = 0
+
+    def add(self, row: Sequence[Any]) -> bool:
+        """Store one row; True when the table is full."""
+        self.rows[self.used] = row
+        self.used += 1
+        return self.used == len(self.rows)
+
+    def take(self) -> bytes:
+        data = self.rows[: self.used].tobytes()
+        self.used = 0
+        return data
+
+
+class _Bytes:
+    """A preallocated byte buffer that is emptied into a block."""
+
+    def __init__(self, kind: Kind, size: int) -> None:
+        self.kind = kind
+        self.data = bytearray(size)
+        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
+        self.used = 0
+
+    def room(self) -> int:
+        return len(self.data) - self.used
+
+    def add(self, piece: bytes | bytearray | memoryview) -> None:
+        self.data[self.used : self.used + len(piece)] = piece
+        self.used += len(piece)
+
+    def take(self) -> bytes:
+        data = bytes(memoryview(self.data)[: self.used])
+        self.used = 0
+        return data
+
+
+class Recorder:
+    """Writes one recording; one thread at a time. Adding buffers, a full buffer is written at once, `flush` writes the rest.
+
+    Left by an exception or not closed at all, the recording has no END block and reads as incomplete, which it is.
+    """
+
+    def __init__(
+        self, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
+    ) -> None:
+        """Create `path` (UsageError if it exists, unless `overwrite`) and write header and bundle to it.
+
+        `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
+        """
+        self.path = Path(path)
+        self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
+        self._messages = _Bytes(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
+        self._commands = _Bytes(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._events = _Bytes(Kind.EVENTS, _EVENT_BUFFER_BYTES)
+        self._decisions = _Rows(Kind.DECISIONS, DECISION_DTYPE)
+        self._timings = _Rows(Kind.TIMINGS, TIMING_DTYPE)
+        self._log = LogEncoder()
+        from .kernels import pack_messages  # numba is loaded only by who records
+
+        self._pack = pack_messages
+        pack_messages(self._messages.array, np.zeros((0, 2), np.int64), 0, 0, 0, self._messages.array, 0)
+        self._n_decisions = 0
+        self._n_blocks = 0
+        facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
+        facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
+        text = canonical_json({**facts, **header})
+        self._file = _create(self.path, overwrite)
+        start, self._chain = file_prologue(MAGIC, FORMAT_VERSION)
+        self._end = 0
+        self._write(start)
+        self._write_block(Kind.HEADER, text)
+        if bundle:
+            self._write_block(Kind.BUNDLE, bundle)
+        self.sync()
+        sync_folder(self.path.parent)
+
+    @classmethod
+    def open(
+        cls, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
+    ) -> Recorder:
+        """Start a recording at `path`; the same as calling the class."""
+        return cls(path, header, bundle=bundle, overwrite=overwrite)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+        except PansError:
+            if error is None:
+                raise
+        finally:
+            self._file.close()
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes in the file, all of them in whole blocks."""
+        return self._end
+
+    @property
+    def written(self) -> tuple[int, str]:
+        """Number of the decisions in the file and the SHA-256 (hex) of their log; all of them after `flush`."""
+        return self._n_decisions, self._log.hexdigest()
+
+    def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
+        self._add_bytes(self._messages, host_ns, data)
+
+    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None:
+        """Keep `count` of `messages` from place `first` on, which arrived together."""
+        buffer, stop = self._messages, first + count
+        while True:
+            first, buffer.used = self._pack(
+                messages.buffer, messages.spans, first, stop, host_ns, buffer.array, buffer.used
+            )
+            if first == stop:
+                return
+            begin, end = messages.spans[first].tolist()
+            self._add_bytes(buffer, host_ns, messages.buffer[begin:end].tobytes())  # makes room
+            first += 1
+
+    def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
+        self._add_bytes(self._commands, host_ns, data)
+
+    def add_decision(self, record: Sequence[Any]) -> None:
+        """Keep one decision: a tuple in the order of DECISION_DTYPE."""
+        if self._decisions.add(record):
+            self._empty(self._decisions)
+
+    def add_decisions(self, rows: NDArray[np.void]) -> None:
+        """Keep many decisions, DECISION_DTYPE (n,), behind those already added; whole blocks go out at once."""
+        self._empty(self._decisions)
+        for start in range(0, len(rows), BLOCK_ROWS):
+            self._write_decisions(rows[start : start + BLOCK_ROWS])
+
+    def _write_decisions(self, rows: NDArray[np.void]) -> None:
+        self._write_block(Kind.DECISIONS, self._log.block(rows))
+        self._n_decisions += len(rows)
+
+    def add_timing(self, record: Sequence[Any]) -> None:
+        """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
+        if self._timings.add(record):
+            self._empty(self._timings)
+
+    def add_event(self, event: Mapping[str, Any]) -> None:
+        """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
+        line = canonical_json(event) + b"\n"
+        if len(line) > len(self._events.data):
+            raise UsageError(f"an event of {len(line)} bytes, allowed at most {len(self._events.data)}")
+        if len(line) > self._events.room():
+            self._empty(self._events)
+        self._events.add(line)
+
+    def add_clock(self, samples: NDArray[np.void]) -> None:
+        """Write clock samples, CLOCK_DTYPE (n,) of clock.py; rare, hence not buffered."""
+        for start in range(0, len(samples), _BUFFER_ROWS):
+            part = np.ascontiguousarray(samples[start : start + _BUFFER_ROWS], dtype=CLOCK_DTYPE)
+            self._write_block(Kind.CLOCK, part.tobytes())
+
+    def flush(self) -> None:
+        """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
+        self._flush(self._commands, self._messages, self._decisions, self._timings, self._events)
+
+    def flush_decisions(self) -> None:
+        """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
+        self._flush(self._commands, self._messages, self._decisions)
+
+    def _flush(self, *buffers: _Rows | _Bytes) -> None:
+        n_decisions = self._decisions.used
+        blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
+        if blocks:
+            self._write(b"".join(blocks))
+            self._n_decisions += n_decisions
+
+    def sync(self) -> None:
+        """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
+        self.flush()
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def close(self, summary: Mapping[str, Any]) -> str:
+        """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log."""
+        self.flush()
+        digest = self._log.hexdigest()
+        end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
+        self._write_block(Kind.END, canonical_json(end))
+        self.sync()
+        self._file.close()
+        return digest
+
+    def _add_bytes(self, buffer: _Bytes, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        if len(data) > MESSAGE_MAX_BYTES:
+            raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
+        needed = MESSAGE.size + len(data)
+        if needed > buffer.room():
+            self._empty(buffer)
+        if needed > buffer.room():
+            self._write_block(buffer.kind, MESSAGE.pack(host_ns, len(data)) + bytes(data))
+            return
+        MESSAGE.pack_into(buffer.data, buffer.used, host_ns, len(data))
+        buffer.used += MESSAGE.size
+        buffer.add(data)
+
+    def _empty(self, buffer: _Rows | _Bytes) -> None:
+        if buffer.used:
+            n_decisions = self._decisions.used if buffer is self._decisions else 0
+            self._write(self._block_of(buffer))
+            self._n_decisions += n_decisions
+
+    def _block_of(self, buffer: _Rows | _Bytes) -> bytes:
+        """Empty a buffer into a block, which must be written next."""
+        if buffer is self._decisions:
+            rows = self._decisions.rows[: self._decisions.used]
+            self._decisions.used = 0
+            return b"".join(self._framed(Kind.DECISIONS, self._log.block(rows)))
+        return b"".join(self._framed(buffer.kind, buffer.take()))
+
+    def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
+        pieces = self._framed(kind, payload)
+        if len(payload) > _COPIED_BYTES:
+            self._write(*pieces)
+        else:
+            self._write(b"".join(pieces))
+
+    def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:
+        """Return what stands before a payload, the payload, and what stands behind it: the next block."""
+        if len(payload) > LIMITS[kind]:
+            raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
+        head, tail, self._chain = block_ends(kind, self._n_blocks, self._chain, payload)
+        self._n_blocks += 1
+        return head, payload, tail
+
+    def _write(self, *pieces: bytes | memoryview) -> None:
+        """Write one whole block (or the prologue); `_end` moves when all of it is there."""
+        if self._file.closed:
+            raise UsageError(f"{self.path}: this recording is closed")
+        began_ns = time.perf_counter_ns()
+        try:
+            for piece in pieces:
+                view = memoryview(piece)
+                while view:
+                    view = view[self._file.write(view) :]
+        except OSError as error:
+            raise self._broken(error) from error
+        self._end += sum(len(piece) for piece in pieces)
+        if self.watch_write is not None:
+            self.watch_write(began_ns, time.perf_counter_ns())
+
+    def _broken(self, error: OSError) -> RecordingError:
+        """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
+        with suppress(OSError):  # otherwise the reader stops at the torn block by itself
+            self._file.truncate(self._end)
+        self._file.close()
+        reason = error.strerror or str(error)
+        return RecordingError(
+            f"{self.path}: the recording stops after {self._end} bytes: {reason}",
+            remedy="make room on the disk; what was written before is readable",
+        )
+
+
+def _create(path: Path, overwrite: bool) -> Any:
+    try:
+        if overwrite:
+            path.unlink(missing_ok=True)
+        return open(path, "xb", buffering=0)  # one write per block, nothing half written behind our back
+    except FileExistsError as error:
+        raise UsageError(f"{path}: exists already", remedy="choose another name, or allow overwriting") from error
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,220 @@
+"""Reading recordings: every block checked, a cut file read up to its last whole block, memory for one block at a time.
+
+Owns the way back from the file; never writes one and never judges a run. `read_recording` returns a `Recording` or raises
+DamagedFileError; a cut is no damage, it is what a power cut leaves.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle, parse_bundle
+from pans.runtime.container import FILE_PROLOGUE, MIB, Block, check_prologue, parse_json_object, read_block
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.timing.clock import CLOCK_DTYPE
+
+from .format import DECISION_DTYPE, LIMITS, MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind
+from .log import LogReader, log_reader
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What `read_recording` found; the accessors read the file again, one block at a time."""
+
+    path: Path
+    size: int
+    version: int  # of the format
+    header: Mapping[str, Any]
+    kinds: Mapping[Kind, int]  # number of whole blocks
+    n_decisions: int
+    decisions_sha256: str
+    complete: bool  # END is there and fits
+    end_offset: int  # bytes up to the last whole block
+    summary: Mapping[str, Any]  # of END; empty if incomplete
+    damage: str  # "" or what is wrong behind end_offset (salvage only)
+
+    def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
+        """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
+        with open(self.path, "rb") as file:
+            _, chain = _start(file, str(self.path))
+            for block in _blocks(file, chain, str(self.path)):
+                if not wanted or block.kind in wanted:
+                    yield block
+                if block.end >= self.end_offset:
+                    return
+
+    def messages(self) -> Iterator[tuple[int, bytes]]:
+        """Yield (arrival host_ns, decoded bytes) of the device's messages, in order."""
+        return self._pairs(Kind.MESSAGES)
+
+    def commands(self) -> Iterator[tuple[int, bytes]]:
+        """Yield (sent host_ns, bytes) of the commands, in order."""
+        return self._pairs(Kind.COMMANDS)
+
+    def decisions(self) -> NDArray[np.void]:
+        """Return all decisions, DECISION_DTYPE (n,), whichever form they stand in."""
+        parts = list(self.iter_decisions())
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=DECISION_DTYPE)
+
+    def iter_decisions(self) -> Iterator[NDArray[np.void]]:
+        """Yield the decisions block by block, DECISION_DTYPE (n,); memory holds one block."""
+        reader = log_reader(self.version)
+        for block in self.iter_blocks(Kind.DECISIONS):
+            yield reader.rows(block.payload, f"{self.path}: block {block.index}")
+
+    def timings(self) -> NDArray[np.void]:
+        """Return the host times of all decisions, TIMING_DTYPE (n,)."""
+        return self._rows(Kind.TIMINGS, TIMING_DTYPE)
+
+    def clock_samples(self) -> NDArray[np.void]:
+        """Return all clock samples, CLOCK_DTYPE (n,)."""
+        return self._rows(Kind.CLOCK, CLOCK_DTYPE)
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """Yield the events, in order."""
+        for block in self.iter_blocks(Kind.EVENTS):
+            for line in block.payload.splitlines():
+                yield parse_json_object(line, f"{self.path}: an event in block {block.index}")
+
+    def bundle_data(self) -> bytes:
+        """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
+        return next((block.payload for block in self.iter_blocks(Kind.BUNDLE)), b"")
+
+    def bundle(self) -> Bundle:
+        """Return the bundle that the run used; UsageError if it was not recorded."""
+        data = self.bundle_data()
+        if not data:
+            raise UsageError(f"{self.path}: the recording holds no bundle", remedy="name the bundle with --bundle")
+        return parse_bundle(data, f"{self.path}: the bundle inside")
+
+    def _pairs(self, kind: Kind) -> Iterator[tuple[int, bytes]]:
+        for block in self.iter_blocks(kind):
+            position, payload = 0, block.payload
+            while position < len(payload):
+                start = position + MESSAGE.size
+                host_ns, length = MESSAGE.unpack_from(payload, position) if start <= len(payload) else (0, len(payload))
+                if start + length > len(payload):
+                    raise DamagedFileError(f"{self.path}: block {block.index}: a message reaches past its block")
+                yield host_ns, payload[start : start + length]
+                position = start + length
+
+    def _rows(self, kind: Kind, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+        parts = [np.frombuffer(_whole_rows(block, dtype, self.path), dtype=dtype) for block in self.iter_blocks(kind)]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
+
+
+def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
+    if len(block.payload) % dtype.itemsize:
+        size = len(block.payload)
+        raise DamagedFileError(f"{path}: block {block.index} has {size} bytes, allowed: a multiple of {dtype.itemsize}")
+    return block.payload
+
+
+def _start(file: Any, where: str) -> tuple[int, int]:
+    """Read the prologue: the format version and the checksum that seeds the first block."""
+    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, where)
+
+
+def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
+    index = 0
+    while (block := read_block(file, index, chain, LIMITS, where)) is not None:
+        yield block
+        if block.kind == Kind.END:
+            if rest := len(file.read(MIB)):
+                raise DamagedFileError(f"{where}: {rest} bytes or more behind the END block at byte {block.end}")
+            return
+        index, chain = index + 1, block.chain
+
+
+class _Scan:
+    """What one pass over the blocks adds up to."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.kinds = {kind: 0 for kind in Kind}
+        self.header: dict[str, Any] = {}
+        self.end: dict[str, Any] | None = None
+        self.end_offset = 0
+        self.n_decisions = 0
+        self.version = 0
+        self.log: LogReader = log_reader(1)
+
+    def begin(self, version: int) -> None:
+        self.version, self.log = version, log_reader(version)
+
+    def take(self, block: Block) -> None:
+        where = f"{self.path}: block {block.index}"
+        kind = Kind(block.kind)
+        if (kind == Kind.HEADER) != (block.index == 0) or (kind == Kind.BUNDLE and self.kinds[kind]):
+            raise DamagedFileError(f"{where}: {kind.name} does not belong here")
+        if kind == Kind.HEADER:
+            self.header = parse_json_object(block.payload, where)
+        elif kind == Kind.BUNDLE:
+            found = hashlib.sha256(block.payload).hexdigest()
+            if self.header.get("bundle_sha256") != found:
+                wanted = ascii(self.header.get("bundle_sha256"))[:80]
+                raise DamagedFileError(f"{where}: the bundle has the SHA-256 {found}, the header says {wanted}")
+        elif kind == Kind.END:
+            self.end = self._check_end(block, where)
+        elif kind == Kind.DECISIONS:
+            self.n_decisions += len(self.log.rows(block.payload, where))
+        self.kinds[kind] += 1
+        self.end_offset = block.end
+
+    def _check_end(self, block: Block, where: str) -> dict[str, Any]:
+        end = parse_json_object(block.payload, where)
+        facts = {"blocks": block.index, "decisions": self.n_decisions, "decisions_sha256": self.log.hexdigest()}
+        for key, found in facts.items():
+            if end.get(key) != found:
+                raise DamagedFileError(f"{where}: END says {key} = {ascii(end.get(key))[:80]}, found {found}")
+        if not isinstance(end.get("summary"), dict):
+            raise DamagedFileError(f"{where}: END holds no summary")
+        return end
+
+
+def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
+    """Check every block of `path` and return what it holds; a cut file is fine (`complete` False), an altered one is not.
+
+    DamagedFileError names the block and its byte. With `salvage` the blocks before it are returned instead, and `damage`
+    says what is wrong; only a file without a whole header still raises. UsageError if the file is not there.
+    """
+    scan, damage = _Scan(Path(path)), ""
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            try:
+                version, chain = _start(file, str(path))
+                scan.begin(version)
+                for block in _blocks(file, chain, str(path)):
+                    scan.take(block)
+            except DamagedFileError as error:
+                if not salvage or not scan.kinds[Kind.HEADER]:
+                    whole = f"{sum(scan.kinds.values())} whole blocks before it"
+                    raise DamagedFileError(f"{error.message}; {whole}", remedy=error.remedy) from error
+                damage = error.message
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not scan.kinds[Kind.HEADER]:
+        raise DamagedFileError(f"{path}: cut after {size} bytes, within its header: nothing of it can be read")
+    complete = scan.end is not None and not damage
+    return Recording(
+        path=Path(path),
+        size=size,
+        version=scan.version,
+        header=scan.header,
+        kinds={kind: count for kind, count in scan.kinds.items() if count},
+        n_decisions=scan.n_decisions,
+        decisions_sha256=scan.log.hexdigest(),
+        complete=complete,
+        end_offset=scan.end_offset,
+        summary=scan.end["summary"] if scan.end is not None else {},
+        damage=damage,
+    )

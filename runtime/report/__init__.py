@@ -1,0 +1,1 @@
+"""Files read back for people: summary, page, verification, facts, exports."""

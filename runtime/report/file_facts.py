@@ -1,0 +1,119 @@
+"""What a file of this project holds, as plain facts for `pans info`.
+
+Owns the choice of what to show; never judges it (verify.py) and never prints. `file_facts` returns a JSON-able dict, units in
+the keys, and reads a damaged recording as far as it goes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.instrument.calibration import load_calibration, now_utc
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.record.recorder import DecisionFlag, Recording, read_recording
+
+from .verify import file_kind
+
+
+def file_facts(path: str | Path) -> dict[str, Any]:
+    """Return what `path` holds, its `kind` among it; UsageError or DamagedFileError if nothing can be read."""
+    kind = file_kind(path)
+    if kind == "bundle":
+        bundle, sha256 = load_bundle(path)
+        return {"kind": kind, "path": str(path), "sha256": sha256, **_bundle_facts(bundle)}
+    if kind == "recording":
+        return {"kind": kind, "path": str(path), **_recording_facts(read_recording(path, salvage=True))}
+    if kind == "calibration":
+        calibration = load_calibration(path)
+        facts = {key: value for key, value in calibration.values.items() if key != "sha256"}
+        return {
+            "kind": kind,
+            "path": str(path),
+            "sha256": calibration.sha256,
+            "age_h": calibration.age_h(now_utc()),
+            **facts,
+        }
+    return {"kind": kind, "path": str(path), **_profile_facts(load_profile(str(path)))}
+
+
+def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
+    back_ends = [name for name, part in (("table", bundle.table), ("onnx", bundle.head_onnx)) if part is not None]
+    return {
+        "name": bundle.name,
+        "task": bundle.task,
+        "classes": list(bundle.classes),
+        "encoder": bundle.encoder,
+        "sensor": None if bundle.analyser is None else _sensor_facts(bundle.analyser),
+        "picture_shape_px": None if bundle.picture_shape is None else list(bundle.picture_shape),
+        "patterns": bundle.n_features,
+        "image_shape_px": list(bundle.image_shape),
+        "levels": bundle.levels,
+        "photons_per_level": bundle.photons_per_level,
+        "illumination": bundle.illumination(),
+        "back_ends": back_ends,
+        "head_bytes": 0 if bundle.head_onnx is None else len(bundle.head_onnx),
+        "table_rows": 0 if bundle.table is None else len(bundle.table),
+        "golden_vectors": len(bundle.golden_means),
+        "provenance": dict(bundle.provenance),
+    }
+
+
+def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
+    singular = np.linalg.svd(analyser.matrix, compute_uv=False)
+    return {
+        "light": analyser.light,
+        "optics": analyser.optics,
+        "complex": bool(np.iscomplexobj(analyser.matrix)),
+        "full_scale_photoelectrons": analyser.full_scale_photoelectrons,
+        "exposure_us": analyser.exposure_us,
+        "largest_singular_value": float(singular[0]),
+        "largest_column_sum": float(np.abs(analyser.matrix).sum(axis=0).max()),
+        "fingerprint": analyser.fingerprint,
+    }
+
+
+def _recording_facts(recording: Recording) -> dict[str, Any]:
+    decisions = recording.decisions()
+    decided = decisions[(decisions["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
+    known = decided[decided["truth"] >= 0]
+    header = dict(recording.header)
+    profile = header.pop("profile", None)
+    if isinstance(profile, dict):
+        header["profile"] = {key: value for key, value in profile.items() if key != "toml"}
+    facts: dict[str, Any] = {
+        "complete": recording.complete,
+        "damage": recording.damage,
+        "size_bytes": recording.size,
+        "readable_bytes": recording.end_offset,
+        "simulated": header.get("simulated"),
+        "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
+        "decisions": recording.n_decisions,
+        "abstained": len(decisions) - len(decided),
+        "decisions_sha256": recording.decisions_sha256,
+        "clicks_mean": float(decided["clicks"].mean()) if len(decided) else None,
+        "accuracy": float(np.mean(known["label"] == known["truth"])) if len(known) else None,
+        "messages": sum(1 for _ in recording.messages()),
+        "events": dict(Counter(str(event.get("kind", "?")) for event in recording.events())),
+        "header": header,
+        "summary": dict(recording.summary),
+    }
+    data = recording.bundle_data()
+    facts["bundle"] = recording.bundle().name if data else None
+    return facts
+
+
+def _profile_facts(profile: Profile) -> dict[str, Any]:
+    facts = asdict(profile)
+    del facts["text"]
+    modulator = facts["object_modulator"]
+    if modulator is not None and math.isinf(modulator["contrast"]):
+        modulator["contrast"] = "inf"  # JSON has no infinity
+    return {**facts, "sha256": profile.sha256}

@@ -1,0 +1,147 @@
+"""A recording as Photon-HDF5, the open format of photon-counting experiments (photon-hdf5.org, version 0.5).
+
+Owns the mapping onto that format; never reads a message (exposures.py). Needs h5py (extra `export`), imported by name when a file
+is written: the lean runtime does not know it.
+
+A binary click becomes a photon: its timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known),
+its detector the channel that clicked. Which pattern was shown, which object stood there and what was decided is in `/user/pans`; the format
+leaves `/user` to its users.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import secrets
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.runtime import __version__
+from pans.runtime.core.plan import Plan
+from pans.runtime.errors import UsageError
+from pans.runtime.record.exposures import ClickList
+from pans.runtime.record.recorder import Recording
+
+FORMAT_NAME, FORMAT_VERSION = "Photon-HDF5", "0.5"
+FORMAT_URL = "http://photon-hdf5.org/"
+
+
+def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> None:
+    """Write `clicks` of `recording` beside `path`, and rename; UsageError without h5py, or when the device's clock went back."""
+    try:
+        h5py: Any = importlib.import_module("h5py")
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            "Photon-HDF5 needs the package h5py, which is not installed", remedy="pip install 'pans-runtime[export]'"
+        ) from error
+    if (np.diff(clicks.start_tick) < 0).any():
+        raise UsageError(
+            f"{recording.path}: the device's clock went back (it was switched off in between): the format has one clock",
+            remedy="export it as csv, which numbers the streams",
+        )
+    beside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with h5py.File(beside, "w") as file:
+            file.attrs["format_name"] = np.bytes_(FORMAT_NAME)
+            file.attrs["format_version"] = np.bytes_(FORMAT_VERSION)
+            _write(file, _tree(path, recording, plan, clicks))
+        os.replace(beside, path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error}") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _write(group: Any, tree: dict[str, Any]) -> None:
+    """Text as bytes, and a title on every node: what readers of the format expect."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            node = group.create_group(name)
+            _write(node, value)
+        else:
+            data = np.bytes_(value.encode()) if isinstance(value, str) else value
+            node = group.create_dataset(name, data=data)
+        node.attrs["TITLE"] = np.bytes_(_TITLES.get(name, name.replace("_", " ")))
+
+
+def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
+    unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
+    channels = plan.n_patterns if plan.mode == "parallel" else 1
+    simulated = bool(recording.header.get("simulated"))
+    profile = recording.header.get("profile", {})
+    device = recording.summary.get("device", {})
+    described = (
+        f"{'SIMULATED. ' if simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "
+        f"{plan.exposure_us:g} us; timestamps are the begin of the exposure. Profile {profile.get('name')}."
+    )
+    identity = {
+        "author": "unknown",
+        "author_affiliation": "unknown",
+        "creator": "unknown",
+        "creator_affiliation": "unknown",
+        "filename": path.name,
+        "filename_full": str(path.resolve()),
+        "creation_time": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()),
+        "software": "pans-runtime",
+        "software_version": __version__,
+        "format_name": FORMAT_NAME,
+        "format_version": FORMAT_VERSION,
+        "format_url": FORMAT_URL,
+    }
+    return {
+        "acquisition_duration": (clicks.last_tick - clicks.first_tick) * unit_s,
+        "description": described,
+        "photon_data": {
+            "timestamps": clicks.start_tick,
+            "timestamps_specs": {"timestamps_unit": unit_s},
+            "detectors": clicks.channel.astype(np.uint8 if channels <= 256 else np.uint16),
+            "measurement_specs": {"measurement_type": "generic", "detectors_specs": {}},
+        },
+        "setup": {
+            "num_pixels": channels,
+            "num_spots": 1,
+            "num_spectral_ch": 1,
+            "num_polarization_ch": 1,
+            "num_split_ch": 1,
+            "modulated_excitation": 0,
+            "lifetime": 0,
+            "excitation_alternated": np.zeros(1, np.uint8),
+            "excitation_cw": np.ones(1, np.uint8),
+        },
+        "identity": identity,
+        "provenance": {
+            "filename": recording.path.name,
+            "filename_full": str(recording.path.resolve()),
+            "creation_time": str(recording.header.get("created_utc", ""))[:19].replace("T", " "),
+            "software": "pans-runtime",
+            "software_version": str(recording.header.get("versions", {}).get("pans", "unknown")),
+        },
+        "user": {
+            "pans": {
+                "simulated": int(simulated),
+                "exposure_us": plan.exposure_us,
+                "exposures": clicks.exposures,
+                "exposure": clicks.exposure,
+                "object": clicks.object,
+                "pattern": clicks.pattern,
+                "decisions": recording.decisions(),
+                "decisions_sha256": recording.decisions_sha256,
+                "device": str(device.get("firmware", "unknown")),
+                "profile": str(profile.get("toml", "")),
+            }
+        },
+    }
+
+
+_TITLES = {
+    "photon_data": "Group containing arrays of photon-data.",
+    "timestamps": "Begin of the exposure of each click, in timestamps_unit.",
+    "timestamps_unit": "Length of one device tick in seconds.",
+    "detectors": "Channel that clicked.",
+    "acquisition_duration": "Measurement duration in seconds.",
+    "pattern": "Pattern that was shown during the exposure of each click; 65535: dark slot.",
+    "object": "Object that stood before the detector at each click; 4294967295: not known.",
+}

@@ -1,0 +1,226 @@
+"""The checks behind `pans verify`: is this file whole, and can what it says be true?
+
+Owns the judgement on files, never their format. `verify_file` never raises for what a file holds: it returns a `Verdict` with
+alerts (odd, usable), violations (a claim that does not hold) and damage (not readable as it was written).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
+from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, parse_bundle, word_means
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
+from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
+from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
+from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
+from pans.runtime.record.format import NO_LABEL
+from pans.runtime.record.parts import chain_violations, first_decision, parts_in
+from pans.runtime.record.recorder import DecisionFlag, Recording, read_recording
+
+_COMPARE_FEATURES_MAX = 16
+_ABSTAIN_CAUSES = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
+
+
+@dataclass(slots=True)
+class FileVerdict:
+    """What was found in one file; `damaged` when it cannot be read as it was written."""
+
+    path: str
+    kind: str
+    alerts: list[str] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
+    damaged: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Nothing at all to report."""
+        return not (self.alerts or self.violations or self.damaged)
+
+
+def file_kind(path: str | Path) -> str:
+    """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
+    if str(path) in shipped_profiles() and not Path(path).exists():
+        return "profile"
+    try:
+        with open(path, "rb") as file:
+            start = file.read(len(BUNDLE_MAGIC))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
+    by_magic = {BUNDLE_MAGIC: "bundle", RECORDING_MAGIC: "recording"}
+    kind = by_magic.get(start) or suffixes.get(Path(path).suffix)  # a damaged magic still has its name
+    if kind is None:
+        raise DamagedFileError(
+            f"{path}: it starts with {start!a}, which is no file of this project",
+            remedy="allowed: bundles (.pans), recordings (.pansrec), profiles (.toml, or a shipped name), calibrations (.json)",
+        )
+    return kind
+
+
+def verify_file(path: str | Path) -> FileVerdict:
+    """Check one file as its kind demands; UsageError only if it is not there."""
+    verdict = FileVerdict(str(path), "unknown")
+    try:
+        verdict.kind = file_kind(path)
+        if verdict.kind == "bundle":
+            _verify_bundle(load_bundle(path)[0], verdict)
+        elif verdict.kind == "recording":
+            _verify_recording(read_recording(path), verdict)
+        elif verdict.kind == "calibration":
+            verdict.alerts += find_warnings(load_calibration(path), now_utc())
+        else:
+            load_profile(str(path))
+    except UsageError:
+        raise
+    except (DamagedFileError, ConfigError) as error:
+        verdict.damaged = True
+        verdict.violations.append(error.message)
+        if verdict.kind == "recording":
+            verdict.violations += _what_survives(path)
+    return verdict
+
+
+def verify_folder(folder: str | Path) -> list[FileVerdict]:
+    """Check each part of the recording in `folder`, and the chain from one to the next; UsageError if there are none."""
+    paths = parts_in(folder)
+    verdicts = [verify_file(path) for path in paths]
+    chain = FileVerdict(str(folder), "parts")
+    if any(verdict.damaged for verdict in verdicts):
+        chain.violations.append("the chain cannot be checked: a part is damaged")
+    else:
+        try:
+            chain.violations += chain_violations([read_recording(path) for path in paths])
+        except DamagedFileError as error:
+            chain.violations.append(error.message)
+    return [*verdicts, chain]
+
+
+def _what_survives(path: str | Path) -> list[str]:
+    try:
+        left = read_recording(path, salvage=True)
+    except PansError:
+        return []
+    return [f"{path}: {left.n_decisions} decisions in the first {left.end_offset} bytes are readable"]
+
+
+def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
+    """Golden vectors on every back end, table against head on every word, and signs of a bad export."""
+    parts = {"table": bundle.table, "onnx": bundle.head_onnx, "int8": bundle.int8_head, "int8-onnx": bundle.int8_onnx}
+    for backend, part in parts.items():
+        if part is not None:
+            try:
+                make_decider(bundle, backend=backend)
+            except DamagedFileError as error:
+                verdict.violations.append(error.message)
+    if verdict.violations:
+        return
+    if bundle.table is not None and bundle.head_onnx is not None and bundle.n_features <= _COMPARE_FEATURES_MAX:
+        words = word_means(np.arange(1 << bundle.n_features), bundle.n_features).astype(np.int64)
+        difference = golden_violation(bundle.table, make_decider(bundle, backend="onnx").scores_batch(words, 1))
+        if difference:
+            verdict.violations.append(f"table and head disagree: {difference}")
+    verdict.alerts += _bundle_alerts(bundle)
+
+
+def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
+    if bundle.analyser is not None:
+        dark = np.flatnonzero(~bundle.analyser.matrix.any(axis=1))
+        if len(dark):
+            yield f"{len(dark)} of {bundle.n_features} detectors get no light (the first: {int(dark[0])})"
+    elif (top := int(bundle.pattern_levels.max())) < bundle.levels - 1:
+        yield f"the brightest pixel is at level {top} of {bundle.levels - 1}: every exposure is longer than it must be"
+    dark = np.flatnonzero(~bundle.pattern_levels.any(axis=1))
+    if len(dark) and bundle.analyser is None:
+        yield f"{len(dark)} of {bundle.n_features} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
+    if bundle.table is not None:
+        never = set(range(bundle.n_classes)) - set(bundle.table.argmax(axis=1).tolist())
+        if never:
+            names = ", ".join(bundle.classes[label] for label in sorted(never)[:5])
+            yield f"{len(never)} classes are never decided by any click word: {names}"
+
+
+def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
+    if not recording.complete:
+        verdict.violations.append(
+            f"incomplete: no END block; {recording.end_offset} of {recording.size} bytes hold whole blocks, "
+            f"with {recording.n_decisions} decisions"
+        )
+    n_classes = _verify_inner_bundle(recording, verdict)
+    _verify_inner_profile(recording, verdict)
+    decisions = recording.decisions()
+    first = first_decision(recording)
+    verdict.violations += _decision_violations(decisions, n_classes, first)
+    verdict.violations += _timing_violations(recording.timings(), first + len(decisions))
+    for _ in recording.events():
+        pass  # reading them is the check
+    for stream, items in (("messages", recording.messages()), ("commands", recording.commands())):
+        times = np.fromiter((host_ns for host_ns, _ in items), dtype=np.int64)
+        if (np.diff(times) < 0).any():
+            verdict.alerts.append(f"the host times of the {stream} go back at {int(np.argmax(np.diff(times) < 0)) + 1}")
+
+
+def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:
+    """Check the bundle inside; return its number of classes (the most there can be, if it is not there)."""
+    data = recording.bundle_data()
+    if not data:
+        verdict.alerts.append("the recording holds no bundle: it can only be replayed beside it")
+        return NO_LABEL
+    bundle = parse_bundle(data, f"{recording.path}: the bundle inside")
+    inner = FileVerdict(verdict.path, "bundle")
+    _verify_bundle(bundle, inner)
+    verdict.violations += [f"the bundle inside: {text}" for text in inner.violations]
+    verdict.alerts += [f"the bundle inside: {text}" for text in inner.alerts]
+    return bundle.n_classes if bundle.picture_shape is None else 1  # a picture's label is 0
+
+
+def _verify_inner_profile(recording: Recording, verdict: FileVerdict) -> None:
+    profile: Any = recording.header.get("profile")
+    text = profile.get("toml") if isinstance(profile, dict) else None
+    if not isinstance(text, str):
+        verdict.alerts.append("the recording holds no hardware profile")
+        return
+    if hashlib.sha256(text.encode()).hexdigest() != profile.get("sha256"):
+        verdict.violations.append("the hardware profile inside does not have the SHA-256 that stands beside it")
+    try:
+        parse_profile(text, "the profile inside")
+    except ConfigError as error:
+        verdict.violations.append(error.message)
+
+
+def _decision_violations(decisions: NDArray[np.void], n_classes: int, first: int) -> Iterator[str]:
+    known = DecisionFlag(0)
+    for flag in DecisionFlag:
+        known |= flag
+    flags, labels, probability = decisions["flags"], decisions["label"], decisions["probability"]
+    abstained = (flags & int(DecisionFlag.ABSTAINED)) != 0
+    finite = np.isfinite(probability) & (probability >= 0) & (probability <= 1)
+    checks = {
+        "is not numbered in sequence": decisions["index"] != first + np.arange(len(decisions), dtype=np.uint64),
+        "has flags that this version does not know": (flags & ~np.uint32(int(known))) != 0,
+        "abstained, but has a label": abstained & (labels != NO_LABEL),
+        f"has a label beyond the {n_classes} classes": ~abstained & (labels >= n_classes),
+        "has a label despite a gap or a wrong pattern": ~abstained & ((flags & int(_ABSTAIN_CAUSES)) != 0),
+        "has a probability outside [0, 1]": ~finite,
+    }
+    for what, bad in checks.items():
+        if bad.any():
+            yield f"decision {int(np.argmax(bad))} {what} ({int(bad.sum())} of {len(decisions)})"
+
+
+def _timing_violations(timings: NDArray[np.void], n_decisions: int) -> Iterator[str]:
+    if len(timings) > 1 and (np.diff(timings["index"].astype(np.int64)) <= 0).any():
+        yield "the timings are not in the order of the decisions"
+    if len(timings) and int(timings["index"].max()) >= n_decisions:
+        yield f"a timing belongs to decision {int(timings['index'].max())}, but there are {n_decisions}"
+    bad = (timings["decided_ns"] < timings["arrival_ns"]) | (timings["recorded_ns"] < timings["decided_ns"])
+    if bad.any():
+        yield f"timing {int(np.argmax(bad))}: decided before it arrived, or recorded before it was decided"

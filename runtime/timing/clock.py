@@ -1,0 +1,170 @@
+"""Device tick <-> host time, with its uncertainty: the only place that converts.
+
+Owns the probe history, the fitted line and its epochs; never reads a clock. `to_host_ns` returns the host time of a tick and how
+far off it may be. Method: a two-way probe bounds the offset at its own tick to half its round trip, whatever the asymmetry of the
+two ways; the quickest probes are kept, a straight line is fitted through their midpoints (weighted least squares with a prior on
+the drift), and the published uncertainty is the tightest bound that any of the latest quick probes gives: half its round trip,
+plus its distance from the line, plus what the rate may have changed since. All in integers relative to a reference, so that nothing
+is lost past 2^53.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.errors import LinkError
+
+NS_PER_S = 1_000_000_000
+HISTORY = 64  # six seconds of probes: long enough for a rate, short enough for a crystal that warms up
+ANCHORS = 8  # the latest quick probes, each of which bounds the error by itself
+DRIFT_PRIOR = 100e-6  # one sigma of the prior on the rate error: crystals are within +-100 ppm
+WANDER = 2e-6  # the rate may differ by this from the fitted one within the history
+READING_NS = 1_000  # both ends stamp to a microsecond or better
+STEP_MARGIN_NS = 20_000
+MAX_UNRECORDED = 4096
+
+CLOCK_DTYPE = np.dtype([("host_ns", "<i8"), ("tick", "<u8"), ("round_trip_ns", "<i8")])
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFit:
+    """host_ns = reference_host_ns + ns_per_tick * (tick - reference_tick); `uncertainty_ns` is the one at the reference.
+
+    `anchors` are (ticks after the reference, bound in ns) of the latest quick probes; `rate_uncertainty` is relative.
+    """
+
+    reference_tick: int
+    reference_host_ns: int
+    ns_per_tick: float
+    uncertainty_ns: float
+    rate_uncertainty: float
+    drift_ppm: float
+    probes: int
+    anchors: tuple[tuple[int, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """The device's counter jumped: at `tick` it was off by `off_ns`, more than the published uncertainty allowed."""
+
+    tick: int
+    off_ns: int
+    allowed_ns: int
+
+
+def unwrap_tick(raw: int, latest: int, bits: int = 32) -> int:
+    """Extend a counter of `bits` bits: the tick nearest to `latest` (a whole tick) whose low bits are `raw`.
+
+    For drivers of devices whose counter wraps; right as long as less than half a wrap lies between the two.
+    """
+    span = 1 << bits
+    if not 0 <= raw < span:
+        raise ValueError(f"raw tick {raw} does not fit {bits} bits")
+    ahead = (raw - latest) % span
+    return max(latest + ahead - (span if ahead >= span // 2 else 0), raw)
+
+
+class ClockModel:
+    """Learns the mapping from probes. A device that restarts needs a new model; a counter that jumps starts a new epoch here."""
+
+    def __init__(self, tick_hz: int) -> None:
+        self.tick_hz = tick_hz
+        self.samples: npt.NDArray[np.void] = np.zeros(HISTORY, CLOCK_DTYPE)
+        self.n_probes = 0  # in all
+        self.epoch = 0  # counts jumps within the session
+        self.fit: ClockFit | None = None
+        self._kept = 0  # since the last jump
+        self._strange = 0
+        self._unrecorded: deque[tuple[int, int, int]] = deque(maxlen=MAX_UNRECORDED)
+
+    def add_probe(self, sent_ns: int, rx_tick: int, tx_tick: int, received_ns: int) -> ClockStep | None:
+        """Take one two-way probe: host send, device arrival and departure in ticks, host receive; refit.
+
+        Returns the jump when the probe cannot be explained without one: the history before it is then left behind.
+        """
+        device_ns = (tx_tick - rx_tick) * NS_PER_S // self.tick_hz
+        round_trip = max(received_ns - sent_ns - device_ns, 0)
+        row = (sent_ns + (received_ns - sent_ns) // 2, rx_tick + (tx_tick - rx_tick) // 2, round_trip)
+        self.n_probes += 1
+        self._unrecorded.append(row)
+        step = self._jump(row)
+        if step is not None:
+            self.epoch += 1
+            self._kept = 0
+        self.samples[self._kept % HISTORY] = row
+        self._kept += 1
+        self.fit = _fit(self.samples[: min(self._kept, HISTORY)], self.tick_hz, (self._kept - 1) % HISTORY)
+        return step
+
+    def to_host_ns(self, tick: int) -> tuple[int, int]:
+        """Return the host time of `tick` and its uncertainty, both in ns; LinkError before the first probe."""
+        fit = self._ready()
+        elapsed = tick - fit.reference_tick
+        rate = fit.ns_per_tick * fit.rate_uncertainty
+        uncertainty = min([bound + abs(elapsed - at) * rate for at, bound in fit.anchors])
+        return fit.reference_host_ns + round(elapsed * fit.ns_per_tick), int(uncertainty) + 1
+
+    def to_tick(self, host_ns: int) -> int:
+        """Return the device tick at a host time (for commands with absolute ticks)."""
+        fit = self._ready()
+        return fit.reference_tick + round((host_ns - fit.reference_host_ns) / fit.ns_per_tick)
+
+    def history(self) -> npt.NDArray[np.void]:
+        """Return the probes that the fit is made of, CLOCK_DTYPE (n,), oldest first: what a part of a recording begins with."""
+        kept = self.samples[: min(self._kept, HISTORY)]
+        return kept[np.argsort(kept["tick"], kind="stable")]
+
+    def take_samples(self) -> npt.NDArray[np.void]:
+        """Return the probes since the last call, CLOCK_DTYPE (n,), for the recording; of more than 4096 the oldest are gone."""
+        taken = np.array(list(self._unrecorded), CLOCK_DTYPE)
+        self._unrecorded.clear()
+        return taken
+
+    def _jump(self, row: tuple[int, int, int]) -> ClockStep | None:
+        host_ns, tick, round_trip = row
+        if self.fit is None or self._kept < ANCHORS:
+            return None
+        expected, uncertainty = self.to_host_ns(tick)
+        allowed = uncertainty + round_trip // 2 + STEP_MARGIN_NS
+        off = host_ns - expected
+        return ClockStep(tick, off, allowed) if abs(off) > allowed else None
+
+    def _ready(self) -> ClockFit:
+        if self.fit is None:
+            raise LinkError("the device clock is not known: no probe has been answered")
+        return self.fit
+
+
+def _fit(samples: npt.NDArray[np.void], tick_hz: int, newest: int) -> ClockFit:
+    round_trip = samples["round_trip_ns"].astype(np.float64)
+    best = float(round_trip.min())
+    # Queueing only ever adds delay: slow probes carry no information that the quick ones do not.
+    quick = np.flatnonzero(round_trip <= 1.5 * best + 20_000.0)
+    quick = quick[np.argsort((quick - newest - 1) % len(samples))]  # oldest first
+    host, tick, trip = samples["host_ns"][quick], samples["tick"][quick], round_trip[quick]
+    reference_host, reference_tick = int(host[-1]), int(tick[-1])
+    ns_per_tick = NS_PER_S / tick_hz
+    ticks = tick.astype(np.int64) - np.int64(reference_tick)
+    ticks_ns = ticks.astype(np.float64) * ns_per_tick
+    offset = (host - reference_host).astype(np.float64) - ticks_ns  # host minus nominal device time, small numbers
+    weight = 1.0 / (trip / 2 + READING_NS) ** 2
+    total = float(weight.sum())
+    mean_t, mean_o = float(weight @ ticks_ns) / total, float(weight @ offset) / total
+    precision = float(weight @ (ticks_ns - mean_t) ** 2) + 1.0 / DRIFT_PRIOR**2
+    rate = float(weight @ ((ticks_ns - mean_t) * (offset - mean_o))) / precision
+    residual = offset - (mean_o + rate * (ticks_ns - mean_t))
+    bounds = trip / 2 + np.abs(residual) + READING_NS + ns_per_tick  # a tick is floored, hence one tick more
+    return ClockFit(
+        reference_tick=reference_tick,
+        reference_host_ns=reference_host + round(mean_o - rate * mean_t),
+        ns_per_tick=ns_per_tick * (1.0 + rate),
+        uncertainty_ns=float(bounds[-1]),
+        rate_uncertainty=3.0 / precision**0.5 + WANDER,
+        drift_ppm=rate * 1e6,
+        probes=len(quick),
+        anchors=tuple(zip(ticks[-ANCHORS:].tolist(), bounds[-ANCHORS:].tolist())),
+    )

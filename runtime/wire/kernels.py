@@ -1,0 +1,268 @@
+"""The compiled kernels of bulk decoding: delimiters, COBS and CRC-32 on one buffer, in place.
+
+Owns the loops over bytes; never allocates, keeps no state of its own and never looks inside a message. `unstuff_frames`
+gives the same frames and counts as `wire.FrameDecoder`, byte for byte (tests/test_wire_bulk.py holds them against each other).
+Imported by whoever measures, before arming: what decodes only a few messages does so in Python and must not pay for numba.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from .schema import MessageType
+
+FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = (
+    range(11)
+)
+SMALLEST_BODY = 12  # header and CRC
+_CLICKS, _FRAMES, _MARK = (int(kind) for kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
+_U = np.uint64
+_ONE, _EIGHT, _SIXTEEN, _BYTE = _U(1), _U(8), _U(16), _U(0xFF)
+_S16, _S24, _S32, _S40, _S48, _S56 = _U(16), _U(24), _U(32), _U(40), _U(48), _U(56)
+_ONES, _HIGHS = _U(0x0101010101010101), _U(0x8080808080808080)
+_LOW32 = _U(0xFFFFFFFF)
+_LONG_RUN = 12  # zeros in a row before it pays to look at eight at once: shorter runs are told apart by no branch
+
+
+def _crc_tables() -> npt.NDArray[np.uint32]:
+    """Tables of the reflected CRC-32 polynomial: row k is the effect of a byte that k further bytes follow."""
+    table = np.zeros((16, 256), np.uint32)
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0xEDB88320 if crc & 1 else 0)
+        table[0, byte] = crc
+    for k in range(1, 16):
+        table[k] = table[0][table[k - 1] & 0xFF] ^ (table[k - 1] >> 8)
+    return table
+
+
+CRC_TABLES = _crc_tables()
+
+
+@njit(cache=True, nogil=True)
+def load8(data, i):  # type: ignore[no-untyped-def]
+    """Eight bytes as a little-endian uint64 from position `i` (uint64); the compiler makes it one load."""
+    return (
+        _U(data[i])
+        | _U(data[i + _ONE]) << _EIGHT
+        | _U(data[i + _U(2)]) << _S16
+        | _U(data[i + _U(3)]) << _S24
+        | _U(data[i + _U(4)]) << _S32
+        | _U(data[i + _U(5)]) << _S40
+        | _U(data[i + _U(6)]) << _S48
+        | _U(data[i + _U(7)]) << _S56
+    )
+
+
+@njit(cache=True, nogil=True)
+def load4(data, i):  # type: ignore[no-untyped-def]
+    """Four bytes as a little-endian number, in a uint64, from position `i` (uint64)."""
+    return (
+        _U(data[i]) | _U(data[i + _ONE]) << _EIGHT | _U(data[i + _U(2)]) << _S16 | _U(data[i + _U(3)]) << _S24
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def crc32_span(data, start, stop, seed):  # type: ignore[no-untyped-def]
+    """CRC-32 of data[start:stop], uint8, continued from `seed`, as zlib.crc32 gives it; a uint64 below 2^32.
+
+    Sixteen bytes a step through sixteen tables ("slicing", Kounavis and Berry 2005): no instruction beyond plain integers.
+    """
+    table = CRC_TABLES
+    crc = _U(seed) ^ _LOW32
+    i, end = _U(start), _U(stop)
+    while i + _SIXTEEN <= end:
+        x = load8(data, i) ^ crc
+        y = load8(data, i + _EIGHT)
+        crc = _U(
+            table[15, x & _BYTE]
+            ^ table[14, (x >> _EIGHT) & _BYTE]
+            ^ table[13, (x >> _S16) & _BYTE]
+            ^ table[12, (x >> _S24) & _BYTE]
+            ^ table[11, (x >> _S32) & _BYTE]
+            ^ table[10, (x >> _S40) & _BYTE]
+            ^ table[9, (x >> _S48) & _BYTE]
+            ^ table[8, x >> _S56]
+            ^ table[7, y & _BYTE]
+            ^ table[6, (y >> _EIGHT) & _BYTE]
+            ^ table[5, (y >> _S16) & _BYTE]
+            ^ table[4, (y >> _S24) & _BYTE]
+            ^ table[3, (y >> _S32) & _BYTE]
+            ^ table[2, (y >> _S40) & _BYTE]
+            ^ table[1, (y >> _S48) & _BYTE]
+            ^ table[0, y >> _S56]
+        )
+        i += _SIXTEEN
+    while i < end:
+        crc = _U(table[0, (crc ^ _U(data[i])) & _BYTE]) ^ (crc >> _EIGHT)
+        i += _ONE
+    return crc ^ _LOW32
+
+
+@njit(cache=True, nogil=True)
+def find_zero(data, start, stop):  # type: ignore[no-untyped-def]
+    """First position in start..stop-1 whose byte is 0, or `stop`; all uint64. Eight bytes a step."""
+    i = start
+    while i + _EIGHT <= stop:
+        v = load8(data, i)
+        # A byte is 0 exactly where adding 0x7F to its low bits and or-ing it gives no high bit: nothing borrows or overflows.
+        if (((v & ~_HIGHS) + ~_HIGHS) | v) & _HIGHS != _HIGHS:
+            break
+        i += _EIGHT
+    while i < stop and data[i] != 0:
+        i += _ONE
+    return i
+
+
+@njit(cache=True, nogil=True)
+def unstuff(data, start, stop):  # type: ignore[no-untyped-def]
+    """Undo COBS on data[start:stop] in place: the body stands at start+1..; return its end, or 0 if it is no COBS string.
+
+    The span holds no zero. A code byte is where the zero of the group before it belongs, so that up to the first full group (255)
+    nothing moves at all. There the walk from code to code has no branch that depends on the data, except that a long run
+    of code 1, the zeros of sparse clicks, goes on eight at a time.
+    """
+    pos = start
+    code = _U(data[pos])
+    run = 0
+    while code != _BYTE:
+        end = pos + code
+        if end >= stop:
+            return stop if end == stop else _U(0)
+        following = _U(data[end])
+        data[end] = 0
+        run = (run + 1) * (following == _ONE)
+        pos = end
+        code = following
+        if run > _LONG_RUN:
+            while pos + _EIGHT < stop and load8(data, pos + _ONE) == _ONES:
+                for k in range(8):
+                    data[pos + _ONE + _U(k)] = 0
+                pos += _EIGHT
+            run = 0
+    return _unstuff_moving(data, pos, stop, code)
+
+
+@njit(cache=True, nogil=True)
+def _unstuff_moving(data, pos, stop, code):  # type: ignore[no-untyped-def]
+    """The rest of `unstuff` from the group at `pos` on, whose code has been read: data moves down by one per full group."""
+    out = pos + _ONE
+    while True:
+        end = pos + code
+        if end > stop:
+            return _U(0)
+        if out == pos + _ONE:
+            out = end
+        else:
+            out = _move_down(data, pos + _ONE, end, out)
+        pos = end
+        if pos >= stop:
+            return out
+        following = _U(data[pos])
+        if code != _BYTE:
+            data[out] = 0
+            out += _ONE
+        code = following
+        while code == _ONE and pos + _EIGHT < stop and load8(data, pos + _ONE) == _ONES:
+            for k in range(8):
+                data[out + _U(k)] = 0
+            pos += _EIGHT
+            out += _EIGHT
+
+
+@njit(cache=True, nogil=True)
+def _move_down(data, source, end, out):  # type: ignore[no-untyped-def]
+    """Copy data[source:end] to data[out:], out < source; return where it ends."""
+    while source + _EIGHT <= end:
+        word = load8(data, source)
+        for k in range(8):
+            data[out + _U(k)] = (word >> _U(8 * k)) & _BYTE
+        source += _EIGHT
+        out += _EIGHT
+    while source < end:
+        data[out] = data[source]
+        source += _ONE
+        out += _ONE
+    return out
+
+
+@njit(cache=True, nogil=True)
+def unstuff_frames(data, used, limit, schema, bodies, tally):  # type: ignore[no-untyped-def]
+    """Decode every frame that ends within data[:used], in place; return how many bodies are good.
+
+    data uint8 (capacity,), limit: longest raw frame in bytes, schema: the CRC's seed, bodies int64 (used // 14 + 1, 2): start and stop
+    of each header + payload, tally int64 (N_TALLIES,): counts are added to, SKIPPING (within an oversized frame) is kept, and
+    CONSUMED is set to the bytes that are done with: the rest is to be put before the next data.
+    """
+    n_bodies = 0
+    start, n_used = _U(0), _U(used)
+    while True:
+        stop = find_zero(data, start, n_used)
+        length = np.int64(stop) - np.int64(start)
+        if tally[SKIPPING]:
+            tally[DISCARDED] += length
+        elif length > limit:
+            tally[OVERSIZED] += 1
+            tally[DISCARDED] += length
+            tally[SKIPPING] = 1
+        if stop >= n_used:
+            break
+        if tally[SKIPPING]:
+            tally[SKIPPING] = 0
+        elif length > 0:
+            end = unstuff(data, start, stop)
+            first = start + _ONE
+            if end == _U(0):
+                tally[COBS_ERRORS] += 1
+                tally[DISCARDED] += length + 1
+            elif np.int64(end) - np.int64(first) < SMALLEST_BODY:
+                tally[SHORT_FRAMES] += 1
+                tally[DISCARDED] += length + 1
+            else:
+                kind = data[first]
+                seed = 0 if kind == 0x01 or kind == 0x81 else schema  # HELLO and WELCOME: wire_schema.UNSEEDED
+                if crc32_span(data, first, end - _U(4), seed) == load4(data, end - _U(4)):
+                    tally[FRAMES] += 1
+                    bodies[n_bodies, 0] = np.int64(first)
+                    bodies[n_bodies, 1] = np.int64(end) - 4
+                    n_bodies += 1
+                else:
+                    tally[CRC_ERRORS] += 1
+                    tally[DISCARDED] += length + 1
+        start = stop + _ONE
+    tally[CONSUMED] = used if tally[SKIPPING] else np.int64(start)
+    return n_bodies
+
+
+@njit(cache=True, nogil=True)
+def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-untyped-def]
+    """Put `data` (bytes) behind what waits in `buffer`, decode as `unstuff_frames` does, and return how many bodies are good.
+
+    HELD bytes from CONSUMED on have no delimiter yet. They are moved to the front only here, before the next data, so that the bodies
+    stay where they are until then.
+    """
+    waiting, held = tally[CONSUMED], tally[HELD]
+    if waiting:
+        for i in range(held):
+            buffer[i] = buffer[waiting + i]
+    for i in range(len(data)):
+        buffer[held + i] = data[i]
+    used = held + len(data)
+    n_bodies = unstuff_frames(buffer, used, limit, schema, bodies, tally)
+    tally[HELD] = used - tally[CONSUMED]
+    tally[BYTES_IN] += len(data)
+    return n_bodies
+
+
+@njit(cache=True, nogil=True)
+def stream_stop(buffer, spans, first, session):  # type: ignore[no-untyped-def]
+    """Return the place of the first body from `first` on that is no CLICKS, FRAMES or MARK of `session`; len(spans) without one."""
+    for place in range(first, spans.shape[0]):
+        start = _U(spans[place, 0])
+        kind = buffer[start]
+        if (kind != _CLICKS and kind != _FRAMES and kind != _MARK) or load4(buffer, start + _U(4)) != _U(session):
+            return place
+    return spans.shape[0]

@@ -1,0 +1,116 @@
+"""Protocol 1 in tables: message types, states, limits and byte layouts (docs/PROTOCOL.md is its specification).
+
+Owns the numbers that both ends must agree on, and the schema hash made from them; never encodes a message (wire.py does) and never
+frames one (framing.py does).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from enum import IntEnum
+
+import numpy as np
+
+from pans.runtime.errors import PansError
+
+PROTOCOL_VERSION = 1
+MAX_PAYLOAD_BYTES = 65536
+MAX_WELCOME_BYTES = 4096
+MAX_ACK_TEXT_BYTES = 512
+DARK_PATTERN = 0xFFFF
+UNKNOWN_TRUTH = -1
+NO_OBJECT = 0xFFFFFFFF
+
+
+class MalformedMessage(PansError):
+    """A frame whose CRC is right but whose payload cannot be meant; counted by the receiver, never fatal."""
+
+
+class MessageType(IntEnum):
+    """First byte of every frame; host to device below 0x80."""
+
+    HELLO = 0x01
+    PING = 0x02
+    COMMAND = 0x03
+    GRANT = 0x04
+    WELCOME = 0x81
+    PONG = 0x82
+    ACK = 0x83
+    STATUS = 0x84
+    CLICKS = 0x90
+    FRAMES = 0x91
+    MARK = 0x92
+
+
+class Opcode(IntEnum):
+    """What a COMMAND asks for."""
+
+    LOAD_PATTERN = 0x01
+    LOAD_PLAN = 0x02
+    ARM = 0x03
+    STOP = 0x04
+    RESET = 0x05
+    GATE = 0x06
+
+
+class DeviceState(IntEnum):
+    """State in STATUS: IDLE takes uploads, ARMED waits for its start tick, RUNNING measures, SAFE is dark until RESET."""
+
+    IDLE = 0
+    ARMED = 1
+    RUNNING = 2
+    SAFE = 3
+
+
+class StateReason(IntEnum):
+    """Why the device is in its state."""
+
+    NONE = 0
+    COMPLETED = 1
+    STOPPED = 2
+    LEASE_EXPIRED = 3
+    POWER_ON = 4
+    FAULT = 5
+
+
+class AckStatus(IntEnum):
+    """Outcome of the command named by `refused_id`."""
+
+    DONE = 0
+    UNKNOWN_OPCODE = 1
+    MALFORMED = 2
+    OUT_OF_RANGE = 3
+    WRONG_STATE = 4
+    TOO_LATE = 5
+
+
+# Layouts, in the order of the fields of the tuples below. The schema hash is computed from this table, so that a change to any
+# layout makes the two ends refuse each other at the handshake instead of misreading each other's bytes.
+LAYOUTS: dict[str, str] = {
+    "HEADER": "<BBHI",
+    "HELLO": "<IHH",
+    "WELCOME": "<IHH",
+    "PING": "<IQ",
+    "PONG": "<IQQQ",
+    "COMMAND": "<IBBH",
+    "ACK": "<IIIHH",
+    "GRANT": "<II",
+    "STATUS": "<BBHIIQQ",
+    "CLICKS": "<IIQQIHHI",
+    "FRAMES": "<IIQQIHHI",
+    "MARK": "<IIhHQQf",
+    "LOAD_PATTERN": "<HHII",
+    "LOAD_PLAN": "<BBHIIIIQHHI",
+    "PLAN_SLOT": "<QHH",
+    "ARM": "<QQII",
+    "GATE": "<QIHH",
+}
+SCHEMA_TEXT = f"pans-wire/{PROTOCOL_VERSION};" + ";".join(f"{name}={layout}" for name, layout in LAYOUTS.items())
+SCHEMA = zlib.crc32(SCHEMA_TEXT.encode("ascii"))
+STRUCTS = {name: struct.Struct(layout) for name, layout in LAYOUTS.items()}
+HEADER = STRUCTS["HEADER"]
+UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
+SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
+BLOCK_HEADER_BYTES = STRUCTS["CLICKS"].size
+MAX_FRAME_BYTES = HEADER.size + MAX_PAYLOAD_BYTES + 4 + (MAX_PAYLOAD_BYTES + 12) // 254 + 2

@@ -1,0 +1,143 @@
+"""Stream messages -> blocks in order, with every gap made visible.
+
+Owns the stream's sequence and the loss accounting; never retransmits, never decides. `StreamTracker.accept` returns the block or
+mark of a stream frame (None when it is damaged or repeated) and the gap before it (None when there is none).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from . import messages as wire
+from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType
+
+SEQUENCE = 1 << 32
+HALF_SEQUENCE = 1 << 31
+# a number further ahead is nonsense: believing it would mean seconds of empty windows at once
+MAX_GAP_EXPOSURES = 1 << 18
+
+
+class Gap(NamedTuple):
+    """Exposures that will never arrive: from `first_exposure` on, `exposures` of them, `dropped_by_device` of those on the device."""
+
+    first_exposure: int
+    exposures: int
+    messages: int
+    dropped_by_device: int
+
+
+@dataclass(slots=True)
+class StreamCounters:
+    """Totals since ARM. `lost_exposures` includes those that the device dropped."""
+
+    messages: int = 0
+    exposures: int = 0
+    gaps: int = 0
+    lost_messages: int = 0
+    lost_exposures: int = 0
+    device_drops: int = 0
+    repeated: int = 0
+    malformed: int = 0
+
+
+class StreamTracker:
+    """Follows one stream from ARM on; sequence numbers and drop counters may wrap."""
+
+    def __init__(self) -> None:
+        self.counters = StreamCounters()
+        self.next_seq = 0
+        self.next_exposure = 0
+        self._drops = 0
+        self._lost_messages = 0  # since the last click block: reported with the next gap in the exposures
+        self._finished = False
+
+    def accept(self, frame: Frame) -> tuple[ClickBlock | FrameBlock | Mark | None, Gap | None]:
+        """Take one stream frame; see the module's docstring."""
+        try:
+            message = _decode(frame)
+        except wire.MalformedMessage:
+            self.counters.malformed += 1
+            return None, None
+        ahead = (message.seq - self.next_seq) % SEQUENCE
+        if ahead >= HALF_SEQUENCE or self._finished:  # seen before, or overtaken: a late photon is useless
+            self.counters.repeated += 1
+            return None, None
+        if not isinstance(message, Mark) and message.exposure_index - self.next_exposure > MAX_GAP_EXPOSURES:
+            self.counters.malformed += 1
+            return None, None
+        self._lost_messages += ahead
+        self.counters.lost_messages += ahead
+        self.counters.messages += 1
+        self.next_seq = (message.seq + 1) % SEQUENCE
+        if isinstance(message, Mark):
+            return message, None
+        n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
+        if message.exposure_index < self.next_exposure:  # a device that counts backwards: never let it rewrite the past
+            self.counters.malformed += 1
+            return None, None
+        gap = self._gap_before(message.exposure_index, message.drops)
+        self.next_exposure = message.exposure_index + n_exposures
+        self.counters.exposures += n_exposures
+        return message, gap
+
+    @property
+    def open(self) -> bool:
+        """Whether the stream has not been finished."""
+        return not self._finished
+
+    @property
+    def position(self) -> tuple[int, int, int]:
+        """The sequence number and exposure that come next, and the device's drop counter."""
+        return self.next_seq, self.next_exposure, self._drops
+
+    def resume(self, position: tuple[int, int, int]) -> None:
+        """Go on from a `position` that another tracker had."""
+        self.next_seq, self.next_exposure, self._drops = position
+
+    def advance(self, position: tuple[int, int], messages: int, exposures: int) -> None:
+        """Account for messages in order and without loss that were taken elsewhere (stream.py), `exposures` of them in blocks."""
+        self.next_seq, self.next_exposure = position
+        self.counters.messages += messages
+        self.counters.exposures += exposures
+        if exposures:
+            self._lost_messages = 0  # whatever was lost before them held no exposures
+
+    def finish(self, next_exposure: int, drops: int) -> Gap | None:
+        """Close the stream: the device says it stopped before `next_exposure`; return the gap at the end, if any.
+
+        What still comes is counted as repeated: it has been reported lost.
+        """
+        self._finished = True
+        if not 0 < next_exposure - self.next_exposure <= MAX_GAP_EXPOSURES:
+            return None
+        gap = self._gap_before(next_exposure, drops)
+        self.next_exposure = next_exposure
+        return gap
+
+    def restart(self) -> None:
+        """Follow the stream of another ARM; the totals go on."""
+        self.next_seq = self.next_exposure = self._drops = self._lost_messages = 0
+        self._finished = False
+
+    def _gap_before(self, exposure_index: int, drops: int) -> Gap | None:
+        missing = exposure_index - self.next_exposure
+        dropped = (drops - self._drops) % SEQUENCE
+        self._drops = drops
+        self.counters.device_drops += dropped
+        lost_messages, self._lost_messages = self._lost_messages, 0
+        if missing == 0:
+            return None
+        self.counters.gaps += 1
+        self.counters.lost_exposures += missing
+        return Gap(self.next_exposure, missing, lost_messages, min(dropped, missing))
+
+
+def _decode(frame: Frame) -> ClickBlock | FrameBlock | Mark:
+    if frame.type == MessageType.CLICKS:
+        return wire.decode_clicks(frame.payload)
+    if frame.type == MessageType.FRAMES:
+        return wire.decode_frames(frame.payload)
+    if frame.type == MessageType.MARK:
+        return wire.decode_mark(frame.payload)
+    raise wire.MalformedMessage(f"type {frame.type:#04x} is no stream message")

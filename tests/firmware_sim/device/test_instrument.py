@@ -1,0 +1,779 @@
+"""The instrument as a state machine: golden conversations, limits, and what must never happen."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse, GateRefusal
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.device.upload import word_bytes
+from pans.firmware_sim.scene.still import load_scene, scene_from_arrays
+from pans.runtime.instrument.click_law import click_law, click_probability, object_transmission
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.messages import (
+    DARK_PATTERN,
+    SLOT_DTYPE,
+    AckStatus,
+    DeviceState,
+    MessageType,
+    Opcode,
+    StateReason,
+)
+
+NONCE = 0x11223344
+POWER_ON = 1000
+IDEAL = load_profile("ideal")  # 1 MHz clock, exposures from 10 us, no readout
+PARALLEL = load_profile("wdm-snspd")
+FULL = 65535
+DECODERS: dict[int, Any] = {
+    MessageType.WELCOME: wire.decode_welcome,
+    MessageType.PONG: wire.decode_pong,
+    MessageType.ACK: wire.decode_ack,
+    MessageType.STATUS: wire.decode_status,
+    MessageType.CLICKS: wire.decode_clicks,
+    MessageType.FRAMES: wire.decode_frames,
+    MessageType.MARK: wire.decode_mark,
+}
+
+
+class Bench:
+    """A host that sends what it is told at the tick it is told, and keeps every answer with the tick at which it came."""
+
+    def __init__(self, profile: Profile = IDEAL, scene: Any = None, **options: Any) -> None:
+        scene = load_scene("uniform") if scene is None else scene
+        self.device = Instrument(profile, scene, power_on_tick=POWER_ON, **options)
+        self.decoder = wire.FrameDecoder()
+        self.command_id = 0
+        self.got: list[tuple[int, Any]] = []
+
+    def send(self, data: bytes) -> list[Any]:
+        return self._keep(self.device.tick, self.device.step(self.device.tick, data))
+
+    def run_to(self, tick: int) -> list[Any]:
+        """Step from event to event until `tick`; return the messages that came."""
+        messages = []
+        while (due := self.device.next_event_tick()) is not None and due <= tick:
+            messages += self._keep(due, self.device.step(due, b""))
+        return messages + self._keep(tick, self.device.step(tick, b""))
+
+    def _keep(self, tick: int, sent: bytes) -> list[Any]:
+        frames = self.decoder.feed(sent)
+        assert all(frame.session == self.device.session for frame in frames)
+        messages = [DECODERS[frame.type](frame.payload) for frame in frames]
+        self.got += [(tick, message) for message in messages]
+        return messages
+
+    def hello(self) -> list[Any]:
+        self.command_id = 0
+        if self.device.session == NONCE:  # another host in between, or it would be a repetition
+            self.device.step(self.device.tick, wire.encode_hello(NONCE + 1))
+        return self.send(wire.encode_hello(NONCE))
+
+    def command(self, opcode: int, body: bytes = b"", command_id: int | None = None) -> Any:
+        if command_id is None:
+            self.command_id = command_id = self.command_id + 1
+        answers = self.send(wire.encode_command(command_id, opcode, body, NONCE))
+        acks = [answer for answer in answers if isinstance(answer, wire.Ack)]
+        assert len(acks) == 1
+        return acks[0]
+
+    def done(self, opcode: int, body: bytes = b"") -> None:
+        ack = self.command(opcode, body)
+        assert ack.refused_id != ack.last_id, ack.text
+
+    def refused(self, opcode: int, body: bytes = b"") -> tuple[int, str]:
+        ack = self.command(opcode, body)
+        assert ack.last_id == ack.refused_id == self.command_id
+        return ack.status, ack.text
+
+    def gate_open(self, channel: int) -> bool:
+        return self.device.gates.is_open(channel, self.device.tick)
+
+    def grant(self, limit: int = 1 << 30, lease_ms: int = 0) -> list[Any]:
+        return self.send(wire.encode_grant(wire.Grant(limit, lease_ms), NONCE))
+
+    def upload(self, levels: np.ndarray, shown: list[int], **changes: Any) -> None:
+        for index, row in enumerate(levels):
+            self.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, 0, len(row), row)))
+        self.done(Opcode.LOAD_PLAN, pack_plan(plan(len(levels), shown, **changes)))
+
+    def ready(self, levels: np.ndarray | None = None, shown: list[int] | None = None, **changes: Any) -> Bench:
+        levels = np.full((2, 4), 100, np.uint16) if levels is None else levels
+        self.hello()
+        self.upload(levels, [0, 1, DARK_PATTERN] if shown is None else shown, **changes)
+        return self
+
+    def arm(self, start: int = 2000, cycles: int = 2, lease_ms: int = 100) -> None:
+        self.done(Opcode.ARM, pack_arm(Arm(start, cycles, lease_ms)))
+
+
+def slots_at(patterns: list[int], period: int = 100) -> np.ndarray:
+    slots = np.zeros(len(patterns), SLOT_DTYPE)
+    slots["offset_ticks"] = np.arange(len(patterns)) * period
+    slots["pattern"] = patterns
+    return slots
+
+
+def plan(n_patterns: int, patterns: list[int], **changes: Any) -> PlanChunk:
+    """Exposures of 80 ticks every 100, one cycle per object, unless changed."""
+    slots = slots_at(patterns)
+    head = PlanChunk(0, n_patterns, len(slots), 0, 80, 100, 100 * len(slots), 16, 1, slots)
+    return head._replace(**changes)
+
+
+def of_type(messages: list[Any], kind: type) -> list[Any]:
+    return [message for message in messages if isinstance(message, kind)]
+
+
+# -- golden conversations ----------------------------------------------------------------------------------------------
+
+
+def test_handshake() -> None:
+    bench = Bench()
+    welcome, status = bench.hello()
+    assert (welcome.schema, welcome.protocol) == (wire.SCHEMA, 1)
+    expected = {
+        "epoch": 1, "tick_hz": 1_000_000, "tick": POWER_ON, "mode": "sequential", "channels": 1, "levels": 65536,
+        "pattern_memory": 65535, "buffer_messages": 256, "simulated": True, "profile": "ideal",
+    }  # fmt: skip
+    assert {key: welcome.facts[key] for key in expected} == expected
+    assert {"firmware", "serial", "pattern_pixels", "slot_memory"} <= set(welcome.facts)
+    assert status == wire.Status(DeviceState.IDLE, StateReason.POWER_ON, 0, 0, POWER_ON, 0)
+
+
+def test_a_whole_run_tick_by_tick() -> None:
+    bench = Bench().ready(np.array([[0, 0], [FULL, FULL]], np.uint16))
+    bench.got.clear()
+    bench.arm(start=2000, cycles=2)
+    bench.grant()
+    bench.run_to(3000)
+    photons = 2 * 10_000.0 * 80e-6
+    story = [(tick, message) for tick, message in bench.got if not isinstance(message, wire.ClickBlock | wire.Ack)]
+    assert story == [
+        (1000, wire.Status(DeviceState.ARMED, StateReason.NONE, 100, 0, 1000, 0)),
+        (2000, wire.Status(DeviceState.RUNNING, StateReason.NONE, 99, 0, 2000, 1)),
+        (2000, wire.Mark(0, 0, -1, 0, 2000, np.float32(photons))),
+        (2300, wire.Mark(2, 1, -1, 3, 2300, np.float32(photons))),
+        (2600, wire.Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, 2600, 6)),
+    ]
+    blocks = [(tick, message) for tick, message in bench.got if isinstance(message, wire.ClickBlock)]
+    assert [(tick, block[:6], block.patterns.tolist()) for tick, block in blocks] == [
+        (2280, (1, 0, 2000, 0, 100, 0), [0, 1, DARK_PATTERN]),
+        (2580, (3, 0, 2300, 3, 100, 1), [0, 1, DARK_PATTERN]),
+    ]
+    assert all(not block.bits[[0, 2]].any() for _, block in blocks)  # no light, no dark counts: no clicks
+    assert bench.device.next_event_tick() == 1_002_600  # the next STATUS
+
+
+def test_the_first_block_byte_by_byte() -> None:
+    """Written from docs/PROTOCOL.md with struct and zlib alone."""
+    bench = Bench().ready(np.full((2, 1), FULL, np.uint16), exposure_ticks=90)
+    bench.arm(start=2000, cycles=1)
+    bench.grant()
+    bench.device.step(2289, b"")
+    sent = bench.device.step(2290, b"")
+    frame = uncobs(sent[: sent.index(0)])
+    body = frame[:-4]
+    assert zlib.crc32(body, 0x2E64AFC4) == struct.unpack("<I", frame[-4:])[0]
+    assert body[:44] == struct.pack("<BBHI", 0x90, 0, 0, NONCE) + struct.pack("<IIQQIHHI", 1, 0, 2000, 0, 100, 3, 0, 0)
+    assert body[44:50] == struct.pack("<HHH", 0, 1, 0xFFFF)
+    assert len(body) == 51
+    assert body[50] & 0b100 == 0  # the dark slot
+
+
+def uncobs(data: bytes) -> bytes:
+    out, position = bytearray(), 0
+    while position < len(data):
+        code = data[position]
+        out += data[position + 1 : position + code] + (b"\0" if code < 255 else b"")
+        position += code
+    return bytes(out[:-1])
+
+
+def test_ping_is_answered_with_the_tick_of_its_arrival() -> None:
+    bench = Bench()
+    bench.hello()
+    bench.run_to(5000)
+    assert bench.send(wire.encode_ping(7, 123456789, NONCE)) == [wire.Pong(7, 123456789, 5000, 5000)]
+
+
+def test_status_comes_once_per_second() -> None:
+    bench = Bench()
+    bench.hello()
+    bench.got.clear()
+    bench.run_to(POWER_ON + 3_500_000)
+    assert [tick for tick, _ in bench.got] == [POWER_ON + 1_000_000 * second for second in (1, 2, 3)]
+
+
+def test_before_a_session_the_device_is_silent() -> None:
+    bench = Bench()
+    assert bench.device.next_event_tick() is None
+    assert bench.device.step(10_000_000, wire.encode_ping(1, 1, NONCE)) == b""
+    assert bench.device.counters.foreign_session == 1
+
+
+def test_an_object_lasts_its_cycles() -> None:
+    scene = scene_from_arrays("three", np.zeros((3, 2, 2), np.uint8), np.array([5, 6, 7]), tuple("abcdefgh"))
+    bench = Bench(scene=scene).ready(cycles_per_object=2)
+    bench.arm(cycles=9)
+    bench.grant()
+    marks = of_type(bench.run_to(10_000), wire.Mark)
+    assert [(mark.object_index, mark.truth, mark.exposure_index, mark.tick) for mark in marks] == [
+        (0, 5, 0, 2000), (1, 6, 6, 2600), (2, 7, 12, 3200), (3, 5, 18, 3800), (4, 6, 24, 4400),
+    ]  # fmt: skip
+
+
+def test_blocks_end_at_their_length_at_a_gap_and_at_the_cycle() -> None:
+    slots = slots_at([0, 1, 0, 1, 0, 1])
+    slots["offset_ticks"][4:] += 50
+    bench = Bench().ready()
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0] * 6, slots=slots, cycle_ticks=650, block_exposures=3)))
+    bench.arm(cycles=1)
+    bench.grant()
+    blocks = of_type(bench.run_to(4000), wire.ClickBlock)
+    assert [(block.exposure_index, block.tick, len(block.bits)) for block in blocks] == [
+        (0, 2000, 3), (3, 2300, 1), (4, 2450, 2),
+    ]  # fmt: skip
+
+
+# -- clicks ------------------------------------------------------------------------------------------------------------
+
+
+def test_mean_clicks_follow_the_click_law() -> None:
+    """More than 1e5 exposures through the whole instrument, on the paper's profile with its modulator and read noise."""
+    profile = load_profile("oled-qcmos")
+    rng = np.random.default_rng(3)
+    images = rng.integers(0, 256, (4, 3, 3), dtype=np.uint8)
+    levels = rng.integers(0, 124, (3, 9)).astype(np.uint16)
+    exposure, period = 20_000, 166_667  # ticks of 0.1 us
+    order = [0, DARK_PATTERN, 1, 2]
+    slots = slots_at(order, period)
+    bench = Bench(profile, scene_from_arrays("noise", images, None, ()), seed=77)
+    bench.hello()
+    bench.upload(levels, order, slots=slots, exposure_ticks=exposure, slot_period_ticks=period, cycle_ticks=4 * period)
+    n_cycles = 28_000
+    bench.arm(start=2000, cycles=n_cycles, lease_ms=3_600_000)
+    counts, n = np.zeros((4, 4)), n_cycles // 4
+    end = 2000 + n_cycles * 4 * period
+    while bench.device.tick < end:
+        bench.grant((1 << 20) + 2 * bench.device.tick // period, 3_600_000)
+        for block in of_type(bench.run_to(min(end, bench.device.tick + 10**9)), wire.ClickBlock):
+            slot = block.exposure_index % 4
+            counts[block.object_index % 4, slot : slot + len(block.bits)] += block.bits
+        bench.got.clear()
+    peak = profile.projector.peak_photoelectrons_hz * 2000e-6
+    lam = object_transmission(profile, images).reshape(4, 9) @ (levels * peak / 123).T
+    p = click_probability(click_law(profile, 2000.0), np.insert(lam, 1, 0.0, axis=1))
+    z = (counts / n - p) / np.sqrt(p * (1 - p) / n)
+    lit = [0, 2, 3]
+    assert np.abs(z[:, lit]).max() < 5
+    assert abs(counts[:, lit].sum() - n * p[:, lit].sum()) < 5 * np.sqrt(n * (p * (1 - p))[:, lit].sum())
+    assert abs(counts[:, 1].sum() - 4 * n * p[0, 1]) < 5 * np.sqrt(4 * n * p[0, 1]) + 1
+
+
+def test_another_seed_gives_other_clicks_and_the_same_seed_the_same() -> None:
+    def bits(seed: int) -> list[int]:
+        bench = Bench(seed=seed).ready(np.full((2, 4), 20_000, np.uint16))
+        bench.arm(cycles=50)
+        bench.grant()
+        return np.concatenate([block.bits for block in of_type(bench.run_to(90_000), wire.ClickBlock)]).tolist()
+
+    assert bits(1) == bits(1)
+    assert bits(1) != bits(2)
+
+
+def test_two_runs_of_a_session_draw_different_clicks() -> None:
+    bench = Bench().ready(np.full((2, 4), 20_000, np.uint16))
+    runs = []
+    for start in (2000, 60_000):
+        bench.arm(start=start, cycles=50)
+        bench.grant()
+        blocks = of_type(bench.run_to(start + 20_000), wire.ClickBlock)
+        assert blocks[0].seq == 1
+        assert blocks[0].exposure_index == 0
+        runs.append(np.concatenate([block.bits for block in blocks]).tolist())
+    assert runs[0] != runs[1]
+
+
+def parallel_bench(n_channels: int = 10, **options: Any) -> Bench:
+    bench = Bench(PARALLEL, **options)
+    bench.hello()
+    levels = np.zeros((n_channels, 1), np.uint16)
+    levels[-1] = 255
+    slots = slots_at([0, DARK_PATTERN, 0], 10_000)
+    bench.upload(
+        levels, [0] * 3, mode=1, slots=slots, exposure_ticks=10_000, slot_period_ticks=10_000, cycle_ticks=30_000
+    )
+    return bench
+
+
+def test_parallel_frames_pack_one_bit_per_channel() -> None:
+    bench = parallel_bench()
+    bench.arm(start=2000, cycles=1000, lease_ms=1000)
+    bench.grant()
+    blocks = of_type(bench.run_to(2000 + 1000 * 30_000), wire.FrameBlock)
+    assert len(blocks) == 1000
+    assert all(block.words.shape == (3, 2) for block in blocks)
+    bits = np.unpackbits(np.stack([block.words for block in blocks]), axis=2, bitorder="little")
+    lit, dark = bits[:, [0, 2], 9].mean(), bits[:, 1, 9].mean()
+    assert lit > 0.99  # ten photoelectrons
+    assert dark < 0.1
+    assert not bits[:, :, 10:].any()
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"), [(1, 1), (8, 1), (9, 2), (16, 2), (17, 4), (32, 4), (33, 8), (64, 8), (65, 16), (400, 56)]
+)
+def test_word_bytes(channels: int, expected: int) -> None:
+    assert word_bytes(channels) == expected
+
+
+# -- chunks and time steps ---------------------------------------------------------------------------------------------
+
+
+def conversation(bench: Bench) -> bytes:
+    """All that a host would send before its run, as one string."""
+    patterns = np.full((2, 4), 9000, np.uint16)
+    bodies = [(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(i, 0, 4, row))) for i, row in enumerate(patterns)]
+    bodies.append((Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1, DARK_PATTERN]))))
+    bodies.append((Opcode.ARM, pack_arm(Arm(2000, 20, 50))))
+    commands = [wire.encode_command(number, *body, NONCE) for number, body in enumerate(bodies, start=1)]
+    ping, grant = wire.encode_ping(1, 5, NONCE), wire.encode_grant(wire.Grant(1000, 0), NONCE)
+    return wire.encode_hello(NONCE) + ping + b"".join(commands) + b"\x07garbage\0" + grant
+
+
+def test_one_byte_at_a_time_changes_nothing() -> None:
+    whole, single = Bench(), Bench()
+    data = conversation(whole)
+    expected = whole.device.step(1500, data)
+    found = b"".join(single.device.step(1500, data[i : i + 1]) for i in range(len(data)))
+    assert found == expected
+    assert whole.device.step(20_000, b"") == single.device.step(20_000, b"")
+
+
+@given(cuts=st.lists(st.integers(1501, 20_000), max_size=40))
+@settings(max_examples=30, deadline=None)
+def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
+    whole, cut = Bench(), Bench()
+    data = conversation(whole)
+    assert whole.device.step(1500, data) == cut.device.step(1500, data)
+    expected = whole.device.step(20_000, b"")
+    assert b"".join(cut.device.step(tick, b"") for tick in [*sorted(cuts), 20_000]) == expected
+
+
+def test_time_does_not_go_back() -> None:
+    bench = Bench()
+    with pytest.raises(ValueError, match="cannot go back"):
+        bench.device.step(POWER_ON - 1, b"")
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_repeated_command_is_acknowledged_and_not_executed_again() -> None:
+    bench = Bench().ready()
+    bench.arm(start=2000, cycles=0)
+    bench.grant()
+    bench.run_to(2500)
+    arm_id = bench.command_id
+    bench.done(Opcode.STOP)
+    assert bench.command(Opcode.ARM, pack_arm(Arm(5000, 0, 100)), command_id=arm_id).last_id == bench.command_id
+    assert bench.device.state is DeviceState.IDLE
+    assert bench.device.counters.repeated_commands == 1
+
+
+def test_a_command_after_a_lost_one_waits_for_its_turn() -> None:
+    bench = Bench()
+    bench.hello()
+    body = pack_pattern(PatternChunk(0, 0, 1, np.array([1], np.uint16)))
+    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=2).last_id == 0
+    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=1).last_id == 1
+    assert bench.command(Opcode.LOAD_PATTERN, body, command_id=2).last_id == 2
+    assert bench.device.counters.commands_out_of_order == 1
+
+
+def test_the_latest_refusal_stays_in_later_acknowledgements() -> None:
+    bench = Bench()
+    bench.hello()
+    bench.refused(0x77)
+    ack = bench.command(Opcode.STOP)
+    assert (ack.last_id, ack.refused_id, ack.status, ack.refused_mask) == (2, 1, AckStatus.UNKNOWN_OPCODE, 2)
+    bench.refused(0x78)
+    ack = bench.command(Opcode.STOP)
+    assert (ack.last_id, ack.refused_id, ack.refused_mask) == (4, 3, 0b1010)
+    assert [ack.refuses(command_id) for command_id in (1, 2, 3, 4)] == [True, False, True, False]
+
+
+def pattern_body(**changes: Any) -> bytes:
+    return pack_pattern(PatternChunk(0, 0, 2, np.array([1, 2], np.uint16))._replace(**changes))
+
+
+PATTERN_FAULTS = [
+    ({"pattern": 65535}, "memory holds 65535"),
+    ({"n_pixels": (1 << 22) + 1}, "allowed 4194304"),
+    ({"first_pixel": 1, "n_pixels": 3}, "expected 0"),
+]
+
+
+@pytest.mark.parametrize(("changes", "text"), PATTERN_FAULTS)
+def test_an_impossible_pattern_is_refused(changes: dict[str, Any], text: str) -> None:
+    bench = Bench()
+    bench.hello()
+    status, said = bench.refused(Opcode.LOAD_PATTERN, pattern_body(**changes))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert text in said
+
+
+def test_levels_above_the_projector_are_refused() -> None:
+    bench = Bench(load_profile("oled-qcmos"))
+    bench.hello()
+    status, said = bench.refused(Opcode.LOAD_PATTERN, pattern_body(levels=np.array([3, 124], np.uint16)))
+    assert (status, said) == (AckStatus.OUT_OF_RANGE, "level 124: the projector has 0..123")
+
+
+def test_pattern_memory_is_limited_in_bytes() -> None:
+    bench = Bench()
+    bench.hello()
+    statuses = []
+    for index in range(33):
+        ack = bench.command(Opcode.LOAD_PATTERN, pattern_body(pattern=index, n_pixels=1 << 22))
+        statuses.append(ack.refused_id == ack.last_id)
+    assert statuses == [False] * 32 + [True]
+
+
+PLAN_FAULTS = [
+    ({"mode": 1}, "this instrument is sequential"),
+    ({"n_patterns": 0}, "0 patterns"),
+    ({"n_patterns": 1}, "shows pattern 1"),
+    ({"exposure_ticks": 8}, "10..1000000 ticks"),
+    ({"exposure_ticks": 102}, "exposures 100 ticks apart"),
+    ({"cycle_ticks": 250}, "exposures 50 ticks apart"),
+    ({"cycle_ticks": 200}, "exposure at 200"),
+    ({"cycle_ticks": 1 << 60}, "cycle of"),
+    ({"block_exposures": 0}, "0 exposures per block"),
+    ({"block_exposures": 40_000}, "40000 exposures per block"),
+    ({"cycles_per_object": 0}, "0 cycles per object"),
+    ({"n_slots": (1 << 20) + 1}, "slots: allowed"),
+    ({"first_slot": 1, "n_slots": 4}, "does not continue"),
+    ({"slots": slots_at([0, 1, 0])[::-1]}, "apart"),
+]
+
+
+@pytest.mark.parametrize(("changes", "text"), PLAN_FAULTS)
+def test_an_impossible_plan_is_refused(changes: dict[str, Any], text: str) -> None:
+    bench = Bench().ready()
+    status, said = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1, DARK_PATTERN])._replace(**changes)))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert text in said
+
+
+def test_patterns_may_not_change_faster_than_the_projector() -> None:
+    profile = replace(IDEAL, projector=replace(IDEAL.projector, pattern_rate_max_hz=5000.0))
+    bench = Bench(profile).ready(shown=[0, 0, 1, 1])  # each shown for two exposures: 200 us
+    status, said = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 0, 1, 0])))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert "patterns change after 100 ticks" in said
+
+
+def test_a_plan_in_two_chunks() -> None:
+    bench = Bench().ready()
+    whole = plan(2, [0, 1, 0, 1])
+    bench.done(Opcode.LOAD_PLAN, pack_plan(whole._replace(slots=whole.slots[:3])))
+    assert bench.refused(Opcode.ARM, pack_arm(Arm(2000, 1, 100)))[0] == AckStatus.WRONG_STATE
+    other = whole._replace(first_slot=3, slots=whole.slots[3:])
+    assert "does not continue" in bench.refused(Opcode.LOAD_PLAN, pack_plan(other._replace(exposure_ticks=90)))[1]
+    bench.done(Opcode.LOAD_PLAN, pack_plan(other))
+    bench.arm(cycles=1)
+    bench.grant()
+    assert len(of_type(bench.run_to(3000), wire.ClickBlock)[0].bits) == 4
+
+
+ARM_FAULTS = [
+    (Arm(POWER_ON, 1, 100), AckStatus.TOO_LATE, "has passed"),
+    (Arm(1 << 63, 1, 100), AckStatus.OUT_OF_RANGE, "ahead"),
+    (Arm(2000, 1, 0), AckStatus.OUT_OF_RANGE, "lease of 0 ms"),
+    (Arm(2000, (1 << 64) - 1, 100), AckStatus.OUT_OF_RANGE, "beyond tick"),
+]
+
+
+@pytest.mark.parametrize(("arm", "status", "text"), ARM_FAULTS)
+def test_an_impossible_arm_is_refused(arm: Arm, status: int, text: str) -> None:
+    found, said = Bench().ready().refused(Opcode.ARM, pack_arm(arm))
+    assert found == status
+    assert text in said
+
+
+def test_arming_needs_a_plan_and_all_its_patterns() -> None:
+    bench = Bench()
+    bench.hello()
+    arm = pack_arm(Arm(2000, 1, 100))
+    assert bench.refused(Opcode.ARM, arm) == (AckStatus.WRONG_STATE, "no complete plan is loaded")
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1])))
+    bench.done(Opcode.LOAD_PATTERN, pattern_body())
+    assert bench.refused(Opcode.ARM, arm) == (AckStatus.WRONG_STATE, "1 of 2 patterns are not loaded")
+    bench.done(Opcode.LOAD_PATTERN, pattern_body(pattern=1, n_pixels=3))
+    assert bench.refused(Opcode.ARM, arm)[0] == AckStatus.WRONG_STATE  # two of its three pixels
+    last = PatternChunk(1, 2, 3, np.array([4], np.uint16))
+    bench.done(Opcode.LOAD_PATTERN, pack_pattern(last))
+    assert bench.refused(Opcode.ARM, arm)[1] == "patterns have different sizes: 2 and 3 pixels"
+
+
+def test_a_scene_of_another_shape_is_refused_with_the_numbers() -> None:
+    scene = scene_from_arrays("small", np.zeros((1, 5, 5), np.uint8), None, ())
+    status, said = Bench(scene=scene).ready().refused(Opcode.ARM, pack_arm(Arm(2000, 1, 100)))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert "4 pixels, scene 'small' has 25" in said
+
+
+def test_uploads_need_idle() -> None:
+    bench = Bench().ready()
+    bench.arm()
+    for opcode, body in [(Opcode.LOAD_PATTERN, pattern_body()), (Opcode.ARM, pack_arm(Arm(9000, 1, 9)))]:
+        assert bench.refused(opcode, body)[0] == AckStatus.WRONG_STATE
+
+
+@given(st.binary(max_size=200), st.sampled_from([*Opcode, 0, 200]))
+@settings(max_examples=200, deadline=None)
+def test_no_command_body_brings_the_device_down(body: bytes, opcode: int) -> None:
+    bench = Bench()
+    bench.hello()
+    assert bench.command(opcode, body).last_id == 1
+
+
+@given(st.binary(max_size=400), st.sampled_from(list(MessageType)))
+@settings(max_examples=200, deadline=None)
+def test_no_frame_brings_the_device_down(payload: bytes, kind: int) -> None:
+    bench = Bench().ready()
+    bench.device.step(1500, wire.encode_frame(kind, payload, NONCE) + payload + b"\0")
+    assert of_type(bench.send(wire.encode_ping(1, 1, bench.device.session)), wire.Pong) or not bench.device.session
+
+
+# -- fail-safe ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_expired_lease_latches_the_device_dark() -> None:
+    bench = Bench().ready()
+    bench.arm(start=2000, cycles=0, lease_ms=10)
+    bench.grant(lease_ms=0)  # no renewal
+    bench.done(Opcode.GATE, pack_gate(Gate(10_500, 5000, 2)))
+    bench.run_to(10_900)
+    assert bench.device.projector_lit
+    assert bench.gate_open(2)
+    messages = bench.run_to(11_000)  # 10 ms after ARM
+    status = of_type(messages, wire.Status)[-1]
+    assert (status.state, status.reason, status.tick) == (DeviceState.SAFE, StateReason.LEASE_EXPIRED, 11_000)
+    assert not bench.device.projector_lit
+    assert not bench.gate_open(2)
+    assert of_type(bench.run_to(500_000), wire.ClickBlock) == []
+    bench.grant(lease_ms=1000)
+    assert bench.device.state is DeviceState.SAFE
+    assert bench.refused(Opcode.ARM, pack_arm(Arm(600_000, 1, 9)))[0] == AckStatus.WRONG_STATE
+    bench.hello()
+    assert bench.device.state is DeviceState.SAFE  # it outlives the session
+    bench.done(Opcode.RESET)
+    assert bench.device.state is DeviceState.IDLE
+
+
+def test_a_renewed_lease_keeps_the_run_going() -> None:
+    bench = Bench().ready()
+    bench.arm(start=2000, cycles=0, lease_ms=10)
+    for tick in range(10_000, 100_000, 9_000):
+        bench.run_to(tick)
+        bench.grant(lease_ms=10)
+        assert bench.device.state is DeviceState.RUNNING
+    bench.run_to(109_000)
+    assert bench.device.state is DeviceState.SAFE
+
+
+def test_the_lease_runs_while_armed() -> None:
+    bench = Bench().ready()
+    bench.arm(start=500_000, lease_ms=10)
+    bench.run_to(11_000)
+    assert bench.device.state is DeviceState.SAFE
+
+
+def test_hello_ends_a_run_and_forgets_uploads() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=0)
+    bench.run_to(2100)
+    bench.send(wire.encode_hello(NONCE))  # a repetition changes nothing
+    assert bench.device.state is DeviceState.RUNNING
+    bench.hello()
+    assert (bench.device.state, bench.device.reason) == (DeviceState.IDLE, StateReason.STOPPED)
+    assert bench.refused(Opcode.ARM, pack_arm(Arm(5000, 1, 100)))[1] == "no complete plan is loaded"
+
+
+def test_stop_sends_what_was_exposed() -> None:
+    bench = Bench().ready()
+    bench.arm(start=2000, cycles=0)
+    bench.grant()
+    bench.run_to(2190)  # two exposures have ended, the third has not begun
+    answers = bench.send(wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE))
+    block, status, ack = answers
+    assert block.patterns.tolist() == [0, 1]
+    assert (status.state, status.reason, status.next_exposure) == (DeviceState.IDLE, StateReason.STOPPED, 2)
+    assert ack.last_id == bench.command_id + 1
+
+
+def test_an_exposure_broken_off_is_no_exposure() -> None:
+    bench = Bench().ready()
+    bench.arm(start=2000, cycles=0)
+    bench.grant()
+    bench.run_to(2150)
+    answers = bench.send(wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE))
+    assert [block.patterns.tolist() for block in of_type(answers, wire.ClickBlock)] == [[0]]
+    assert of_type(answers, wire.Status)[0].next_exposure == 1
+
+
+# -- gates -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_gate_opens_at_its_tick_for_its_time() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=0)
+    bench.done(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))
+    assert list(bench.device.gates.pulses) == [GatePulse(3000, 3050, 1)]
+    states = []
+    for tick in (2999, 3000, 3049, 3050):
+        bench.run_to(tick)
+        states.append(bench.gate_open(1))
+    assert states == [False, True, True, False]
+    assert not bench.gate_open(0)
+
+
+def test_a_late_gate_is_not_executed() -> None:
+    bench = Bench().ready()
+    assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.WRONG_STATE
+    bench.arm(cycles=0)
+    bench.run_to(3000)
+    assert bench.refused(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))[0] == AckStatus.TOO_LATE
+    assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 50, GATE_CHANNELS)))[0] == AckStatus.OUT_OF_RANGE
+    assert bench.refused(Opcode.GATE, pack_gate(Gate(4000, 0, 1)))[0] == AckStatus.OUT_OF_RANGE
+    gates = bench.device.gates
+    assert not gates.pulses
+    assert list(gates.refusals) == [
+        GateRefusal(3000, 1, 3000, AckStatus.TOO_LATE),
+        GateRefusal(4000, GATE_CHANNELS, 3000, AckStatus.OUT_OF_RANGE),
+        GateRefusal(4000, 1, 3000, AckStatus.OUT_OF_RANGE),
+    ]
+    assert (gates.accepted, gates.refused) == (0, 3)
+
+
+def test_stop_closes_gates_and_cancels_those_to_come() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=0)
+    bench.done(Opcode.GATE, pack_gate(Gate(3000, 5000, 1)))
+    bench.done(Opcode.GATE, pack_gate(Gate(9000, 50, 2)))
+    bench.run_to(4000)
+    bench.done(Opcode.STOP)
+    assert list(bench.device.gates.pulses) == [GatePulse(3000, 4000, 1)]
+
+
+def test_pending_gates_are_limited() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=0)
+    for number in range(MAX_PENDING_GATES):
+        bench.done(Opcode.GATE, pack_gate(Gate(5000 + number, 1, 0)))
+    assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+    bench.run_to(5000)
+    bench.done(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))
+    assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
+    assert (bench.device.gates.accepted, bench.device.gates.refused) == (MAX_PENDING_GATES + 1, 2)
+
+
+# -- receive window ----------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_streamed_without_a_grant() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=3)
+    assert of_type(bench.run_to(5000), wire.ClickBlock) == []
+    released = bench.grant(limit=3)
+    assert [message.seq for message in released] == [0, 1, 2]
+    assert [message.seq for message in bench.grant(limit=100)] == [3, 4, 5]
+
+
+def test_a_grant_just_before_arm_counts() -> None:
+    bench = Bench().ready()
+    bench.grant(limit=2)
+    bench.arm(cycles=3)
+    stream = [message for message in bench.run_to(5000) if not isinstance(message, wire.Status)]
+    assert [message.seq for message in stream] == [0, 1]
+
+
+def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
+    bench = Bench(buffer_messages=4).ready()
+    bench.arm(cycles=10)
+    bench.run_to(2000 + 5 * 300 - 1)  # five marks and blocks: four messages are held, three blocks and marks dropped
+    kept = bench.grant(limit=100)
+    assert [message.seq for message in kept] == [0, 1, 2, 3]
+    following = [message for message in bench.run_to(9000) if not isinstance(message, wire.Status)]
+    assert following[0].seq == 4  # a dropped message takes no number
+    first_block = of_type(following, wire.ClickBlock)[0]
+    assert first_block.exposure_index == 15
+    assert first_block.drops == 9
+    assert bench.device.stream.dropped_messages == 6
+    assert of_type([message for _, message in bench.got], wire.Status)[-1].drops == 9
+
+
+def test_every_exposure_is_delivered_or_counted() -> None:
+    bench = Bench(buffer_messages=3).ready()
+    bench.arm(cycles=40)
+    rng = np.random.default_rng(0)
+    limit, delivered = 0, 0
+    messages = []
+    while bench.device.state is not DeviceState.IDLE:
+        messages += bench.run_to(bench.device.tick + int(rng.integers(100, 2000)))
+        limit += int(rng.integers(0, 4))
+        messages += bench.grant(limit, lease_ms=100)
+    messages += bench.grant(1 << 20)
+    delivered = sum(len(block.bits) for block in of_type(messages, wire.ClickBlock))
+    drops = of_type(messages, wire.Status)[-1].drops
+    assert drops > 0
+    assert delivered + drops == 40 * 3
+
+
+def test_the_window_compares_modulo_2_to_the_32() -> None:
+    bench = Bench().ready()
+    bench.arm(cycles=0)
+    bench.device.stream.sequence = 0xFFFFFFFE
+    bench.grant(limit=0xFFFFFFFF)
+    assert [message.seq for message in bench.run_to(2599) if hasattr(message, "seq")] == [0xFFFFFFFE]
+    assert [message.seq for message in bench.grant(limit=1)] == [0xFFFFFFFF, 0]
+
+
+# -- sessions ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_another_session_are_counted_and_ignored() -> None:
+    bench = Bench().ready()
+    bench.device.step(1500, wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE + 1))
+    assert bench.device.counters.foreign_session == 1
+    assert bench.command(Opcode.STOP).last_id == bench.command_id
+
+
+def test_another_schema_is_answered_and_goes_no_further() -> None:
+    bench = Bench()
+    body = struct.pack("<IHH", 0xDEADBEEF, 2, 0)
+    sent = bench.device.step(1500, wire.encode_frame(MessageType.HELLO, body, NONCE))
+    frames = bench.decoder.feed(sent)
+    assert [frame.type for frame in frames] == [MessageType.WELCOME]
+    assert wire.decode_welcome(frames[0].payload).schema == wire.SCHEMA
+    assert bench.device.step(1600, wire.encode_ping(1, 1, NONCE)) == b""
+
+
+def test_a_session_without_a_nonce_is_malformed() -> None:
+    bench = Bench()
+    body = struct.pack("<IHH", wire.SCHEMA, 1, 0)
+    assert bench.device.step(1500, wire.encode_frame(MessageType.HELLO, body, 0)) == b""
+    assert bench.device.counters.malformed == 1

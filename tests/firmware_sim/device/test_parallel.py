@@ -1,0 +1,247 @@
+"""Frames made ahead: the messages of plain loops and the bytes of the reference encoders, whatever happens meanwhile."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from moving_scenes import BAR_LEVELS, CELLS, FLOW, LEVELS, PICTURES, TAPE, TICK_HZ, program
+
+from pans.firmware_sim.commands import bench_flow
+from pans.firmware_sim.device import frame_writer
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.device.parallel import FrameRun, Stretch
+from pans.firmware_sim.device.sequential import Measurement
+from pans.firmware_sim.device.stream_buffer import StreamBuffer
+from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.ports.faults import parse_faults
+from pans.firmware_sim.ports.faulty import FaultyDevice
+from pans.firmware_sim.scene.changes import Changes
+from pans.firmware_sim.scene.detector import detector_model
+from pans.firmware_sim.scene.drawing import ClickSource
+from pans.firmware_sim.scene.exposure_times import Exposures
+from pans.firmware_sim.scene.light import begin, prepare
+from pans.firmware_sim.scene.marks import MARK_PHOTONS, Stamp
+from pans.firmware_sim.scene.moving import Change, SceneFile, Tape
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
+from pans.runtime.wire.messages import DeviceState, Opcode
+
+RNG = np.random.default_rng(5)
+PROFILE = replace(FLOW, detector=replace(FLOW.detector, crosstalk_probability=0.1, afterpulse_probability=0.1))
+CHANGES = (Change("dark", 0.0, 1.0, -1, 90.0), Change("drift", 0.0, 1.0, -1, -50.0))
+
+
+class OneByOne(StreamBuffer):
+    """Every message for itself, through the encoders of pans.runtime.wire."""
+
+    def put_due(self, run: Measurement | FrameRun, tick: int, session: int) -> list[bytes | memoryview]:
+        return self.put_each(run, tick, session)
+
+
+# -- messages ------------------------------------------------------------------------------------------------------------
+
+
+def parts(scene: SceneFile, plan: Program, cycles: int) -> tuple[Any, ClickSource]:
+    levels = BAR_LEVELS if isinstance(scene.what, Tape) else LEVELS
+    exposure_us = plan.exposure_ticks * 1e6 / TICK_HZ
+    exposures, changes = Exposures(plan, cycles or None, TICK_HZ), Changes(scene.changes, 3)
+    light = begin(scene, prepare(PROFILE, scene, levels, exposure_us), plan, exposures, changes, 7, 0)
+    return light, ClickSource(light, exposures, detector_model(PROFILE, exposure_us), changes, 7, 100)
+
+
+def plain_messages(scene: SceneFile, plan: Program, cycles: int, start: int) -> list[Any]:
+    """The stream in plain loops: clicks by the detector's reference, every mark before the first block that ends after it."""
+    light, source = parts(scene, plan, cycles)
+    rows = light.take_marks(cycles * plan.cycle_ticks)
+    photons = rows[:, MARK_PHOTONS].copy().view(np.float64).astype(np.float32).tolist()
+    marks = [
+        wire.Mark(0, number, truth, exposure, tick + start, light, half)
+        for (number, truth, exposure, tick, half, _), light in zip(rows.tolist(), photons)
+    ]
+    light, source = parts(scene, plan, cycles)
+    messages: list[Any] = []
+    before = np.zeros(3, np.uint8)
+    for cycle in range(cycles):
+        for first, count in plan.blocks:
+            begins = start + cycle * plan.cycle_ticks + plan.offsets[first : first + count]
+            while marks and marks[0].tick < begins[-1] + plan.exposure_ticks:
+                messages.append(marks.pop(0))
+            exposure = cycle * plan.n_slots + first
+            clicks = source.clicks(exposure, count, before)
+            before = clicks[-1]
+            words = np.packbits(clicks, axis=1, bitorder="little")
+            number = wire.NO_OBJECT if scene.moves else cycle // plan.cycles_per_object
+            messages.append(wire.FrameBlock(0, 0, int(begins[0]), exposure, plan.slot_period_ticks, number, words))
+    return messages
+
+
+def comparable(message: Any) -> Any:
+    return (*message[:6], message.words.tobytes()) if isinstance(message, wire.FrameBlock) else message
+
+
+@pytest.mark.parametrize("changes", [(), CHANGES], ids=["steady", "changing"])
+@pytest.mark.parametrize("what", [CELLS, TAPE, PICTURES], ids=["cells", "tape", "still"])
+def test_stretches_hold_the_messages_of_plain_loops(what: Any, changes: tuple[Change, ...]) -> None:
+    scene = SceneFile("x", what, changes)
+    cut = replace(program(16, dark=(3,), gap=777), blocks=((0, 9), (9, 1), (10, 6)), cycles_per_object=3)
+    for plan, cycles in ((cut, 400), (program(1), 1200)):
+        light, source = parts(scene, plan, cycles)
+        run = FrameRun(plan, Arm(1000, cycles, 1), light, source, scene.moves)
+        found = []
+        while (due := run.next_tick) is not None:
+            stretch = run.stretch()
+            assert stretch is not None
+            assert stretch.due_by(due - 1) == 0
+            assert stretch.due_by(due) >= 1
+            found.append(comparable(run.emit()))
+        assert found == [comparable(message) for message in plain_messages(scene, plan, cycles, 1000)]
+        assert sum(isinstance(message, wire.Mark) for message in found) > 100
+        assert run.cut(10**9) is None
+        assert not run.draw_ahead()
+
+
+def test_a_run_that_is_broken_off_ends_within_a_block() -> None:
+    plan = replace(program(16), blocks=((0, 10), (10, 6)))
+    for tick in (0, 1000, 1199, 1200, 1449, 1450, 9999, 77_777):
+        light, source = parts(SceneFile("x", CELLS), plan, 0)
+        run = FrameRun(plan, Arm(1000, 0, 1), light, source, moves=True)
+        whole = []
+        while run.next_tick is not None and run.next_tick <= tick:
+            whole.append(run.emit())
+        sent = sum(len(message.words) for message in whole if isinstance(message, wire.FrameBlock))
+        rest = run.cut(tick)
+        assert sent + (len(rest.words) if rest else 0) == run.ended_by(tick)
+        assert run.next_tick is None
+        if rest is not None:
+            light, source = parts(SceneFile("x", CELLS), plan, 0)
+            uncut = FrameRun(plan, Arm(1000, 0, 1), light, source, moves=True)
+            blocks = [
+                m for m in (uncut.emit() for _ in range(400) if uncut.next_tick) if isinstance(m, wire.FrameBlock)
+            ]
+            whole_block = next(block for block in blocks if block.exposure_index == rest.exposure_index)
+            assert whole_block.words[: len(rest.words)].tobytes() == rest.words.tobytes()
+            assert whole_block[:6] == rest[:6]
+
+
+# -- bytes ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lit", [0.0, 0.05, 1.0])
+def test_the_compiled_writer_is_the_reference(lit: float) -> None:
+    stamp = Stamp(0xFFFFFFFE, 0xFFFFFFFF, 0xABCDEF01)
+    for size in (1, 2, 4, 56):
+        counts = [1, 40, 0, 209, 210, 254, 0, 300]
+        n = sum(counts)
+        words = np.where(RNG.random((n, size)) < lit, RNG.integers(1, 256, (n, size)), 0).astype(np.uint8)
+        messages = np.zeros((len(counts), frame_writer.N_COLUMNS), np.int64)
+        first, wanted = 0, []
+        for k, count in enumerate(counts):
+            sequence, tick, exposure = (stamp.sequence + k) & 0xFFFFFFFF, 2**40 + k, 2**33 + k
+            if count:
+                messages[k] = tick, count, tick, exposure, wire.NO_OBJECT, first, 0, 0
+                block = wire.FrameBlock(
+                    sequence, stamp.drops, tick, exposure, 250, wire.NO_OBJECT, words[first : first + count]
+                )
+                wanted.append(wire.encode_frames(block, stamp.session))
+                first += count
+            else:
+                photons = float(RNG.exponential(1e3 * lit))
+                bits = int(np.float32(photons).view(np.uint32))
+                messages[k] = tick, 0, tick, exposure, k, -1, 65535, bits
+                wanted.append(
+                    wire.encode_mark(wire.Mark(sequence, k, -1, exposure, tick, photons, 65535), stamp.session)
+                )
+        stretch = Stretch(messages, words, 250)
+        assert bytes(stretch.take(3, *stamp)) == b"".join(wanted[:3])
+        assert bytes(stretch.take(5, 1, *stamp[1:])) == b"".join(wanted[3:])
+
+
+# -- the whole device ------------------------------------------------------------------------------------------------------
+
+
+def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list[int]]:
+    """All bytes of two runs under random grants, leases, gates, probes, STOP; the choices depend on `seed` alone."""
+    dice, out, tick, limit, number = random.Random(seed), [], 2000, 0, 100
+    closed = seed % 3 > 0
+
+    def step(data: bytes) -> None:
+        out.append(bytes(device.step(tick, data)))
+        for _ in range(ahead()):
+            device.draw_ahead()
+
+    def command(opcode: Opcode, body: bytes) -> None:
+        nonlocal number
+        number += 1
+        step(wire.encode_command(number, opcode, body, bench_flow.SESSION))
+
+    for run in range(2):
+        command(Opcode.STOP, b"")
+        command(Opcode.RESET, b"")
+        command(Opcode.ARM, pack_arm(Arm(tick + 500, 900 if run else 0, 5)))
+        for _ in range(80):
+            tick += dice.choice([1, 50, 777, 5000, 30_000, 200_000])
+            what = dice.random()
+            if what < 0.2:
+                step(wire.encode_ping(tick & 0xFFFF, 5, bench_flow.SESSION))
+            elif what < 0.6:
+                limit = limit + dice.randrange(60) if closed else 1 << 30
+                step(wire.encode_grant(wire.Grant(limit, 5), bench_flow.SESSION))
+            elif what < 0.7:
+                command(Opcode.GATE, pack_gate(Gate(tick + dice.choice([-5, 0, 1, 9999]), 10, 1)))
+            else:
+                step(b"")
+        tick += dice.choice([1, 2_000_000])  # beyond the lease, or not
+    step(wire.encode_grant(wire.Grant(1 << 30, 0), bench_flow.SESSION))
+    return b"".join(out), [tick, limit]
+
+
+def instrument(name: str, capacity: int, one_by_one: bool, changes: tuple[Change, ...] = ()) -> Instrument:
+    """The bench's instrument, its run stopped; command 100 was the last one."""
+    device = bench_flow._armed(name, 10, 5.0, 40)
+    device.scene = replace(device.scene, changes=changes)
+    device.stream = (OneByOne if one_by_one else StreamBuffer)(capacity)
+    for number in range(device._ack.last_id + 1, 101):
+        device.step(0, wire.encode_command(number, Opcode.STOP, b"", bench_flow.SESSION))
+    assert device.state is DeviceState.IDLE
+    return device
+
+
+@pytest.mark.parametrize(("name", "capacity"), [("clothes-in-flow", 256), ("clothes-in-flow", 4), ("bar-tape", 7)])
+def test_made_ahead_or_one_by_one_the_stream_is_the_same(name: str, capacity: int) -> None:
+    dropped = refused = 0
+    for seed in range(6):
+        changes = CHANGES if seed % 2 else ()
+        plain = instrument(name, capacity, True, changes)
+        wanted = story(plain, seed, lambda: 0)
+        dice = random.Random(seed + 1)
+        for ahead in (lambda: 0, lambda: dice.randrange(4)):  # noqa: B023
+            device = instrument(name, capacity, False, changes)
+            assert story(device, seed, ahead) == wanted
+            assert device.stream.dropped_exposures == plain.stream.dropped_exposures
+            assert device.stream.dropped_messages == plain.stream.dropped_messages
+            assert device.counters == plain.counters
+        dropped += plain.stream.dropped_messages
+        refused += plain.gates.refused
+        assert len(wanted[0]) > 5000
+    assert (dropped > 5) == (capacity < 256)
+    assert refused > 10
+
+
+def test_faults_find_the_same_frames() -> None:
+    faults = parse_faults("loss:0.1,flip:0.1,reorder:0.1,late:1ms/5ms")
+    clock = DeviceClock(TICK_HZ, 0, 0)
+
+    def run(one_by_one: bool) -> tuple[bytes, Any]:
+        device = FaultyDevice(
+            lambda epoch, tick: instrument("clothes-in-flow", 256, one_by_one), clock, faults, 3, 1000
+        )
+        return story(device, 0, lambda: 1)[0], device.counters
+
+    assert run(True) == run(False)
+    assert run(True)[1].lost > 10

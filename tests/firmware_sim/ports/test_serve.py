@@ -1,0 +1,471 @@
+"""The simulator's shells: URLs, virtual time, and a pty and TCP through real pyserial (waits are bounded, nothing sleeps)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports import shell
+from pans.firmware_sim.ports.serve import ChildLink, SimOptions, open_sim, parse_sim_url
+from pans.firmware_sim.ports.shell import Port, TcpPort, open_port, serve
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import load_scene
+from pans.runtime.errors import ConfigError, LinkError, UsageError
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link.base import Link, open_link
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
+from pans.runtime.wire.messages import SLOT_DTYPE, DeviceState, MessageType, Opcode, StateReason
+from pans.runtime.wire.session import HostSession
+
+PATIENCE_S = 20.0
+STREAM: dict[int, Any] = {MessageType.MARK: wire.decode_mark, MessageType.CLICKS: wire.decode_clicks}
+FAST = "sim:ideal?scene=uniform&pace=fast"
+needs_pty = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
+
+
+# -- URLs --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_url_names_the_instrument() -> None:
+    assert parse_sim_url("sim:ideal") == SimOptions("ideal")
+    url = "sim:my/lab.toml?scene=a%20b.npz&seed=7&pace=fast&offset=5&drift_ppm=-30.5"
+    assert parse_sim_url(url) == SimOptions("my/lab.toml", "a b.npz", 7, "fast", 5, -30.5)
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("sim:", "is no simulator URL"),
+        ("sim:?seed=1", "is no simulator URL"),
+        ("sim:ideal?sead=1", "unknown key 'sead'"),
+        ("sim:ideal?profile=other", "unknown key 'profile'"),
+        ("sim:ideal?seed", "no list of key=value"),
+        ("sim:ideal?seed=x", "seed must be a whole number, found 'x'"),
+        ("sim:ideal?seed=-1", "seed=-1"),
+        ("sim:ideal?pace=slow", "pace=slow"),
+        ("sim:ideal?offset=-1", "offset=-1"),
+        ("sim:ideal?drift_ppm=nan", "drift_ppm=nan"),
+        ("sim:ideal?drift_ppm=5000", "drift_ppm=5000"),
+        ("sim:ideal?" + "&".join(["seed=1"] * 50), "no list of key=value"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(url: str, text: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_sim_url(url)
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("pace", ["fast", "real"])
+def test_a_wrong_profile_or_scene_is_told_by_the_opener(pace: str) -> None:
+    with pytest.raises(ConfigError):
+        open_sim(f"sim:nowhere?pace={pace}")
+    with pytest.raises(ConfigError):
+        open_sim(f"sim:ideal?scene=nowhere&pace={pace}")
+
+
+@pytest.mark.parametrize("listen", ["", "tcp", "tcp:", "tcp:x", "tcp:127.0.0.1:70000", "udp:1", "pty:1"])
+def test_an_unknown_port_is_refused(listen: str) -> None:
+    with pytest.raises(UsageError, match="cannot listen on"):
+        open_port(listen)
+
+
+def test_a_taken_port_is_a_link_error() -> None:
+    first = open_port("tcp:0")
+    try:
+        with pytest.raises(LinkError, match="cannot listen"):
+            open_port(f"tcp:{first.url.rpartition(':')[2]}")
+    finally:
+        first.close()
+
+
+# -- the device's clock ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drift_ppb", [-100_000, 0, 20_000, 123_456])
+@pytest.mark.parametrize("tick_hz", [1000, 1_000_000, 100_000_000, 10_000_000_000])
+def test_ticks_and_nanoseconds_are_inverse(tick_hz: int, drift_ppb: int) -> None:
+    clock = DeviceClock(tick_hz, 55, drift_ppb)
+    for tick in (55, 56, 1000, 123_456_789, 2**61):
+        host_ns = clock.host_ns_at(tick)
+        assert clock.tick_at(host_ns) >= tick
+        assert host_ns == 0 or clock.tick_at(host_ns - 1) < tick
+    assert clock.tick_at(0) == 55
+
+
+def test_the_clock_drifts_as_told() -> None:
+    clock = DeviceClock(1_000_000, 0, 20_000)
+    assert clock.tick_at(10**9 * 1000) == 1_000_000 * 1000 + 20_000
+
+
+# -- virtual time ------------------------------------------------------------------------------------------------------
+
+
+def opened(link: Link, session: HostSession | None = None) -> tuple[HostSession, wire.FrameDecoder]:
+    """Do the handshake over `link` within PATIENCE_S of the link's own time."""
+    session = session or HostSession(0x5EED)
+    decoder = wire.FrameDecoder()
+    session.start(link.now_ns())
+    deadline = link.now_ns() + int(PATIENCE_S * 1e9)
+    while session.welcome is None and link.now_ns() < deadline:
+        session.poll(link.now_ns())
+        link.write(session.take_output())
+        for frame in decoder.feed(link.read(0.05)):
+            session.on_frame(frame, link.now_ns())
+    assert session.welcome is not None
+    return session, decoder
+
+
+def run_of(link: Link, n_cycles: int = 20, lease_ms: int = 60_000) -> tuple[list[Any], bytes]:
+    """Measure `n_cycles` cycles of three exposures; return the stream's messages and all bytes received after the handshake."""
+    session, decoder = opened(link)
+    slots = np.zeros(3, SLOT_DTYPE)
+    slots["offset_ticks"], slots["pattern"] = [0, 100, 200], [0, 1, wire.DARK_PATTERN]
+    for index in range(2):
+        levels = np.full(2, 2000 * (index + 1), np.uint16)
+        session.submit(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, 0, 2, levels)))
+    session.submit(Opcode.LOAD_PLAN, pack_plan(PlanChunk(0, 2, 3, 0, 90, 100, 300, 16, 1, slots)))
+    session.grant(1 << 20, 0)
+    session.probe(link.now_ns())
+    raw, messages, armed = b"", [], False
+    deadline = link.now_ns() + int(PATIENCE_S * 1e9)
+    while link.now_ns() < deadline:
+        if session.pongs and session.settled and not armed:
+            armed = True
+            start_tick = session.pongs[-1][0].tx_tick + 200_000
+            session.submit(Opcode.ARM, pack_arm(Arm(start_tick, n_cycles, lease_ms)))
+        session.poll(link.now_ns())
+        link.write(session.take_output())
+        data = link.read(0.05)
+        raw += data
+        for frame in decoder.feed(data):
+            session.on_frame(frame, link.now_ns())
+            if frame.type in STREAM:
+                messages.append(STREAM[frame.type](frame.payload))
+        if armed and session.status is not None and session.status.reason == StateReason.COMPLETED:
+            return messages, raw
+    raise AssertionError(f"the run did not complete within {PATIENCE_S} s: {session.status}")
+
+
+def check_run(messages: list[Any], n_cycles: int = 20) -> None:
+    assert [message.seq for message in messages] == list(range(2 * n_cycles))
+    blocks = [message for message in messages if isinstance(message, wire.ClickBlock)]
+    assert [block.exposure_index for block in blocks] == [3 * cycle for cycle in range(n_cycles)]
+    assert all(block.patterns.tolist() == [0, 1, wire.DARK_PATTERN] for block in blocks)
+
+
+def test_a_virtual_run_is_the_same_bit_for_bit() -> None:
+    runs = [run_of(open_sim(FAST + seed)) for seed in ("", "", "&seed=1")]
+    check_run(runs[0][0])
+    assert runs[0][1] == runs[1][1]
+    assert runs[0][1] != runs[2][1]
+
+
+def test_virtual_time_stops_at_each_emission() -> None:
+    link = open_sim(FAST)
+    assert isinstance(link, VirtualLink)
+    assert (link.simulated, link.virtual, link.name) == (True, True, FAST)
+    assert link.now_ns() == START_NS
+    assert link.read(0.5) == b""  # nothing to come before a session
+    assert link.now_ns() == START_NS + 500_000_000
+    opened(link)
+    before = link.now_ns()
+    status = link.read(10.0)
+    assert len(status) > 20
+    second = link.now_ns() - before
+    assert second == link.clock.host_ns_at(link.device.next_event_tick() - 1_000_000) - before
+    assert abs(second - 10**9) < 50_000  # 20 ppm fast, and one microsecond tick
+    assert link.read(0.0) == b""
+
+
+def test_a_closed_virtual_link_is_gone() -> None:
+    link = open_sim(FAST)
+    link.close()
+    link.close()
+    for use in (lambda: link.read(0.1), lambda: link.write(b"\0")):
+        with pytest.raises(LinkError, match="is closed"):
+            use()
+
+
+def test_open_link_finds_the_simulator() -> None:
+    link = open_link(FAST)
+    assert link.simulated
+    link.close()
+
+
+# -- real pace, through pyserial ---------------------------------------------------------------------------------------
+
+
+class SerialClient:
+    """pyserial as the tests' own minimal link."""
+
+    name, simulated, virtual = "test", True, False
+
+    def __init__(self, url: str) -> None:
+        target = url.removeprefix("serial:")
+        self.port = serial.serial_for_url(target.removeprefix("//"), timeout=0.05)
+
+    def read(self, timeout_s: float) -> bytes:
+        return bytes(self.port.read(self.port.in_waiting or 1))
+
+    def write(self, data: bytes) -> None:
+        self.port.write(data)
+
+    def now_ns(self) -> int:
+        return time.perf_counter_ns()
+
+    def close(self) -> None:
+        self.port.close()
+
+
+@contextmanager
+def serving(listen: str) -> Iterator[tuple[Port, Instrument]]:
+    """An instrument behind a real port, served by a thread; a failure there fails the test."""
+    profile = load_profile("ideal")
+    clock = DeviceClock(profile.clock.tick_hz)
+    device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(time.perf_counter_ns()))
+    port, stop, died = open_port(listen), threading.Event(), []
+
+    def work() -> None:
+        try:
+            serve(device, clock, port, stop.is_set)
+        except BaseException as error:
+            died.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield port, device
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+        port.close()
+    assert not thread.is_alive()
+    assert not died
+
+
+LISTEN = [pytest.param("pty", marks=needs_pty), "tcp:127.0.0.1:0"]
+
+
+@pytest.mark.parametrize("listen", LISTEN)
+def test_a_run_over_a_real_port(listen: str) -> None:
+    with serving(listen) as (port, _):
+        client = SerialClient(port.url)
+        try:
+            check_run(run_of(client)[0])
+        finally:
+            client.close()
+
+
+@pytest.mark.parametrize("listen", LISTEN)
+def test_a_client_that_hangs_up_leaves_the_light_off_and_may_return(listen: str) -> None:
+    with serving(listen) as (port, device):
+        client = SerialClient(port.url)
+        with pytest.raises(AssertionError, match="did not complete"):
+            run_until_lit(client, device)
+        client.close()
+        wait_for(lambda: device.state is DeviceState.SAFE)
+        assert not device.projector_lit
+        again = SerialClient(port.url)
+        try:
+            session, decoder = opened(again, HostSession(0xBEEF))
+            assert session.welcome is not None
+            session.submit(Opcode.RESET)
+            wait_for(lambda: exchange(again, session, decoder).settled)
+            check_run(run_of(again)[0])
+        finally:
+            again.close()
+
+
+def run_until_lit(client: SerialClient, device: Instrument) -> None:
+    """Start an endless run with a short lease, and give up on it as soon as the projector is lit."""
+    original = client.read
+
+    def read(timeout_s: float) -> bytes:
+        if device.projector_lit:
+            raise AssertionError("did not complete: hung up")
+        return original(timeout_s)
+
+    client.read = read  # type: ignore[method-assign]
+    run_of(client, n_cycles=0, lease_ms=300)
+
+
+def exchange(client: SerialClient, session: HostSession, decoder: wire.FrameDecoder) -> HostSession:
+    session.poll(client.now_ns())
+    client.write(session.take_output())
+    for frame in decoder.feed(client.read(0.05)):
+        session.on_frame(frame, client.now_ns())
+    return session
+
+
+def wait_for(condition: Any) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+
+
+def test_bytes_cross_the_port_unchanged() -> None:
+    """All 256 values, so that no terminal mode translates, echoes or swallows any."""
+    listens = ["tcp:0", "pty"] if hasattr(os, "openpty") else ["tcp:0"]
+    for listen in listens:
+        port = open_port(listen)
+        client = SerialClient(port.url)
+        data = bytes(range(256)) * 3
+        client.write(data)
+        received = b""
+        deadline = time.monotonic() + PATIENCE_S
+        while len(received) < len(data) and time.monotonic() < deadline:
+            port.wait(0.05, False)
+            received += port.read()
+        assert received == data
+        assert port.write(data) == len(data)
+        client.port.timeout = PATIENCE_S
+        assert client.port.read(len(data)) == data
+        client.close()
+        port.close()
+
+
+def test_tcp_listens_on_loopback_unless_told_otherwise() -> None:
+    port = open_port("tcp:0")
+    assert port.url.startswith("serial:socket://127.0.0.1:")
+    port.close()
+
+
+def test_without_a_client_output_is_lost_not_kept() -> None:
+    port = TcpPort("127.0.0.1", 0)
+    assert port.write(b"abc") == 3
+    assert port.read() == b""
+    port.close()
+
+
+class StuckPort:
+    """A port whose client never reads."""
+
+    url = "stuck"
+
+    def __init__(self) -> None:
+        self.waits = 0
+        self.largest = 0
+
+    def read(self) -> bytes:
+        return b""
+
+    def write(self, data: bytes) -> int:
+        self.largest = max(self.largest, len(data))
+        return 0
+
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
+        self.waits += 1
+        return False
+
+    def close(self) -> None:
+        pass
+
+
+class Talker:
+    """A device that always has something to say."""
+
+    session = 0
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        return b"x" * 1000 + b"\0"
+
+    def next_event_tick(self) -> int | None:
+        return None
+
+    def draw_ahead(self) -> bool:
+        return False
+
+
+def test_a_client_that_never_reads_costs_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shell, "MAX_BACKLOG_BYTES", 10_000)
+    port = StuckPort()
+    serve(Talker(), DeviceClock(1_000_000), port, lambda: port.waits > 100)
+    assert port.largest == 9 * 1001  # whole outputs only
+
+
+# -- processes of their own --------------------------------------------------------------------------------------------
+
+
+def test_real_pace_runs_in_a_process_that_ends_with_the_link() -> None:
+    link = open_sim("sim:ideal?scene=uniform")
+    assert isinstance(link, ChildLink)
+    try:
+        assert (link.simulated, link.virtual) == (True, False)
+        child = link._child
+        assert child.pid != os.getpid()
+        check_run(run_of(link)[0])
+    finally:
+        link.close()
+    assert child.poll() == 0
+    link.close()
+
+
+def test_the_child_ends_when_its_parent_dies() -> None:
+    code = "import os, sys; from pans.firmware_sim.ports.serve import open_sim\n"
+    code += "link = open_sim('sim:ideal?scene=uniform'); print(link._child.pid, flush=True); os._exit(9)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        parent.stdout.read()  # also the child has closed it: it is gone
+    assert parent.returncode == 9
+
+    def gone() -> bool:
+        try:
+            return "State:\tZ" in Path(f"/proc/{pid}/status").read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            return True
+
+    if sys.platform == "linux":
+        wait_for(gone)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to catch")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("how", [["-m", "pans.firmware_sim"], ["-m", "pans.runtime.cli", "simulate"]])
+def test_simulate_prints_its_url_and_serves_until_told_to_end(how: list[str], number: int, code: int) -> None:
+    if "pans.runtime.cli" in how:
+        how = ["-c", "import sys; from pans.runtime.cli import main; sys.exit(main())", "simulate"]
+    words = [sys.executable, *how, "--profile", "ideal", "--scene", "uniform", "--listen", "tcp:0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().decode().strip()
+            client = SerialClient(url)
+            session, _ = opened(client)
+            assert session.welcome is not None
+            assert session.welcome.facts["simulated"] is True
+            client.close()
+            process.send_signal(number)
+            assert process.wait(PATIENCE_S) == code
+        finally:
+            process.kill()
+
+
+def test_a_mistake_on_the_command_line_is_told() -> None:
+    words = [sys.executable, "-m", "pans.firmware_sim", "--profile", "nowhere"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "there is no profile 'nowhere'" in done.stderr
+
+
+def test_the_simulator_starts_lean() -> None:
+    code = "import sys, pans.firmware_sim.commands; print([m for m in sys.modules if '.' not in m])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    for heavy in ("numba", "onnxruntime", "rich", "torch", "usb"):
+        assert f"'{heavy}'" not in done.stdout

@@ -1,0 +1,168 @@
+"""The detector: against its slow oracle, its law, and the quality of its random numbers (5 sigma, fixed seeds)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import naive_detector as naive
+import numpy as np
+import pytest
+
+from pans.firmware_sim.scene.detector import (
+    DetectorModel,
+    detector_model,
+    first_click_probability,
+    sample_clicks,
+    uniform_numbers,
+)
+from pans.runtime.instrument.click_law import ClickLaw, click_probability
+from pans.runtime.instrument.profile import load_profile
+
+N = 200_000
+QUIET = ClickLaw()
+
+
+def no_clicks(channels: int) -> np.ndarray:
+    return np.zeros(channels, np.uint8)
+
+
+def five_sigma(p: float, n: int) -> float:
+    return 5 * np.sqrt(p * (1 - p) / n)
+
+
+# -- random numbers ----------------------------------------------------------------------------------------------------
+
+
+def test_numbers_equal_the_oracle() -> None:
+    for seed, first, stream in [(0, 0, 0), (7, 2**40, 1), (2**64 - 1, 2**64 - 2, 2)]:
+        found = uniform_numbers(seed, first, 4, 3, stream)
+        expected = [[naive.number(seed, first + t, c, stream) for c in range(3)] for t in range(4)]
+        assert found.tolist() == expected
+
+
+def test_numbers_are_uniform() -> None:
+    numbers = uniform_numbers(3, 0, N, 1).ravel()
+    assert numbers.min() >= 0
+    assert numbers.max() < 1
+    assert abs(numbers.mean() - 0.5) < 5 / np.sqrt(12 * N)
+    assert abs(numbers.var() - 1 / 12) < 5 * np.sqrt(1 / 180 / N)
+    counts = np.bincount((numbers * 1000).astype(int), minlength=1000)
+    chi2 = ((counts - N / 1000) ** 2 / (N / 1000)).sum()
+    assert abs(chi2 - 999) < 5 * np.sqrt(2 * 999)
+
+
+@pytest.mark.parametrize("lag", [1, 2, 3, 10, 64])
+def test_numbers_of_neighbouring_exposures_are_uncorrelated(lag: int) -> None:
+    numbers = uniform_numbers(11, 12345, N, 1).ravel() - 0.5
+    assert abs((numbers[lag:] * numbers[:-lag]).mean() * 12) < 5 / np.sqrt(N - lag)
+
+
+def test_channels_streams_and_seeds_are_uncorrelated() -> None:
+    base = uniform_numbers(1, 0, N // 4, 4)
+    others = [uniform_numbers(2, 0, N // 4, 4), uniform_numbers(1, 0, N // 4, 4, 1), uniform_numbers(1, 1, N // 4, 4)]
+    others.append(np.roll(base, 1, axis=1))
+    for other in others:
+        assert abs(((base - 0.5) * (other - 0.5)).mean() * 12) < 5 / np.sqrt(base.size)
+
+
+# -- the law -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "law",
+    [QUIET, ClickLaw(0.02), ClickLaw(1e-4, 0.3, 0.5), ClickLaw(0.9)],
+    ids=["ideal", "dark", "qcmos", "bright dark"],
+)
+def test_mean_clicks_follow_the_law(law: ClickLaw) -> None:
+    photoelectrons = np.array([0.0, 0.01, 0.3, 1.0, 4.0])
+    model = DetectorModel(law)
+    p = first_click_probability(model, photoelectrons)
+    assert np.array_equal(p, click_probability(law, photoelectrons))
+    clicks = sample_clicks(model, np.broadcast_to(p, (N, 5)), 9, 0, no_clicks(5))
+    for channel in range(5):
+        assert abs(clicks[:, channel].mean() - p[channel]) <= five_sigma(p[channel], N)
+
+
+def test_clicks_without_memory_are_independent() -> None:
+    clicks = sample_clicks(DetectorModel(QUIET), np.full((N, 2), 0.3), 4, 0, no_clicks(2)).astype(float) - 0.3
+    limit = 5 * 0.21 / np.sqrt(N)
+    assert abs((clicks[1:, 0] * clicks[:-1, 0]).mean()) < limit
+    assert abs((clicks[:, 0] * clicks[:, 1]).mean()) < limit
+
+
+@pytest.mark.parametrize(
+    ("p_ap", "p_ct", "channels"),
+    [(0, 0, 3), (0.3, 0, 1), (0.3, 0, 4), (0, 0.2, 5), (0.3, 0.2, 5), (1, 0, 2), (0, 1, 3)],
+)
+def test_clicks_equal_the_oracle(p_ap: float, p_ct: float, channels: int) -> None:
+    model = DetectorModel(QUIET, afterpulse_probability=p_ap, crosstalk_probability=p_ct)
+    probability = np.random.default_rng(1).random((300, channels)) * 0.5
+    for previous in (no_clicks(channels), np.ones(channels, np.uint8)):
+        found = sample_clicks(model, probability, 21, 1000, previous)
+        expected = naive.clicks(p_ap, p_ct, probability.tolist(), 21, 1000, previous.tolist())
+        assert found.dtype == np.uint8
+        assert found.tolist() == expected
+
+
+@pytest.mark.parametrize(("p_ap", "p_ct"), [(0, 0), (0.2, 0), (0, 0.1), (0.2, 0.1)])
+def test_splitting_a_run_changes_nothing(p_ap: float, p_ct: float) -> None:
+    model = DetectorModel(QUIET, afterpulse_probability=p_ap, crosstalk_probability=p_ct)
+    probability = np.random.default_rng(2).random((500, 6)) * 0.4
+    whole = sample_clicks(model, probability, 8, 70, no_clicks(6))
+    parts, previous, first = [], no_clicks(6), 0
+    for size in (1, 2, 97, 0, 150, 250):
+        part = sample_clicks(model, probability[first : first + size], 8, 70 + first, previous)
+        previous = part[-1] if size else previous
+        parts.append(part)
+        first += size
+    assert np.array_equal(np.concatenate(parts), whole)
+
+
+def test_afterpulsing_raises_the_mean_as_a_markov_chain_does() -> None:
+    p, p_ap = 0.2, 0.1
+    model = DetectorModel(QUIET, afterpulse_probability=p_ap)
+    clicks = sample_clicks(model, np.full((N, 1), p), 6, 0, no_clicks(1)).ravel().astype(float)
+    primed = 1 - (1 - p) * (1 - p_ap)
+    after = clicks[1:][clicks[:-1] > 0]
+    assert abs(after.mean() - primed) < five_sigma(primed, len(after))
+    stationary = p / (1 - primed + p)
+    correlation = primed - p
+    sigma = np.sqrt(stationary * (1 - stationary) * (1 + correlation) / (1 - correlation) / N)
+    assert abs(clicks.mean() - stationary) < 5 * sigma
+    assert stationary - p > 10 * sigma  # the effect itself is visible
+
+
+def test_crosstalk_reaches_both_neighbours_and_no_further() -> None:
+    model = DetectorModel(QUIET, crosstalk_probability=0.1)
+    probability = np.zeros((N, 5))
+    probability[:, 2] = 0.5
+    clicks = sample_clicks(model, probability, 6, 0, no_clicks(5))
+    assert not clicks[:, [0, 4]].any()
+    for neighbour in (1, 3):
+        assert abs(clicks[:, neighbour].mean() - 0.05) < five_sigma(0.05, N)
+        assert not (clicks[:, neighbour] & ~clicks[:, 2] & 1).any()
+
+
+# -- the profile's effects ---------------------------------------------------------------------------------------------
+
+
+def test_only_declared_effects_are_modelled() -> None:
+    assert detector_model(load_profile("ideal"), 1000.0) == DetectorModel(ClickLaw())
+    spad = detector_model(load_profile("dmd-spad"), 50.0)
+    assert spad.afterpulse_probability == 0.005
+    assert spad.dead_fraction == 0  # 24 ns of 50 us
+    fast = detector_model(load_profile("wdm-snspd"), 1.0)
+    assert fast.dead_fraction == pytest.approx(6.7e-3)
+    assert fast.crosstalk_probability == 0.001
+
+
+def test_crosstalk_needs_neighbours() -> None:
+    profile = load_profile("ideal")
+    profile = replace(profile, detector=replace(profile.detector, crosstalk_probability=0.1))
+    assert detector_model(profile, 1000.0).crosstalk_probability == 0
+
+
+def test_dead_time_saturates_the_rate() -> None:
+    model = DetectorModel(ClickLaw(0.1), dead_fraction=0.5)
+    p = first_click_probability(model, np.array([0.0, 1.9, 1e6]))
+    np.testing.assert_allclose(p, -np.expm1(-np.array([0.1 / 1.05, 2.0 / 2.0, 2.0])), rtol=1e-5)

@@ -1,0 +1,79 @@
+"""The compiled detector draws the very bits of the plain one; the sparse optics the very sums of the dense one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pans.firmware_sim.scene.detector import DetectorModel, sample_clicks, uniform_numbers
+from pans.firmware_sim.scene.detector_kernels import click_thresholds, sample_words, sparse_patterns, sparse_sums
+from pans.runtime.instrument.click_law import ClickLaw
+
+PLAIN = DetectorModel(ClickLaw())
+
+
+def draw(
+    model: DetectorModel, p: np.ndarray, rows: np.ndarray, first: int, previous: np.ndarray, width: int
+) -> np.ndarray:
+    words = np.full((len(rows), width), 0xEE, np.uint8)
+    with np.errstate(over="ignore"):
+        sample_words(model, p, rows, 42, first, previous, words)
+    return words
+
+
+@pytest.mark.parametrize("channels", [1, 8, 10, 70])
+@pytest.mark.parametrize(("p_ap", "p_ct"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.2), (0.3, 0.2)])
+def test_the_bits_are_those_of_the_plain_detector(channels: int, p_ap: float, p_ct: float) -> None:
+    model = replace(PLAIN, afterpulse_probability=p_ap, crosstalk_probability=p_ct)
+    rng = np.random.default_rng(channels)
+    p = rng.random((5, channels))
+    p[0], p[1], p[2] = 0.0, 1.0, 2.0**-53
+    rows = rng.integers(0, 5, 300)
+    before = rng.integers(0, 2, channels).astype(np.uint8)
+    wanted = sample_clicks(model, p[rows], 42, 2**33, before)
+    width = -(-channels // 8) + 1
+    previous = before.copy()
+    words = np.concatenate(
+        [draw(model, p, rows[:120], 2**33, previous, width), draw(model, p, rows[120:], 2**33 + 120, previous, width)]
+    )
+    assert (np.unpackbits(words, axis=1, bitorder="little")[:, :channels] == wanted).all()
+    assert (previous == wanted[-1]).all()
+    assert (words[:, -1] == 0).all()
+
+
+def test_thresholds_are_exact() -> None:
+    numbers = uniform_numbers(3, 0, 2000, 1).ravel()
+    whole = (numbers * 2.0**53).astype(np.uint64)
+    for p in (0.0, 2.0**-53, 0.1, 0.5, np.nextafter(1, 0), 1.0, *numbers[:20], *np.nextafter(numbers[:20], 1)):
+        assert ((whole < click_thresholds(np.array(p))) == (numbers < p)).all()
+
+
+def test_sparse_sums_are_exact() -> None:
+    rng = np.random.default_rng(1)
+    levels = np.where(rng.random((6, 784)) < 0.1, rng.integers(0, 65536, (6, 784)), 0).astype(np.uint16)
+    levels[2] = 0
+    images = rng.integers(0, 256, (20, 784), dtype=np.uint8)
+    out = np.empty((20, 6))
+    sparse_sums(images, *sparse_patterns(levels), out)
+    assert (out == images.astype(np.int64) @ levels.astype(np.int64).T).all()
+
+
+def test_kernels_without_the_compiler() -> None:
+    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+        pytest.skip("this is the run without compilation")
+    names = [
+        "test_the_bits_are_those_of_the_plain_detector[0.0-0.0-10]",
+        "test_the_bits_are_those_of_the_plain_detector[0.3-0.2-10]",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

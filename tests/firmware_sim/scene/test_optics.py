@@ -1,0 +1,66 @@
+"""Optics: lambda against the plain formula, exactness, and what does not fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pans.firmware_sim.scene import optics
+from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
+from pans.firmware_sim.scene.still import Scene, load_scene, scene_from_arrays
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.click_law import object_transmission
+from pans.runtime.instrument.profile import ObjectModulator, Profile, load_profile
+
+RNG = np.random.default_rng(5)
+SCENE: Scene = scene_from_arrays("noise", RNG.integers(0, 256, (9, 7, 6), dtype=np.uint8), None, ())
+LEVELS = RNG.integers(0, 124, (4, 42)).astype(np.uint16)
+
+
+def profiles() -> list[Profile]:
+    paper, ideal = load_profile("oled-qcmos"), load_profile("ideal")
+    coarse = replace(paper, object_modulator=ObjectModulator(contrast=20.0, levels=5))
+    return [ideal, paper, coarse]
+
+
+@pytest.mark.parametrize("profile", profiles(), ids=["ideal", "paper", "coarse"])
+def test_lambda_is_the_sum_of_pattern_times_transmission(profile: Profile) -> None:
+    pattern = LEVELS * photons_per_level(profile, 1500.0)
+    expected = object_transmission(profile, SCENE.images).reshape(9, -1) @ pattern.T
+    found = expected_photoelectrons(profile, SCENE, LEVELS, 1500.0)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_the_top_level_yields_the_peak_rate() -> None:
+    profile = load_profile("oled-qcmos")
+    top = profile.projector.levels - 1
+    one = expected_photoelectrons(profile, load_scene("uniform"), np.array([[top]], np.uint16), 2000.0)
+    assert one[0, 0] == pytest.approx(profile.projector.peak_photoelectrons_hz * 2e-3, rel=1e-15)
+
+
+def test_uniform_passes_everything_and_dark_nothing() -> None:
+    profile = load_profile("oled-qcmos")
+    uniform = expected_photoelectrons(profile, load_scene("uniform"), LEVELS, 1000.0)
+    np.testing.assert_allclose(uniform[0], LEVELS.sum(1) * photons_per_level(profile, 1000.0), rtol=1e-14)
+    assert not expected_photoelectrons(profile, load_scene("dark"), LEVELS, 1000.0).any()
+
+
+def test_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    profile = load_profile("oled-qcmos")
+    whole = expected_photoelectrons(profile, SCENE, LEVELS, 1000.0)
+    monkeypatch.setattr(optics, "_OBJECTS_PER_BLOCK", 2)
+    assert np.array_equal(whole, expected_photoelectrons(profile, SCENE, LEVELS, 1000.0))
+
+
+def test_patterns_of_another_shape_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"patterns have 41 pixels, scene 'noise' has 42 \(7 x 6\)"):
+        expected_photoelectrons(load_profile("ideal"), SCENE, LEVELS[:, :41], 1000.0)
+
+
+def test_the_table_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optics, "MAX_TABLE_ENTRIES", 35)
+    with pytest.raises(ConfigError, match="9 objects x 4 patterns"):
+        expected_photoelectrons(load_profile("ideal"), SCENE, LEVELS, 1000.0)

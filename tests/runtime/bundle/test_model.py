@@ -1,0 +1,304 @@
+"""Bundles: every byte counts, every inconsistency is named, the golden vectors bind table and head together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle import format as bundle_format
+from pans.runtime.bundle.model import (
+    Bundle,
+    bundle_bytes,
+    load_bundle,
+    make_bundle,
+    parse_bundle,
+    word_means,
+    write_bundle,
+)
+from pans.runtime.errors import DamagedFileError, UsageError
+
+
+def affine_head(weights: np.ndarray, bias: np.ndarray, batch: Any = "n") -> bytes:
+    """An ONNX model of scores = means @ weights + bias; weights (d_f, classes)."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    d_f, classes = weights.shape
+    graph = helper.make_graph(
+        [helper.make_node("Gemm", ["means", "w", "b"], ["scores"])],
+        "head",
+        [helper.make_tensor_value_info("means", TensorProto.FLOAT, [batch, d_f])],
+        [helper.make_tensor_value_info("scores", TensorProto.FLOAT, [batch, classes])],
+        [
+            numpy_helper.from_array(weights.astype(np.float32), "w"),
+            numpy_helper.from_array(bias.astype(np.float32), "b"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def random_head(d_f: int, classes: int, seed: int = 1) -> tuple[bytes, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    weights, bias = rng.normal(size=(d_f, classes)), rng.normal(size=classes)
+    return affine_head(weights, bias), weights.astype(np.float32), bias.astype(np.float32)
+
+
+def small_bundle(d_f: int = 2, **changes: Any) -> Bundle:
+    facts: dict[str, Any] = {
+        "name": "small",
+        "task": "test",
+        "classes": ("left", "right"),
+        "image_shape": (1, 3),
+        "levels": 4,
+        "pattern_levels": np.arange(3 * d_f).reshape(d_f, 3) % 4,
+        "photons_per_level": 0.25,
+        "table": np.arange(2 << d_f, dtype=np.float32).reshape(-1, 2) % 5,
+        "provenance": {"made_by": "test", "seed": 1, "loss": 0.1},
+    }
+    return make_bundle(**{**facts, **changes})
+
+
+def resealed(data: bytes, change: Any) -> bytes:
+    """The file with its header changed by `change(header dict)` and the closing checksum made to fit again."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[16 : 16 + length])
+    change(header)
+    text = json.dumps(header).encode()
+    body = data[:12] + struct.pack("<I", len(text)) + text + data[16 + length : -32]
+    return body + hashlib.sha256(body).digest()
+
+
+def test_round_trip_keeps_every_fact(tmp_path: Path) -> None:
+    made = small_bundle()
+    digest = write_bundle(made, tmp_path / "a.pans")
+    read, found = load_bundle(tmp_path / "a.pans")
+    assert found == digest == hashlib.sha256((tmp_path / "a.pans").read_bytes()).hexdigest()
+    for fact in (
+        "name",
+        "task",
+        "classes",
+        "encoder",
+        "image_shape",
+        "levels",
+        "photons_per_level",
+        "head_onnx",
+        "provenance",
+    ):
+        assert getattr(read, fact) == getattr(made, fact)
+    for array in ("pattern_levels", "table", "golden_means", "golden_scores"):
+        wanted, got = getattr(made, array), getattr(read, array)
+        assert got.dtype == wanted.dtype
+        np.testing.assert_array_equal(got, wanted)
+        assert not got.flags.writeable
+    assert bundle_bytes(read) == bundle_bytes(made)
+    assert os.listdir(tmp_path) == ["a.pans"]
+
+
+def test_the_bytes_are_those_of_the_document() -> None:
+    data = bundle_bytes(small_bundle())
+    assert data[:8] == b"PANSBNDL"
+    version, length = struct.unpack_from("<II", data, 8)
+    header = json.loads(data[16 : 16 + length])
+    assert version == 1
+    assert list(header) == sorted(header)
+    start = 16 + length
+    assert data[start : start + 12] == struct.pack("<6H", 0, 1, 2, 3, 0, 1)
+    assert data[-32:] == hashlib.sha256(data[:-32]).digest()
+    last = header["parts"][-1]
+    assert start + last["offset"] + last["length"] + 32 == len(data)
+
+
+def test_any_flipped_byte_is_detected() -> None:
+    data = bundle_bytes(small_bundle(d_f=1))
+    parse_bundle(data, "whole")
+    for position in range(len(data)):
+        for flip in (0x01, 0x80, 0xFF):
+            changed = bytearray(data)
+            changed[position] ^= flip
+            with pytest.raises(DamagedFileError, match=r"^here: "):
+                parse_bundle(bytes(changed), "here")
+
+
+def test_any_truncation_and_any_rest_is_detected() -> None:
+    data = bundle_bytes(small_bundle(d_f=1))
+    for length in range(len(data)):
+        with pytest.raises(DamagedFileError):
+            parse_bundle(data[:length], "cut")
+    for rest in (b"\0", b"x" * 40, data):
+        with pytest.raises(DamagedFileError, match="too many"):
+            parse_bundle(data + rest, "long")
+
+
+def test_the_altered_part_is_named() -> None:
+    data = bytearray(bundle_bytes(small_bundle()))
+    data[-40] ^= 1
+    with pytest.raises(DamagedFileError, match="golden_scores"):
+        parse_bundle(bytes(data), "x")
+
+
+@pytest.mark.parametrize("version", [0, 3, 0xFFFFFFFF])
+def test_unknown_versions_are_refused_by_name(version: int) -> None:
+    data = bundle_bytes(small_bundle())
+    with pytest.raises(DamagedFileError, match=f"version {version}, allowed: 1"):
+        parse_bundle(data[:8] + struct.pack("<I", version) + data[12:], "x")
+
+
+def set_key(key: str, value: Any) -> Any:
+    return lambda header: header.__setitem__(key, value)
+
+
+def set_part(index: int, key: str, value: Any) -> Any:
+    return lambda header: header["parts"][index].__setitem__(key, value)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_key("classes", ["only"]), "1 classes"),
+        (set_key("classes", ["same", "same"]), "same name"),
+        (set_key("classes", ["a", "b\x1b[2J"]), "printable"),
+        (set_key("classes", "ab"), "list of names"),
+        (set_key("classes", ["a", "b", "c"]), "table has shape"),
+        (set_key("levels", 1), "levels is 1"),
+        (set_key("levels", 3), "pattern level is 3"),
+        (set_key("levels", True), "levels is True"),
+        (set_key("levels", 65537), "levels is 65537"),
+        (set_key("photons_per_level", 0), "photons_per_level"),
+        (set_key("photons_per_level", -1.0), "photons_per_level"),
+        (set_key("photons_per_level", "0.1"), "photons_per_level"),
+        (set_key("photons_per_level", float("nan")), "JSON"),
+        (set_key("photons_per_level", 10**400), "header|too large|int"),
+        (set_key("image_shape", [3, 3]), "3x3"),
+        (set_key("image_shape", [-1, -3]), "image_shape"),
+        (set_key("encoder", "tree"), "encoder is 'tree', allowed: active"),
+        (set_key("encoder", ["active"]), "encoder"),
+        (set_key("name", ""), "name is ''"),
+        (set_key("provenance", [1]), "provenance"),
+        (set_key("surplus", 1), "header has the keys"),
+        (lambda header: header.pop("task"), "header has the keys"),
+        (set_key("parts", []), "after the last part"),
+        (lambda header: header["parts"].pop(1), "golden_means lies|outside|offset"),
+        (set_part(0, "shape", [3, 2, 1]), "shape"),
+        (set_part(0, "shape", [1 << 40, 1 << 40]), "shape"),
+        (set_part(0, "shape", [-2, -3]), "shape"),
+        (set_part(0, "shape", [1, 3]), "needs 6"),
+        (set_part(0, "dtype", "|O"), "dtype"),
+        (set_part(0, "name", "pickle"), "unknown part"),
+        (set_part(1, "name", "pattern_levels"), "stands twice"),
+        (set_part(1, "offset", 0), "outside the file or over"),
+        (set_part(1, "sha256", "00" * 32), "does not have its SHA-256"),
+        (set_part(0, "surplus", 1), "keys"),
+    ],
+)
+def test_a_resealed_lie_is_named(change: Any, reason: str) -> None:
+    with pytest.raises(DamagedFileError, match=reason):
+        parse_bundle(resealed(bundle_bytes(small_bundle()), change), "x")
+
+
+def test_a_table_that_contradicts_its_golden_vectors_is_refused() -> None:
+    made = small_bundle()
+    swapped = Bundle(**{name: getattr(made, name) for name in made.__slots__} | {"table": made.table[::-1].copy()})
+    with pytest.raises(DamagedFileError, match="golden"):
+        parse_bundle(bundle_bytes(swapped), "x")
+
+
+def test_limits_come_before_allocation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = bundle_bytes(small_bundle())
+    with pytest.raises(DamagedFileError, match="header of 4294967295 bytes"):
+        parse_bundle(data[:12] + b"\xff\xff\xff\xff" + data[16:], "x")
+    huge = tmp_path / "huge.pans"
+    with open(huge, "wb") as file:
+        file.truncate((256 << 20) + 1)  # sparse
+    with pytest.raises(DamagedFileError, match="allowed at most"):
+        load_bundle(huge)
+    monkeypatch.setattr(bundle_format, "FILE_MAX_BYTES", 100)
+    with pytest.raises(UsageError, match="allowed"):
+        bundle_bytes(small_bundle())
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"table": None}, "neither"),
+        ({"table": np.zeros((3, 2))}, "table has shape"),
+        ({"table": np.full((4, 2), np.nan)}, "finite"),
+        ({"pattern_levels": np.array([[0, 1, 4], [0, 0, 0]])}, "0 to 4|run from 0 to 4"),
+        ({"pattern_levels": np.array([[0, 1, -1], [0, 0, 0]])}, "from -1"),
+        ({"pattern_levels": np.zeros((2, 3))}, "integers"),
+        ({"photons_per_level": float("inf")}, "photons_per_level"),
+        ({"provenance": {"deep": [1, {"loss": float("nan")}]}}, r"deep\[1\]\.loss is nan"),
+        ({"provenance": {"when": object()}}, "when is a object"),
+        ({"provenance": {1: 2}}, "key 1"),
+        ({"classes": ("a", "a")}, "same name"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_with_the_reason(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        small_bundle(**changes)
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.pans"
+    write_bundle(small_bundle(), path)
+    before = path.read_bytes()
+
+    def full_disk(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(UsageError, match="No space"):
+        write_bundle(small_bundle(d_f=1), path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.pans"]
+
+
+def test_missing_files_are_a_matter_of_usage(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.pans", tmp_path):
+        with pytest.raises(UsageError, match="cannot be read"):
+            load_bundle(path)
+
+
+def test_units_of_patterns_and_illumination() -> None:
+    made = small_bundle()
+    np.testing.assert_array_equal(made.patterns(), [[0.0, 0.25, 0.5], [0.75, 0.0, 0.25]])
+    assert made.illumination() == pytest.approx(1.75)
+    assert (made.n_features, made.n_pixels, made.n_classes) == (2, 3, 2)
+
+
+def test_bit_i_of_a_word_is_pattern_i() -> None:
+    np.testing.assert_array_equal(word_means([0b001, 0b110], 3), [[1, 0, 0], [0, 1, 1]])
+
+
+def test_the_table_is_built_from_the_head() -> None:
+    head, weights, bias = random_head(5, 3)
+    made = small_bundle(d_f=5, table=None, head_onnx=head, classes=("a", "b", "c"))
+    assert made.table is not None
+    for word in range(32):
+        means = [float(word >> i & 1) for i in range(5)]
+        np.testing.assert_allclose(made.table[word], np.array(means) @ weights + bias, atol=1e-5)
+    assert parse_bundle(bundle_bytes(made), "x").head_onnx == head
+    fractions = made.golden_means[((made.golden_means > 0) & (made.golden_means < 1)).any(axis=1)]
+    assert len(fractions) >= 8  # means over several shots are among the golden vectors
+
+
+def test_beyond_twelve_patterns_there_is_no_table() -> None:
+    head, _, _ = random_head(13, 2)
+    assert small_bundle(d_f=13, table=None, head_onnx=head).table is None
+
+
+def test_head_and_table_must_agree() -> None:
+    head, weights, bias = random_head(4, 2)
+    table = word_means(np.arange(16), 4) @ weights + bias
+    small_bundle(d_f=4, head_onnx=head, table=table)
+    table[11, 1] += 1e-3
+    with pytest.raises(UsageError, match="vector 11"):
+        small_bundle(d_f=4, head_onnx=head, table=table)

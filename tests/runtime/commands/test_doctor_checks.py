@@ -1,0 +1,127 @@
+"""`pans devices`, `pans doctor` and traces: every finding has its remedy, and nothing is opened to find out."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from pans.firmware_sim.ports.serve import open_sim
+from pans.runtime.cli import main
+from pans.runtime.commands import doctor_checks as doctor
+from pans.runtime.commands.doctor_checks import Finding, examine, port_state, serial_ports, udev_rule
+from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.link.trace import TracedLink
+
+
+def test_doctor_on_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == 0
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    assert {"python", "numba", "onnxruntime", "libusb", "clock resolution", "numba cache"} <= {
+        f["check"] for f in findings
+    }
+    assert all(finding["ok"] or finding["remedy"] for finding in findings)
+    assert main(["doctor"]) == 0
+    assert "ready to run" in capsys.readouterr().out
+
+
+def test_what_is_needed_and_missing_is_an_alert(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def check_broken() -> Iterator[Finding]:
+        raise ImportError("no module named numba")
+        yield
+
+    def check_odd() -> Iterator[Finding]:
+        raise RuntimeError("odd")
+        yield
+
+    findings = examine((check_broken, check_odd, doctor.check_python))
+    assert [(finding.check, finding.ok) for finding in findings] == [
+        ("broken", False),
+        ("odd", False),
+        ("python", True),
+    ]
+    assert all(finding.remedy for finding in findings if not finding.ok)
+    monkeypatch.setattr("pans.runtime.commands.doctor.examine", lambda: findings)
+    assert main(["doctor"]) == 1
+    assert "cannot run: broken" in capsys.readouterr().out
+
+
+def test_the_udev_rule_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--udev"]) == 0
+    rule = capsys.readouterr().out
+    assert rule.strip() == udev_rule().strip()
+    assert 'TAG+="uaccess"' in rule
+    assert 'GROUP="dialout"' in rule
+    assert int(doctor.RULE.partition("-")[0]) < 73  # later, systemd has already handed out the access rights
+
+
+def test_devices_lists_ports_by_their_lasting_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = tmp_path / "ttyACM0"
+    device.touch()
+    port = ListPortInfo(str(device))
+    port.vid, port.pid, port.serial_number, port.description = 0x1209, 1, "A1", "an instrument"
+    gone = ListPortInfo(str(tmp_path / "ttyS9"))
+    monkeypatch.setattr(list_ports, "comports", lambda: [port, gone])
+    assert [(state.url, state.state) for state in serial_ports()] == [
+        ("serial:1209:0001:A1", "free"),
+        (f"serial:{gone.device}", "not there"),
+    ]
+    assert main(["devices", "--no-usb", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert listed["devices"][0]["vid_pid_serial"] == "1209:0001:A1"
+    assert {"serial", "usb", "sim", "simusb", "simserial"} <= set(listed["schemes"])
+
+
+def test_no_permission_and_busy_are_seen_without_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = tmp_path / "ttyUSB0"
+    device.touch()
+    folder = tmp_path / "proc" / "4711" / "fd"
+    folder.mkdir(parents=True)
+    (folder.parent / "comm").write_text("minicom\n")
+    assert port_state(str(device), tmp_path / "proc") == ("free", "")
+    os.symlink(device, folder / "3")
+    assert port_state(str(device), tmp_path / "proc") == ("busy", "close minicom (process 4711) first")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    state, remedy = port_state(str(device), tmp_path / "proc")
+    assert state == "no permission"
+    assert "udev" in remedy
+
+
+def test_a_trace_has_both_directions_and_times(tmp_path: Path) -> None:
+    path = tmp_path / "trace.txt"
+    link = TracedLink(open_sim("sim:ideal?scene=uniform&pace=fast"), path)
+    link.write(b"\x01\x02\0")
+    assert link.read(0.25) == b""
+    link.reopen()
+    link.close()
+    with pytest.raises(LinkError):
+        link.read(0.1)
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("0.000000000 # sim:ideal")
+    assert lines[1] == "0.000000000 > 01 02 00"
+    assert lines[2] == "0.250000000 # opened again"
+    with pytest.raises(UsageError, match="cannot be written"):
+        TracedLink(open_sim("sim:ideal?scene=uniform&pace=fast"), tmp_path / "none" / "trace.txt")
+
+
+def test_a_run_writes_its_trace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "trace.txt"
+    words = ["demo", "--pace", "fast", "--trials", "1", "--seconds", "0.5", "--out", str(tmp_path)]
+    main([*words, "--trace", str(path), "--json"])
+    summary = json.loads(capsys.readouterr().out)
+    sent, received = (
+        [line.split(maxsplit=2) for line in path.read_text().splitlines() if line.split()[1] == mark] for mark in "><"
+    )
+    assert len(sent) > 10
+    assert sum(len(bytes.fromhex(line[2])) for line in received) == summary["link"]["bytes_in"]
+    times = [float(line[0]) for line in sent]
+    assert times == sorted(times)

@@ -1,0 +1,148 @@
+"""Exports: every click and decision of a real run, again from CSV and from Photon-HDF5."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.cli import main
+from pans.runtime.record.exposures import click_list, recorded_plan
+from pans.runtime.record.recorder import read_recording
+
+# what the format's definition calls mandatory, and that a photon's detector is named
+MANDATORY = {
+    *("acquisition_duration", "description", "photon_data/timestamps", "photon_data/detectors"),
+    *("photon_data/timestamps_specs/timestamps_unit", "setup/num_pixels", "setup/num_spots", "setup/num_spectral_ch"),
+    *("setup/num_polarization_ch", "setup/num_split_ch", "setup/modulated_excitation", "setup/lifetime"),
+    *("setup/excitation_alternated", "identity/format_name", "identity/format_version", "identity/format_url"),
+    *("identity/software", "identity/software_version", "identity/creation_time"),
+}
+
+
+@pytest.fixture(scope="module", params=["oled-qcmos", "wdm-snspd"])
+def run_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of one detector after another, and of all at once with dark slots."""
+    folder = tmp_path_factory.mktemp("run")
+    if request.param == "oled-qcmos":
+        words = ["demo", "--pace", "fast", "--trials", "1", "--out", str(folder)]
+    else:
+        bundle = folder / "small.pans"
+        make_parallel(bundle)
+        device = "sim:wdm-snspd?pace=fast&scene=fashion200"
+        words = ["run", str(bundle), "--device", device, "--decisions", "150", "--shots", "4", "--out", str(folder)]
+    assert main(words) in (0, 1)
+    return folder / "run.pansrec"
+
+
+def make_parallel(path: Path) -> None:
+    from pans.runtime.bundle.model import make_bundle, write_bundle
+    from pans.runtime.instrument.profile import load_profile
+
+    profile, rng = load_profile("wdm-snspd"), np.random.default_rng(0)
+    top = profile.projector.peak_photoelectrons_hz * profile.exposure.max_us * 1e-6
+    levels = profile.projector.levels
+    patterns = rng.integers(0, levels, (5, 784)) * (rng.random((5, 784)) < 0.05)
+    patterns[0, 0] = levels - 1
+    pytest.importorskip("onnx")
+    from heads import onnx_chain, random_layers
+
+    made = make_bundle(
+        name="small",
+        task="t",
+        classes=tuple("0123456789"),
+        image_shape=(28, 28),
+        levels=levels,
+        pattern_levels=patterns,
+        photons_per_level=top / (levels - 1),
+        head_onnx=onnx_chain(random_layers([5, 8, 10])),
+        provenance={},
+    )
+    write_bundle(made, path)
+
+
+def exported(path: Path, form: str, out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(["export", str(path), "--format", form, "-o", str(out), "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_csv_holds_every_click_and_decision(run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = exported(run_of, "csv", tmp_path / "csv", capsys)
+    recording = read_recording(run_of)
+    decisions = recording.decisions()
+    with open(tmp_path / "csv" / "decisions.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == found["decisions"] == recording.n_decisions
+    classes = recording.bundle().classes
+    for row, wanted in zip(rows, decisions):
+        assert (int(row["tick"]), int(row["object"]), int(row["clicks"])) == tuple(wanted[["tick", "object", "clicks"]])
+        assert row["class"] == classes[wanted["label"]]
+        assert np.float32(row["probability"]) == wanted["probability"]
+    with open(tmp_path / "csv" / "clicks.csv", newline="") as file:
+        clicks = list(csv.DictReader(file))
+    assert len(clicks) == found["clicks"]
+    # the clicks behind each decision, counted from the exported file alone
+    lit = [row for row in clicks if row["dark_slot"] == "0"]
+    per_object = np.bincount([int(row["object"]) for row in lit], minlength=len(rows))
+    assert per_object.tolist() == decisions["clicks"].tolist()
+    assert found["simulated"] is True
+    about = json.loads((tmp_path / "csv" / "about.json").read_text())
+    assert about["exposures"] == found["exposures"]
+
+
+def test_the_clicks_are_in_order_and_within_the_plan(run_of: Path) -> None:
+    recording = read_recording(run_of)
+    plan = recorded_plan(recording)
+    clicks = click_list(recording, plan)
+    assert (np.diff(clicks.start_tick) >= 0).all()
+    assert clicks.exposures == recording.n_decisions * plan.slots_per_cycle * plan.cycles_per_object
+    assert clicks.channel.max() < (plan.n_patterns if plan.mode == "parallel" else 1)
+    slot = clicks.exposure % plan.slots_per_cycle
+    assert (plan.slot_pattern[slot] == clicks.pattern).all()
+
+
+def test_photon_hdf5_has_what_the_format_demands(
+    run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    h5py = pytest.importorskip("h5py", reason="needs the export extra")
+    found = exported(run_of, "photon-hdf5", tmp_path / "run.h5", capsys)
+    recording = read_recording(run_of)
+    plan = recorded_plan(recording)
+    clicks = click_list(recording, plan)
+    with h5py.File(tmp_path / "run.h5", "r") as file:
+        missing = {name for name in MANDATORY if name not in file}
+        assert not missing
+        assert file.attrs["format_name"] == b"Photon-HDF5"
+        assert file["identity/format_version"][()] == b"0.5"
+        times = file["photon_data/timestamps"][:]
+        assert times.dtype == np.int64
+        assert times.tolist() == clicks.start_tick.tolist()
+        assert len(file["photon_data/detectors"]) == len(times) == found["clicks"]
+        assert file["photon_data/timestamps_specs/timestamps_unit"][()] == pytest.approx(plan.tick_us * 1e-6)
+        assert file["setup/num_pixels"][()] == (5 if plan.mode == "parallel" else 1)
+        seconds = file["acquisition_duration"][()]
+        assert seconds == pytest.approx((clicks.last_tick - clicks.first_tick) * plan.tick_us * 1e-6)
+        assert file["description"][()].startswith(b"SIMULATED")
+        assert (file["user/pans/decisions"][:] == recording.decisions()).all()
+
+
+def test_hdf5_without_h5py_names_the_extra(
+    run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    assert main(["export", str(run_of), "--format", "photon-hdf5", "-o", str(tmp_path / "run.h5")]) == 2
+    assert "pans-runtime[export]" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_csv_into_a_file_is_refused(run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "there").write_text("mine")
+    assert main(["export", str(run_of), "--format", "csv", "-o", str(tmp_path / "there")]) == 2
+    assert (tmp_path / "there").read_text() == "mine"

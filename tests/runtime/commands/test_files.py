@@ -1,0 +1,374 @@
+"""`pans verify`, `pans info`, `pans bundle`: exit codes, JSON keys, and reasons a person can act on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, make_bundle, write_bundle
+from pans.runtime.bundle.quantise import quantise_patterns
+from pans.runtime.cli import main
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.profile import load_profile, shipped_profiles
+from pans.runtime.record.recorder import Recorder, read_recording
+
+
+def toy_bundle(**changes: Any) -> Bundle:
+    facts: dict[str, Any] = {
+        "name": "toy",
+        "task": "test",
+        "classes": ("a", "b"),
+        "image_shape": (1, 2),
+        "levels": 4,
+        "pattern_levels": [[0, 3], [1, 2]],
+        "photons_per_level": 0.5,
+        "table": [[1, 0], [0, 1], [1, 0], [0, 1]],
+        "provenance": {"made_by": "test"},
+    }
+    return make_bundle(**{**facts, **changes})
+
+
+def decision(index: int, **changes: Any) -> tuple[Any, ...]:
+    row = {
+        **{"index": index, "tick": 10 * index, "exposure_index": index, "object": index, "shot": 0, "clicks": 1},
+        **{"label": 1, "truth": 1, "flags": 0, "probability": 0.75, "counts_crc": 0},
+    }
+    return tuple((row | changes).values())
+
+
+def record(path: Path, decisions: list[tuple[Any, ...]], *, close: bool = True, **changes: Any) -> Path:
+    profile = load_profile("oled-qcmos")
+    inner = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
+    header = {"simulated": True, "profile": inner, **changes}
+    with Recorder(path, header, bundle=bundle_bytes(toy_bundle())) as recorder:
+        for row in decisions:
+            recorder.add_decision(row)
+            recorder.add_timing((row[0], 5, 10, 20, 30))
+        recorder.add_message(1, b"m")
+        recorder.add_event({"kind": "gap"})
+        if close:
+            recorder.close({"accuracy": 1.0})
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, Any]:
+    code = main([str(word) for word in words])
+    out = capsys.readouterr().out
+    return code, json.loads(out) if "--json" in words else out
+
+
+def test_whole_files_are_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bundle(toy_bundle(), tmp_path / "a.pans")
+    record(tmp_path / "a.pansrec", [decision(0), decision(1)])
+    profile = tmp_path / "mine.toml"
+    profile.write_text(load_profile("ideal").text)
+    paths = [tmp_path / "a.pans", tmp_path / "a.pansrec", profile, "oled-qcmos"]
+    code, found = run(capsys, "verify", *paths, "--json")
+    assert code == 0, found
+    assert (found["ok"], found["alerts"], found["violations"]) == (True, [], [])
+    assert [file["kind"] for file in found["files"]] == ["bundle", "recording", "profile", "profile"]
+    code, text = run(capsys, "verify", *paths)
+    assert code == 0
+    assert text.count("ok ") == 4
+
+
+def test_an_incomplete_recording_is_a_violation_not_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = record(tmp_path / "a.pansrec", [decision(0)], close=False)
+    code, found = run(capsys, "verify", path, "--json")
+    assert code == 1
+    assert not found["ok"]
+    assert "incomplete" in found["violations"][0]["message"]
+    assert "1 decisions" in found["violations"][0]["message"]
+    assert not found["files"][0]["damaged"]
+
+
+@pytest.mark.parametrize("name", ["a.pans", "a.pansrec", "a.toml"])
+@pytest.mark.parametrize("where", [0, 40, -1])
+def test_damage_is_exit_code_2(name: str, where: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / name
+    if name.endswith("pans"):
+        write_bundle(toy_bundle(), path)
+    elif name.endswith("pansrec"):
+        record(path, [decision(0)])
+    else:
+        path.write_text(load_profile("ideal").text)
+    data = bytearray(path.read_bytes())
+    data[where] = 0xFF if data[where] != 0xFF else 0
+    path.write_bytes(data)
+    code, found = run(capsys, "verify", path, "--json")
+    assert code == 2
+    assert found["files"][0]["damaged"]
+    assert found["violations"]
+    if name.endswith("pansrec") and where == -1:
+        assert "1 decisions in the first" in found["violations"][1]["message"]
+
+
+def test_one_damaged_file_does_not_hide_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad.pans").write_bytes(b"PANSBNDL")
+    (tmp_path / "odd.txt").write_bytes(b"hello")
+    write_bundle(toy_bundle(), tmp_path / "good.pans")
+    code, found = run(capsys, "verify", *(tmp_path / n for n in ("bad.pans", "odd.txt", "good.pans")), "--json")
+    assert code == 2
+    assert [file["ok"] for file in found["files"]] == [False, False, True]
+    assert main(["verify", str(tmp_path / "none.pans")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ([decision(0), decision(2)], "decision 1 is not numbered"),
+        ([decision(0, label=2)], "beyond the 2 classes"),
+        ([decision(0, label=0xFFFF)], "beyond the 2 classes"),
+        ([decision(0, flags=8)], "abstained, but has a label"),
+        ([decision(0, flags=1)], "despite a gap"),
+        ([decision(0, flags=1 << 20)], "flags that this version does not know"),
+        ([decision(0, probability=1.5)], "probability"),
+        ([decision(0, probability=float("nan"))], "probability"),
+    ],
+)
+def test_decisions_that_cannot_be_true(
+    rows: list[tuple[Any, ...]], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, found = run(capsys, "verify", record(tmp_path / "a.pansrec", rows), "--json")
+    assert code == 1
+    assert reason in found["violations"][0]["message"]
+
+
+def test_an_honest_abstention_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = record(tmp_path / "a.pansrec", [decision(0, flags=9, label=0xFFFF, probability=0.0)])
+    assert run(capsys, "verify", path)[0] == 0
+
+
+def test_timings_must_belong_and_be_in_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.pansrec"
+    with Recorder(path, {}) as recorder:
+        recorder.add_timing((3, 0, 20, 10, 30))
+        recorder.add_message(5, b"")
+        recorder.add_message(4, b"")
+        recorder.close({})
+    code, found = run(capsys, "verify", path, "--json")
+    assert code == 1
+    messages = " ".join(item["message"] for item in found["violations"])
+    assert "belongs to decision 3" in messages
+    assert "decided before it arrived" in messages
+    alerts = " ".join(item["message"] for item in found["alerts"])
+    assert "holds no bundle" in alerts
+    assert "holds no hardware profile" in alerts
+    assert "go back at 1" in alerts
+
+
+def test_a_profile_that_was_changed_inside_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = {"sha256": "0" * 64, "toml": load_profile("ideal").text}
+    code, found = run(capsys, "verify", record(tmp_path / "a.pansrec", [], profile=profile), "--json")
+    assert code == 1
+    assert "SHA-256 that stands beside" in found["violations"][0]["message"]
+
+
+def test_signs_of_a_bad_export_are_alerts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd = toy_bundle(pattern_levels=[[0, 0], [1, 2]], table=[[1, 0]] * 4)
+    write_bundle(odd, tmp_path / "a.pans")
+    code, found = run(capsys, "verify", tmp_path / "a.pans", "--json")
+    assert code == 1
+    assert found["violations"] == []
+    messages = " ".join(item["message"] for item in found["alerts"])
+    for sign in ("level 2 of 3", "1 of 2 patterns are dark", "never decided by any click word: b"):
+        assert sign in messages
+
+
+def test_info_of_every_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    digest = write_bundle(toy_bundle(), tmp_path / "a.pans")
+    code, found = run(capsys, "info", tmp_path / "a.pans", "--json")
+    assert code == 0
+    assert (found["kind"], found["sha256"], found["illumination"]) == ("bundle", digest, 3.0)
+    assert (found["back_ends"], found["classes"], found["patterns"]) == (["table"], ["a", "b"], 2)
+    record(tmp_path / "a.pansrec", [decision(0), decision(1, truth=0), decision(2, flags=9, label=0xFFFF)])
+    code, found = run(capsys, "info", tmp_path / "a.pansrec", "--json")
+    assert code == 0
+    assert (found["kind"], found["complete"], found["simulated"], found["bundle"]) == ("recording", True, True, "toy")
+    assert (found["decisions"], found["abstained"], found["accuracy"]) == (3, 1, 0.5)
+    assert found["events"] == {"gap": 1}
+    assert "toml" not in found["header"]["profile"]
+    code, text = run(capsys, "info", tmp_path / "a.pansrec")
+    assert "SIMULATED" in text
+    for name in shipped_profiles():
+        code, found = run(capsys, "info", name, "--json")
+        assert (code, found["kind"], found["name"]) == (0, "profile", name)
+    perfect = tmp_path / "perfect.toml"
+    perfect.write_text(re.sub(r"(?m)^contrast *=.*$", "contrast = inf", load_profile("oled-qcmos").text))
+    code, found = run(capsys, "info", perfect, "--json")
+    assert (code, found["object_modulator"]["contrast"]) == (0, "inf")
+
+
+def test_info_reads_a_damaged_recording_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = record(tmp_path / "a.pansrec", [decision(0)])
+    path.write_bytes(path.read_bytes()[:-1] + b"\x00\x00")
+    code, found = run(capsys, "info", path, "--json")
+    assert code == 2
+    assert found["damage"]
+    assert found["decisions"] == 1
+
+
+def test_info_does_not_let_a_file_steer_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bundle(toy_bundle(provenance={"note\x1b[2J": "\x1b]0;owned\x07", "long": "x" * 5000}), tmp_path / "a.pans")
+    _, text = run(capsys, "info", tmp_path / "a.pans")
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert len(text) < 3000
+
+
+def make_inputs(folder: Path, d_f: int = 3, pixels: int = 4) -> list[str]:
+    rng = np.random.default_rng(8)
+    np.save(folder / "p.npy", rng.uniform(0, 0.7, size=(d_f, pixels)))
+    np.save(folder / "t.npy", rng.normal(size=(1 << d_f, 2)))
+    return ["bundle", "--patterns", str(folder / "p.npy"), "--table", str(folder / "t.npy"), "--classes", "left,right"]
+
+
+def test_a_bundle_from_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = make_inputs(tmp_path)
+    out = tmp_path / "made.pans"
+    code, found = run(capsys, *words, "--levels", "16", "-o", out, "--json")
+    assert code == 0
+    assert found["bundle"] == str(out)
+    assert found["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
+    made, _ = load_bundle(out)
+    patterns = np.load(tmp_path / "p.npy")
+    assert (made.name, made.classes, made.image_shape, made.levels) == ("made", ("left", "right"), (2, 2), 16)
+    assert made.pattern_levels.max() == 15
+    assert made.photons_per_level == pytest.approx(patterns.max() / 15)
+    error = np.abs(made.patterns() - patterns).max()
+    assert error <= made.photons_per_level / 2 + 1e-12
+    assert found["quantisation_error_max_photons"] == pytest.approx(error)
+    np.testing.assert_array_equal(made.table, np.load(tmp_path / "t.npy").astype(np.float32))
+    assert made.provenance["inputs"]["patterns"]["file"] == "p.npy"
+    before = out.read_bytes()
+    assert run(capsys, *words, "--levels", "16", "-o", out)[0] == 0
+    assert out.read_bytes() == before  # the same inputs give the same bytes
+    assert run(capsys, "verify", out)[0] == 0
+
+
+def test_a_bundle_from_a_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    weights = numpy_helper.from_array(np.array([[1, -1], [2, 0], [0, 3]], dtype=np.float32), "w")
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["x", "w"], ["y"])],
+        "head",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, ["n", 2])],
+        [weights],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    (tmp_path / "h.onnx").write_bytes(model.SerializeToString())
+    words = make_inputs(tmp_path)
+    words[3:5] = ["--head", str(tmp_path / "h.onnx")]
+    out = tmp_path / "made.pans"
+    code, _ = run(capsys, *words, "-o", out)
+    assert code == 0
+    made, _ = load_bundle(out)
+    assert made.levels == 124
+    np.testing.assert_array_equal(made.table[0b101], [1, 2])
+    words += ["--table", str(tmp_path / "t.npy"), "-o", str(out)]
+    assert main(words) == 2  # this table is another back end's
+    assert "disagree" in capsys.readouterr().err
+    assert load_bundle(out)[0].n_features == 3
+
+
+def test_a_profile_gives_levels_and_is_held_against_the_light(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = load_profile("oled-qcmos")
+    words = make_inputs(tmp_path)
+    middle_us = (profile.exposure.min_us + profile.exposure.max_us) / 2
+    patterns = np.full((3, 4), profile.projector.peak_photoelectrons_hz * middle_us * 1e-6)
+    np.save(tmp_path / "p.npy", patterns)
+    code, found = run(capsys, *words, "--profile", "oled-qcmos", "-o", tmp_path / "o.pans", "--json")
+    assert code == 0
+    assert found["exposure_us"] == pytest.approx(middle_us)
+    assert found["levels"] == profile.projector.levels
+    np.save(tmp_path / "p.npy", patterns * 1e6)
+    assert main([*words, "--profile", "oled-qcmos", "-o", str(tmp_path / "o2.pans")]) == 2
+    assert "too weak" in capsys.readouterr().err
+    assert not (tmp_path / "o2.pans").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"--classes": "same,same"}, "same name"),
+        ({"--classes": "a,b,c"}, "table has shape"),
+        ({"--classes": "a,"}, "printable"),
+        ({"--image-shape": "3x3"}, "does not fit 4 pixels"),
+        ({"--levels": "1"}, "levels is 1"),
+        ({"--table": ""}, "neither --head nor --table"),
+        ({"--patterns": "missing.npy"}, "cannot be read"),
+    ],
+)
+def test_bundle_arguments_that_cannot_be_meant(
+    changes: dict[str, str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = make_inputs(tmp_path)
+    for option, value in changes.items():
+        if option in words:
+            place = words.index(option)
+            words[place : place + 2] = [option, value] if value else []
+        else:
+            words += [option, value]
+    assert main([*words, "-o", str(tmp_path / "o.pans")]) == 2
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "o.pans").exists()
+
+
+@pytest.mark.parametrize("kind", ["pickle", "cut", "integers", "huge", "npz", "text", "empty"])
+def test_arrays_from_strangers(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = make_inputs(tmp_path)
+    path = tmp_path / "p.npy"
+    if kind == "pickle":
+        np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    elif kind == "cut":
+        path.write_bytes(path.read_bytes()[:-3])
+    elif kind == "integers":
+        np.save(path, np.ones((3, 4), dtype=np.int64))
+    elif kind == "huge":
+        path.write_bytes(path.read_bytes().replace(b"(3, 4)", b"(3, 9)"))
+    elif kind == "npz":
+        np.savez(tmp_path / "p.npz", a=np.ones(3))
+        path.write_bytes((tmp_path / "p.npz").read_bytes())
+    else:
+        path.write_bytes(b"" if kind == "empty" else b"1,2,3\n")
+    assert main([*words, "-o", str(tmp_path / "o.pans")]) == 2
+    assert "not a readable .npy array" in capsys.readouterr().err
+
+
+def test_quantising_refuses_what_is_not_light() -> None:
+    for bad in (np.array([[1.0, -1e-9]]), np.array([[np.nan, 1]]), np.array([[np.inf, 1]])):
+        with pytest.raises(UsageError, match="allowed: finite photons"):
+            quantise_patterns(bad, 4)
+    with pytest.raises(UsageError, match="no pattern has any light"):
+        quantise_patterns(np.zeros((2, 2)), 4)
+    with pytest.raises(UsageError, match="floats"):
+        quantise_patterns(np.ones((2, 2), dtype=int), 4)
+
+
+def test_quantising_rounds_to_the_nearest_level() -> None:
+    found = quantise_patterns(np.array([[0.0, 0.1, 0.26, 0.74, 1.5]], dtype=np.float32), 4)
+    assert found.pattern_levels.tolist() == [[0, 0, 1, 1, 3]]
+    assert found.photons_per_level == 0.5
+    assert found.error_max == pytest.approx(0.24, abs=1e-6)
+    assert found.pixels_lost == 1
+    assert found.illumination == pytest.approx(2.5)
+    assert found.illumination_wanted == pytest.approx(2.6)
+    full = quantise_patterns(np.array([[0.0, 1e-30, 5e-324 + 1e-25]]), 65536)
+    assert full.pattern_levels[0, 2] == 65535
+
+
+def test_a_recording_of_a_run_is_read_whole(tmp_path: Path) -> None:
+    found = read_recording(record(tmp_path / "a.pansrec", [decision(0)]))
+    assert found.complete
+    assert found.bundle().name == "toy"

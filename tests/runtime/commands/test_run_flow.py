@@ -1,0 +1,254 @@
+"""`pans run --flow` against the simulated instrument in virtual time: figures, gates, recording, replay; refusals."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.firmware_sim.ports.serve import open_sim
+from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.cli import main
+from pans.runtime.commands.run_flow import FlowRun, core_of
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import ConfigError, PlanError, UsageError
+from pans.runtime.flow.plan import build_flow_plan
+from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.live.loop import Onlookers, RunConfig, run_live
+from pans.runtime.live.run import LiveRun
+from pans.runtime.record.recorder import read_recording
+from pans.runtime.wire.messages import DARK_PATTERN
+from pans.trainer.export.tape_bundle import exact_table, tape_bundle
+
+PROFILE = load_profile("flow-snspd")
+FIELDS_PER_S = 20_000.0
+
+
+def run_command(
+    flow_folder: Path, capsys: pytest.CaptureFixture[str], *more: str, seconds: str = "0.1"
+) -> dict[str, Any]:
+    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
+    command = [
+        "run",
+        str(flow_folder / "thirds.pans"),
+        "--device",
+        device,
+        "--flow",
+        str(flow_folder / "flow.toml"),
+        "--seconds",
+        seconds,
+    ]
+    assert main([*command, "--out", str(flow_folder / "out"), "--json", *more]) == 0
+    summary: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return summary
+
+
+def test_cells_are_decided_once_gated_on_time_and_replayed(
+    flow_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = run_command(flow_folder, capsys, "--gate-class", "b,c")
+    counts, gates = summary["passages"], summary["gates"]
+    assert counts["marks"] > 150
+    assert counts["alone"] > 80
+    assert summary["missed"] <= 0.05
+    assert summary["doubled"] == 0.0
+    assert summary["accuracy_labelled"] > 0.97
+    assert gates["asked"] == gates["done"] > 50
+    assert summary["yield"] > 0.5
+    assert summary["passage_clicks_mean"] > 5 * summary["clicks_mean"]
+    assert summary["flow"]["gate_classes"] == ["b", "c"]
+    page = Path(summary["report"]).read_text()
+    assert "SIMULATED" in page
+    assert "yield (targets pulsed)" in page
+    recording = read_recording(Path(summary["recording"]))
+    assert recording.n_decisions == counts["decisions"]
+    assert main(["replay", summary["recording"], "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert replayed["identical"] is True
+    for key in ("accuracy", "passages", "aborted", "yield", "purity", "missed", "clicks_mean"):
+        assert replayed[key] == summary[key]
+
+
+def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: Path) -> None:
+    bundle = load_bundle(flow_folder / "thirds.pans")[0]
+    settings = FlowSettings("cells", fields_per_s=FIELDS_PER_S, onset_frames=4, gate_classes=("a",))
+    decider = make_decider(bundle)
+    plan, core, cycles = core_of(PROFILE, bundle, decider, settings, 1, 0.05)
+    asked: list[int] = []
+    link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast")
+    device = link.device  # type: ignore[attr-defined]
+    flow = FlowRun(core, None)
+
+    def watch(run: LiveRun, output: Any) -> None:
+        asked.extend(action.tick for action in output.actions)
+
+    config = RunConfig(n_cycles=cycles, deadline_us=1000.0)
+    result = run_live(link, PROFILE, bundle, plan, core, config, onlookers=Onlookers(watch, flow.prepared))
+    assert result.ended == "completed"
+    pulses = [pulse.tick for pulse in device.gates.pulses]
+    assert len(asked) > 20
+    assert pulses == asked[: len(pulses)]
+    summary = flow.summary()
+    assert summary["gates"]["done"] == len(pulses)
+    assert summary["passages"]["pulses"] == len(pulses)
+
+
+def test_lost_blocks_are_never_decided_over(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast&faults=loss:0.02"
+    command = [
+        "run",
+        str(flow_folder / "thirds.pans"),
+        "--device",
+        device,
+        "--flow",
+        str(flow_folder / "flow.toml"),
+        "--seconds",
+        "0.1",
+    ]
+    assert main([*command, "--out", str(flow_folder / "lossy"), "--json"]) != 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["lost"] > 0
+    assert summary["aborted"]["gap"] > 0
+    assert summary["accuracy_labelled"] > 0.97
+    assert summary["passages"]["in_gaps"] > 0
+    assert main(["replay", summary["recording"], "--json"]) == 0
+
+
+@pytest.mark.parametrize("dark", [0.0, 0.01])
+def test_a_tape_is_read_as_well_as_the_exact_optimum(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], dark: float
+) -> None:
+    """No crosstalk and a stated dark rate: then nothing but chance may lie between 12 000 bars and the enumerated accuracy."""
+    text = PROFILE.text.replace("dark_rate_hz = 130.0", f"dark_rate_hz = {dark / 5e-6:.6f}")
+    text = text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
+    (tmp_path / "dark.toml").write_text(text)
+    (tmp_path / "tape.toml").write_text(
+        'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = 50000.0\njitter_bars = 0.02\njitter_time_s = 0.01\n'
+    )
+    (tmp_path / "flow.toml").write_text('kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\n')
+    profile = load_profile(str(tmp_path / "dark.toml"))
+    bundle, figures = tape_bundle(profile, photons=8.0, dark=dark, pixels_per_bar=8, lit_px=2, exposure_us=5.0)
+    write_bundle(bundle, tmp_path / "tape.pans")
+    device = f"sim:{tmp_path / 'dark.toml'}?scene={tmp_path / 'tape.toml'}&seed=9&pace=fast"
+    command = [
+        "run",
+        str(tmp_path / "tape.pans"),
+        "--device",
+        device,
+        "--flow",
+        str(tmp_path / "flow.toml"),
+        "--seconds",
+        "0.24",
+    ]
+    assert main([*command, "--out", str(tmp_path), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    n, exact = summary["passages"]["alone"], figures["exact_accuracy"]
+    assert n >= 11_990
+    assert (summary["missed"], summary["doubled"]) == (0.0, 0.0)
+    assert abs(summary["accuracy"] - exact) < 5 * math.sqrt(exact * (1 - exact) / n) + 0.0005
+    assert (
+        abs(summary["clicks_mean"] - figures["clicks_mean"]) < 5 * math.sqrt(2.5 / n) * 3 + 0.02
+    )  # neighbouring windows share bars
+    assert summary["clicks_mean"] < 5.3
+
+
+def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = PROFILE.text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
+    (tmp_path / "even.toml").write_text(text)
+    (tmp_path / "tape.toml").write_text(
+        'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = 50500.0\njitter_bars = 0.02\njitter_time_s = 0.01\n'
+    )
+    (tmp_path / "flow.toml").write_text('kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\ntrack = 3\n')
+    profile = load_profile(str(tmp_path / "even.toml"))
+    bundle, _ = tape_bundle(profile, photons=8.0, dark=0.0, pixels_per_bar=8, lit_px=2, exposure_us=5.0)
+    write_bundle(bundle, tmp_path / "tape.pans")
+    device = f"sim:{tmp_path / 'even.toml'}?scene={tmp_path / 'tape.toml'}&seed=9&pace=fast"
+    command = ["run", str(tmp_path / "tape.pans"), "--device", device, "--flow", str(tmp_path / "flow.toml")]
+    assert main([*command, "--seconds", "0.06", "--out", str(tmp_path), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["passages"]["alone"] > 3000
+    assert summary["accuracy"] > 0.995  # not followed it is lost within 50 bars
+    assert summary["flow"]["bars_per_s"] == pytest.approx(50_500.0, rel=0.005)
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]
+
+
+def test_the_exact_table_without_dark_counts_and_with_endless_light_is_the_truth() -> None:
+    table, accuracy, clicks = exact_table(60.0, 0.0)
+    assert accuracy == pytest.approx(1.0, abs=1e-12)
+    assert clicks == pytest.approx(5.0)
+    word = sum(1 << bar for bar in (3, 5))  # 0001010000
+    assert table[word].argmax() == 1
+
+
+# -- plans and settings --------------------------------------------------------------------------------------------------
+
+
+def thirds(flow_folder: Path) -> Bundle:
+    return load_bundle(flow_folder / "thirds.pans")[0]
+
+
+def test_a_flow_plan_has_dark_frames_where_asked_for(flow_folder: Path) -> None:
+    plan = build_flow_plan(PROFILE, thirds(flow_folder), block_us=250.0, dark_every=3)
+    assert (plan.block_exposures, plan.slots_per_cycle, plan.shots_per_object) == (125, 375, 374)
+    assert np.flatnonzero(plan.slot_pattern == DARK_PATTERN).tolist() == [374]
+    assert plan.cycle_us == pytest.approx(750.0)
+    assert build_flow_plan(PROFILE, thirds(flow_folder), block_us=250.0).dark_slots_per_cycle == 0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"block_us": 1.0}, {"block_us": 2000.0}, {"block_us": 250.0, "dark_every": 1000}],
+)
+def test_a_flow_plan_that_cannot_be_is_refused(flow_folder: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(PlanError, match="allowed"):
+        build_flow_plan(PROFILE, thirds(flow_folder), **changes)
+
+
+def test_a_sequential_instrument_has_no_flow(flow_folder: Path) -> None:
+    with pytest.raises(PlanError, match="all patterns at once"):
+        build_flow_plan(load_profile("oled-qcmos"), thirds(flow_folder), block_us=250.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('kind = "cells"\nspeed = 3\n', r"bad\.toml:2:1: unknown key speed"),
+        ('kind = "cells"\nblock_us = -1.0\n', r"bad\.toml:2:1: block_us is -1\.0"),
+        ('kind = "cells"\npool = 1.5\n', r"bad\.toml:2:1: pool must be a whole number"),
+        ('kind = "cells"\ngate_classes = "a"\n', r"bad\.toml:2:1: gate_classes must be a list"),
+        ("block_us = 250.0\n", r"bad\.toml:1:1: the key kind is missing"),
+        ('kind = "waves"\n', r"bad\.toml:1:1: flow kind is 'waves'"),
+    ],
+)
+def test_mistakes_in_settings_are_named_with_their_place(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.toml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_flow(str(tmp_path / "bad.toml"))
+
+
+@pytest.mark.parametrize("name", ["cells", "tape"])
+def test_shipped_settings_load_and_survive_a_header(name: str) -> None:
+    settings = read_flow(name)
+    assert settings.kind == name
+    assert flow_of_header(json.loads(json.dumps(settings.as_header()))) == settings
+
+
+def test_decisions_cannot_be_counted_beforehand(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&pace=fast"
+    assert (
+        main(["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", "cells", "--decisions", "5"]) == 2
+    )
+    assert "as many decisions as objects pass" in capsys.readouterr().err
+
+
+def test_an_unknown_gate_class_is_a_usage_error(flow_folder: Path) -> None:
+    bundle = thirds(flow_folder)
+    settings = FlowSettings("cells", gate_classes=("x",))
+    with pytest.raises(UsageError, match="gate class x"):
+        core_of(PROFILE, bundle, make_decider(bundle), settings, 1, 0.1)

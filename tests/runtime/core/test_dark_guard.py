@@ -1,0 +1,418 @@
+"""Detector states told apart, tables for a changed detector against exact Bayes, and the policies in live runs and replays."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from plans import parallel, shot_major
+from tree import ROOT
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+from pans.runtime.core.dark_guard import DarkGuard
+from pans.runtime.core.dark_tables import (
+    MAX_MIXED,
+    AdaptedCounts,
+    AdaptedTable,
+    HeadAdapter,
+    TableAdapter,
+    adapted_scores,
+    dark_clicks,
+    extra_probability,
+    make_adapter,
+    meant,
+    n_features_of,
+    word_prior,
+)
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.channel_health import ChannelHealth, Finding
+from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
+from pans.runtime.instrument.dark_rate import DarkMonitor
+from pans.runtime.wire.messages import ClickBlock
+
+N = 8
+
+
+def found_states(bits: NDArray[np.bool_], rate: float = 0.01, block: int = 500) -> tuple[ChannelHealth, list[Finding]]:
+    watch = ChannelWatch(bits.shape[1], np.full(bits.shape[1], rate), WatchSettings(arl_exposures=1e7))
+    health, found = ChannelHealth(watch), []
+    words = np.packbits(bits, axis=1, bitorder="little")
+    for first in range(0, len(words), block):
+        found += health.take(watch.update_words(words[first : first + block]))
+    return health, found
+
+
+def dark(seed: int, n: int, rates: float | NDArray[np.float64], channels: int = N) -> NDArray[np.bool_]:
+    return np.random.default_rng(seed).random((n, channels)) < rates
+
+
+def test_nothing_wrong() -> None:
+    health, found = found_states(dark(1, 200_000, 0.01))
+    assert found == []
+    assert health.present == []
+    assert health.rates().tolist() == [0.01] * N
+
+
+@pytest.mark.parametrize("factor", [3.0, 20.0])
+def test_a_hot_channel(factor: float) -> None:
+    rates = np.full(N, 0.01)
+    rates[5] *= factor
+    health, found = found_states(np.concatenate([dark(2, 20_000, 0.01), dark(3, 20_000, rates)]))
+    assert [(one.kind, one.channels) for one in found] == [("hot", (5,))]
+    assert found[0].level == ("warning" if factor < 5 else "alarm")
+    assert health.rates()[5] == pytest.approx(0.01 * factor, rel=0.1)
+    assert health.rates()[4] == 0.01
+    assert abs(found[0].since - 20_000) < 300
+    assert "channel 5" in found[0].words
+
+
+def test_a_burst_ends() -> None:
+    bits = np.concatenate([dark(4, 20_000, 0.01), dark(5, 2_000, 0.2), dark(6, 60_000, 0.01)])
+    health, found = found_states(bits)
+    assert [one.kind for one in found] == ["burst", "over"]
+    assert found[0].level == "alarm"
+    assert len(found[0].channels) == N
+    assert "all channels" in found[0].words
+    assert health.present == []
+
+
+def test_a_drift() -> None:
+    slow = 0.01 * np.linspace(1.0, 2.5, 40_000)[:, None]
+    _, found = found_states(np.concatenate([dark(7, 10_000, 0.01), dark(8, 40_000, slow)]))
+    assert found[0].kind == "drift"
+    assert len(found[0].channels) == N
+    assert {one.kind for one in found} == {"drift"}
+
+
+def test_a_dead_channel() -> None:
+    rates = np.full(N, 0.01)
+    rates[2] = 0.0
+    health, found = found_states(np.concatenate([dark(9, 20_000, 0.01), dark(10, 20_000, rates)]))
+    assert [(one.kind, one.channels) for one in found] == [("dead", (2,))] or (
+        [(one.kind, one.channels) for one in found] == [("quiet", (2,))]
+    )
+    assert health.rates()[2] < 0.003
+
+
+def test_a_burst_found_in_few_exposures_is_not_over_at_the_first_silence() -> None:
+    """An alarm after two clicks in two exposures is no proof of a rate of 1."""
+    for seed in range(20):
+        bits = np.concatenate([dark(60 + seed, 3_000, 1e-4, 1), dark(90 + seed, 300, 0.6, 1)])
+        _, found = found_states(bits, 1e-4, block=1)
+        assert [one.kind for one in found] == ["burst"]
+
+
+def test_one_detector() -> None:
+    _, found = found_states(np.concatenate([dark(11, 20_000, 0.01, 1), dark(12, 3_000, 0.3, 1)]))
+    assert [one.kind for one in found] == ["burst"]
+    assert "the detector clicks" in found[0].words
+
+
+# ---- tables ----
+
+
+def bayes(
+    light: NDArray[np.float64], dark_rates: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """P(c | object) of every word, float64 (objects, 2**d), and the log posterior of the classes (two objects each)."""
+    p = 1 - np.exp(-light) * (1 - dark_rates)
+    words = np.arange(1 << light.shape[1])
+    bits = (words[:, None] >> np.arange(light.shape[1])) & 1
+    like = np.prod(np.where(bits[None], p[:, None, :], 1 - p[:, None, :]), axis=2)
+    return like, np.log(like.reshape(-1, 2, len(words)).sum(axis=1).T + 1e-300)
+
+
+def accuracy(labels: NDArray[np.int64], like: NDArray[np.float64]) -> float:
+    truth = np.arange(len(like)) // 2
+    return float(np.mean([(like[row] * (labels == truth[row])).sum() for row in range(len(like))]))
+
+
+def test_tables_for_more_dark_counts_are_nearly_those_of_exact_bayes() -> None:
+    rng = np.random.default_rng(3)
+    lost, kept = [], []
+    for _ in range(8):
+        light = rng.exponential(0.8, (8, 8)) * (rng.random((8, 8)) < 0.5)
+        before, after = np.zeros(8), np.full(8, 0.15)
+        after[rng.integers(8)] = 0.6
+        like, scores = bayes(light, before)
+        like_now, scores_now = bayes(light, after)
+        seen = rng.multinomial(20_000, like.mean(axis=0))
+        made = adapted_scores(
+            scores.astype(np.float32), word_prior(seen), extra_probability(after, before), np.zeros(8, np.bool_)
+        )
+        best = accuracy(scores_now.argmax(axis=1), like_now)
+        lost.append(best - accuracy(scores.argmax(axis=1), like_now))
+        kept.append(best - accuracy(made.argmax(axis=1), like_now))
+    assert np.mean(lost) > 0.05  # the old tables suffer
+    assert np.mean(kept) < 0.01  # and the new ones hardly
+    assert max(kept) < 0.03
+
+
+def test_a_masked_channel_says_nothing_and_costs_what_it_must() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.exponential(0.8, (8, 6))
+    like, scores = bayes(light, np.zeros(6))
+    masked = np.zeros(6, np.bool_)
+    masked[[1, 4]] = True
+    made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), np.zeros(6), masked)
+    bits = (np.arange(64)[:, None] >> np.arange(6)) & 1
+    key = bits[:, ~masked] @ (1 << np.arange(4))
+    for value in range(16):
+        rows = made[key == value]
+        assert np.ptp(rows, axis=0).max() < 1e-5
+    without, _ = bayes(light[:, ~masked], np.zeros(4))
+    exact = np.log(without.reshape(-1, 2, 16).sum(axis=1).T)
+    assert (made.argmax(axis=1) == exact.argmax(axis=1)[key]).all()
+
+
+def test_unchanged_detector_leaves_the_table_as_it_is() -> None:
+    rng = np.random.default_rng(5)
+    scores = rng.normal(size=(64, 3)).astype(np.float32)
+    made = adapted_scores(scores, word_prior(np.ones(64, np.int64)), np.zeros(6), np.zeros(6, np.bool_))
+    assert (made.argmax(axis=1) == scores.argmax(axis=1)).all()
+    table = AdaptedTable(made)
+    assert table.decide(np.array([1, 0, 1, 0, 0, 1]), 1).label == int(scores[0b100101].argmax())
+
+
+def test_prior_is_a_distribution_also_without_words() -> None:
+    assert word_prior(np.zeros(32, np.int64)) == pytest.approx(np.full(32, 1 / 32))
+    seen = np.zeros(32, np.int64)
+    seen[3] = 1_000_000
+    assert word_prior(seen).sum() == pytest.approx(1.0)
+    assert word_prior(seen)[3] > 0.999
+
+
+# ---- tables of counts, and heads with too many of them ----
+
+
+def binomial(p: NDArray[np.float64], shots: int, count: int) -> NDArray[np.float64]:
+    return math.comb(shots, count) * p**count * (1 - p) ** (shots - count)
+
+
+def counts_bayes(
+    light: NDArray[np.float64], dark_rates: NDArray[np.float64], shots: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `bayes`, for all vectors of counts, channel 0 the lowest digit."""
+    base, d = shots + 1, light.shape[1]
+    p = 1 - np.exp(-light) * (1 - dark_rates)
+    each = np.stack([binomial(p, shots, count) for count in range(base)], axis=2)  # objects, channels, counts
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    like = np.prod([each[:, channel, digits[:, channel]] for channel in range(d)], axis=0)
+    return like, np.log(like.reshape(-1, 2, base**d).sum(axis=1).T + 1e-300)
+
+
+@pytest.mark.parametrize("shots", [1, 2, 3])
+def test_tables_of_counts_are_exact_when_the_prior_is(shots: int) -> None:
+    """With the true P(c), new scores are the exact joint probability of the changed detector: loops over everything."""
+    rng = np.random.default_rng(50)
+    light, d, base = rng.exponential(0.8, (6, 4)), 4, shots + 1
+    extra, masked = np.array([0.1, 0.0, 0.3, 0.0]), np.array([False, True, False, False])
+    like, scores = counts_bayes(light, np.zeros(d), shots)
+    made = adapted_scores(scores.astype(np.float32), like.mean(axis=0), extra, masked, base)
+    now, _ = counts_bayes(light[:, ~masked], extra[~masked], shots)
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    key = digits[:, ~masked] @ base ** np.arange(3)
+    wanted = now.reshape(-1, 2, base**3).sum(axis=1).T / len(light)
+    assert np.exp(made.astype(np.float64)) == pytest.approx(wanted[key], rel=2e-5)
+
+
+def test_moves_of_dark_clicks_are_binomial() -> None:
+    moves = dark_clicks(3, 0.2)
+    assert moves.sum(axis=1) == pytest.approx(np.ones(4))
+    assert moves[1] == pytest.approx([0, 0.64, 0.32, 0.04])
+    assert moves[3].tolist() == [0, 0, 0, 1]
+    assert dark_clicks(2, 0.0).tolist() == np.eye(3).tolist()
+
+
+def test_prior_of_counts_is_a_distribution() -> None:
+    seen = np.zeros(27, np.int64)
+    seen[5] = 10**6  # counts 2, 1, 0
+    prior = word_prior(seen, 3)
+    assert prior.sum() == pytest.approx(1.0)
+    assert prior[5] > 0.999
+    assert n_features_of(27, 3) == 3
+    assert word_prior(np.zeros(9, np.int64), 3) == pytest.approx(np.full(9, 1 / 9))
+
+
+def test_what_a_channel_meant_is_bayes() -> None:
+    rng = np.random.default_rng(51)
+    seen = rng.integers(1, 1000, 3)
+    own = (seen + 0.5) / (seen.sum() + 1.5)
+    weights = meant(seen, 0.25, masked=False)
+    for found in range(3):
+        joint = np.array([own[c] * dark_clicks(2, 0.25)[c, found] for c in range(3)])
+        assert weights[found] == pytest.approx(joint / joint.sum())
+    assert meant(seen, 0.0, masked=True) == pytest.approx(np.tile(own, (3, 1)))
+
+
+class Scored:
+    """A head that is a table of scores, behind the interface of a decider."""
+
+    name, n_classes = "scored", 4
+
+    def __init__(self, scores: NDArray[np.float64], base: int) -> None:
+        self.table = AdaptedCounts(scores.astype(np.float32), base)
+        self.n_features = self.table.n_features
+        self.decide, self.decide_batch = self.table.decide, self.table.decide_batch
+        self.scores_batch = self.table.scores_batch
+
+
+def test_a_mixed_head_keeps_most_of_what_is_lost_without() -> None:
+    """One dead and one hot channel: the head as it is, mixed over both, and exact for the changed detector."""
+    rng = np.random.default_rng(52)
+    shots, d, lost, kept = 2, 5, [], []
+    base = shots + 1
+    digits = np.arange(base**d)[:, None] // base ** np.arange(d) % base
+    for _ in range(6):
+        light = rng.exponential(0.8, (8, d)) * (rng.random((8, d)) < 0.6)
+        like, scores = counts_bayes(light, np.zeros(d), shots)
+        after = light.copy()
+        after[:, 1] = 0.0
+        extra, masked = np.array([0, 0, 0, 0.5, 0]), np.array([False, True, False, False, False])
+        like_now, best = counts_bayes(after, extra, shots)
+        adapter, head = HeadAdapter(d, shots), Scored(scores, base)
+        for word in rng.choice(base**d, 3000, p=like.mean(axis=0) / like.mean(axis=0).sum()):
+            adapter.count(digits[word])
+        mixed = adapter.made(head, extra, masked)
+        optimum = accuracy(best.argmax(axis=1), like_now)
+        lost.append(optimum - accuracy(scores.argmax(axis=1), like_now))
+        kept.append(optimum - accuracy(mixed.decide_batch(digits, shots), like_now))
+        verdict = mixed.decide(digits[77], shots)
+        assert verdict.label == mixed.decide_batch(digits[77:78], shots)[0]
+        assert 0 < verdict.probability <= 1
+    assert np.mean(lost) > 0.05
+    assert np.mean(kept) < 0.5 * np.mean(lost)
+
+
+def test_what_is_too_much_to_mix_is_not_decided() -> None:
+    adapter = HeadAdapter(20, 3)
+    concerned = np.zeros(20, np.bool_)
+    concerned[:4] = True
+    assert adapter.can_do(concerned)
+    assert MAX_MIXED == 4**4
+    concerned[4] = True
+    assert not adapter.can_do(concerned)
+
+
+def test_the_adapter_fits_the_bundle() -> None:
+    bundle = load_bundle(ROOT / "runtime" / "shipped" / "fashion10.pans")[0]
+    assert isinstance(make_adapter(bundle, 1), TableAdapter)
+    assert isinstance(make_adapter(bundle, 2), TableAdapter)  # 3^10 rows
+    assert isinstance(make_adapter(bundle, 3), HeadAdapter)  # 4^10 are too many
+    with pytest.raises(UsageError, match="only a table of single clicks"):
+        make_adapter(replace(bundle, head_onnx=None), 2)
+
+
+# ---- what the guard takes in ----
+
+
+def test_an_afterpulse_is_no_dark_count() -> None:
+    plan = shot_major(3, 1)  # a dark slot before three patterns: right behind the last of them
+    rng = np.random.default_rng(6)
+    bits = np.zeros(4 * 20_000, np.uint8)
+    for slot in range(len(bits)):
+        p = 0.01 if slot % 4 == 0 else 0.5
+        bits[slot] = rng.random() < 1 - (1 - p) * (1 - 0.02 * bits[slot - 1])
+    found = {}
+    for afterpulses in (True, False):
+        watch = ChannelWatch(1, np.array([0.01]), WatchSettings(arl_exposures=1e7))
+        guard = DarkGuard(plan, watch, afterpulses=afterpulses)
+        events = []
+        for first in range(0, len(bits), 40):
+            if first == 4000:
+                continue  # a gap: what was before the next block is not known
+            shown = np.resize(plan.slot_pattern, 40)
+            events += guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 40]))
+        found[afterpulses] = [event["state"] for event in events]
+        report = guard.report(DarkMonitor(0.01).report(20_000, int(bits[::4].sum())))
+        assert bool(report.alarm) != afterpulses
+        behind_silence = bits[4::4][bits[3:-1:4] == 0]
+        if afterpulses:
+            assert watch.exposures == pytest.approx(len(behind_silence), abs=12)
+    assert found[True] == []
+    assert found[False]
+
+
+def test_empty_fields_as_counts() -> None:
+    watch = ChannelWatch(3, np.full(3, 0.01), WatchSettings(arl_exposures=1e7))
+    guard = DarkGuard(parallel(3, 4), watch, "warn")
+    events = []
+    for _ in range(200):
+        events += guard.take_empty(256, np.array([2, 3, 12], np.int64))
+    assert [(event["state"], event["channels"]) for event in events] == [("hot", [2])]
+    assert "channel 2" in guard.words()
+
+
+def test_tables_and_masks_need_a_bundle() -> None:
+    watch = ChannelWatch(1, np.array([0.01]))
+    with pytest.raises(UsageError, match="needs a bundle"):
+        DarkGuard(shot_major(3, 1), watch, "tables")
+    with pytest.raises(UsageError, match="allowed: warn"):
+        DarkGuard(shot_major(3, 1), watch, "panic")
+
+
+# ---- whole runs ----
+
+SCENE = """kind = "still"
+images = "fashion200"
+[[change]]
+at_s = 30.0
+kind = "dark"
+factor = 20000.0
+"""
+
+
+@pytest.mark.parametrize("policy", ["warn", "tables", "mask", "abstain"])
+def test_a_run_says_so_and_a_replay_agrees(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle = ROOT / "runtime" / "shipped" / "fashion10.pans"
+    (tmp_path / "hot.toml").write_text(SCENE)
+    device = f"sim:oled-qcmos?scene={tmp_path}/hot.toml&pace=fast&seed=2"
+    words = [
+        "run",
+        str(bundle),
+        "--device",
+        device,
+        "--decisions",
+        "400",
+        "--on-dark",
+        policy,
+        "--out",
+        str(tmp_path),
+        "--json",
+    ]
+    assert main(words) == 1
+    summary = json.loads(capsys.readouterr().out)
+    kinds = {one["state"] for one in summary["dark"]["findings"]}
+    assert kinds == {"burst"}
+    assert summary["dark"]["policy"] == policy
+    assert summary["dark"]["channels"][0]["clicks"] == summary["dark"]["clicks"]
+    assert any("times as often as expected" in fault for fault in summary["faults"])
+    assert (summary["abstained"] > 50) == (policy in ("abstain", "mask"))
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    replayed = json.loads(capsys.readouterr().out)
+    assert replayed["identical"]
+    assert replayed["decisions"] == 400
+    assert main(["verify", str(tmp_path / "run.pansrec")]) == 0
+
+
+@pytest.mark.parametrize(("shots", "policy"), [(2, "tables"), (3, "mask")])
+def test_several_shots_per_decision(
+    shots: int, policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A table of counts decides on with tables made anew; where one detector is masked, nothing is left to decide with."""
+    bundle = ROOT / "runtime" / "shipped" / "fashion10.pans"
+    (tmp_path / "hot.toml").write_text(SCENE)
+    device = f"sim:oled-qcmos?scene={tmp_path}/hot.toml&pace=fast&seed=2"
+    words = ["run", str(bundle), "--device", device, "--decisions", "250", "--shots", str(shots), "--on-dark", policy]
+    assert main([*words, "--out", str(tmp_path), "--json"]) == 1
+    summary = json.loads(capsys.readouterr().out)
+    assert {one["state"] for one in summary["dark"]["findings"]} == {"burst"}
+    assert (summary["abstained"] > 50) == (policy == "mask")
+    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]

@@ -1,0 +1,171 @@
+"""The hard numerical cases of the runtime against mpmath and exact rationals, with the worst error that is allowed.
+
+Click probabilities have theirs in test_clicks.py, evidence and fixed-point sums in test_sliding.py, rounding of the heads in
+test_decide_mlp.py.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import comb
+
+import mpmath
+import numpy as np
+import pytest
+from heads import head_bundle, random_layers
+from plans import parallel
+
+from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.core.still import Core
+from pans.runtime.core.stream import StreamCore
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.kernels import winner
+from pans.runtime.decide.verdict import softmax_winner, softmax_winners
+from pans.runtime.instrument.dark_rate import binomial_tail, wilson_interval
+from pans.runtime.record.format import DECISION_DTYPE
+from pans.runtime.timing.clock import ClockModel
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.messages import FrameBlock
+
+
+def test_winning_probabilities() -> None:
+    """Worst relative error 4 units in the last place of float64, for scores of 1e-8 to 1e30 and ties."""
+    rng = np.random.default_rng(1)
+    scores = np.concatenate([rng.normal(size=(40, 10)) * 10.0**scale for scale in (-8, 0, 1, 2.5, 4, 30)]).astype(
+        np.float32
+    )
+    scores = np.concatenate([scores, np.zeros((1, 10), np.float32), np.full((1, 10), -3e38, np.float32)])
+    worst = 0.0
+    bulk = softmax_winners(scores)
+    for number, row in enumerate(scores):
+        with mpmath.workdps(50):
+            top = mpmath.mpf(float(row.max()))
+            exact = 1 / mpmath.fsum(mpmath.exp(mpmath.mpf(float(s)) - top) for s in row)
+        for label, probability in (softmax_winner(row), winner(row[None], 0, 10)):
+            assert label == int(row.argmax())
+            worst = max(worst, float(abs(mpmath.mpf(probability) - exact) / exact))
+        assert bulk.labels[number] == row.argmax()
+        assert bulk.probabilities[number] == pytest.approx(float(exact), rel=2**-23)
+    assert worst <= 4 * 2**-52
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 1.0], [1.0, np.nan], [np.inf, 0.0], [-np.inf, -np.inf]])
+def test_scores_that_are_not_finite(bad: list[float]) -> None:
+    row = np.array(bad, np.float32)
+    assert softmax_winner(row).probability == 0.0
+    assert winner(row[None], 0, 2)[1] == 0.0
+    assert softmax_winners(row[None]).probabilities[0] == 0.0
+
+
+def test_infinitely_unlikely_classes_are_no_fault() -> None:
+    row = np.array([-np.inf, 2.0], np.float32)
+    for label, probability in (softmax_winner(row), winner(row[None], 0, 2)):
+        assert (label, probability) == (1, 1.0)
+
+
+@pytest.mark.parametrize("p", [0.0, 1e-9, 1e-3, 0.3, 0.9, 1.0])
+@pytest.mark.parametrize("n", [1, 20, 400])
+def test_dark_alarm_probabilities_are_exact(p: float, n: int) -> None:
+    """Relative error at most 1e-10 above the mean (at or below it the alarm does not ask)."""
+    exact_p = Fraction(p)
+    for clicks in {0, 1, n // 3, n - 1, n}:
+        exact = sum((comb(n, k) * exact_p**k * (1 - exact_p) ** (n - k) for k in range(clicks, n + 1)), Fraction(0))
+        found = binomial_tail(clicks, n, p)
+        if clicks > n * p and exact > Fraction(1, 10**290):
+            assert abs(Fraction(found) - exact) <= exact * Fraction(1, 10**10)
+        elif clicks > n * p:
+            assert 0 <= found <= 1e-289
+        else:
+            assert found == 1.0
+
+
+def test_dark_rates_after_a_thousand_million_frames() -> None:
+    clicks, exposures = 3 * 10**9 + 7, 10**12 + 1
+    low, high = wilson_interval(clicks, exposures)
+    with mpmath.workdps(40):
+        z, n, rate = mpmath.mpf("1.959963984540054"), mpmath.mpf(exposures), mpmath.mpf(clicks) / exposures
+        centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * mpmath.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+        assert abs(low - (centre - half)) <= 1e-15 * centre
+        assert abs(high - (centre + half)) <= 1e-15 * centre
+
+
+def test_int8_scales_against_exact_rationals() -> None:
+    """A weight is off by at most half its column's scale (and a rounding of the scale to float32)."""
+    layers = random_layers([9, 20, 5], seed=6)
+    head = quantise_head(layers)
+    whole, scale, bias = head.matrices()[0]
+    step = Fraction(1)
+    for k in range(20):
+        column = [Fraction(float(w)) for w in layers[0].weights[:, k]]
+        unit = max(abs(w) for w in column) / 127
+        step = Fraction(float(scale[k])) / unit  # scale = unit / hidden step
+        for i, weight in enumerate(column):
+            assert abs(int(whole[i, k]) * unit - weight) <= unit / 2 * (1 + Fraction(1, 10**9))
+        exact_bias = Fraction(float(layers[0].bias[k])) * step
+        assert abs(Fraction(float(bias[k])) - exact_bias) <= abs(exact_bias) * Fraction(3, 2**24)
+
+
+def test_counters_and_ticks_far_beyond_32_bits() -> None:
+    """Exposures past 2^44, ticks past 2^61, decisions past 2^33: Core and the streaming core write the same rows."""
+    plan, n_features = parallel(10, 8), 10
+    decider = make_decider(head_bundle(random_layers([10, 8, 4])))
+    first = plan.slots_per_cycle * 2**41
+    rng = np.random.default_rng(2)
+    streamed, core = StreamCore(plan, decider, 1, 0, 7), Core(plan, decider, 1, 0)
+    for one in (streamed.core, core):
+        one.tracker.next_exposure = first
+        one.n_decisions = 2**33 - 3
+        one.windows.position = (2**41, 0, 0)
+        one.windows.tallies[:] = 2**40
+    words = rng.integers(0, 4, (9, 2)).astype(np.uint8)
+    data = wire.encode_frames(FrameBlock(0, 0, 2**61, first, 1000, 2**32 - 2, words), 7)
+    rows = np.concatenate([batch.rows.copy() for batch in streamed.feed(data)])
+    expected = core.step(FrameDecoder().feed(data)[0]).decisions
+    assert rows.tolist() == np.array([tuple(row) for row in expected], DECISION_DTYPE).tolist()
+    assert rows["index"].tolist() == list(range(2**33 - 3, 2**33 + 5))
+    assert int(rows["exposure_index"][-1]) == first + 8
+    assert int(rows["tick"][-1]) == 2**61 + 8 * 1000 + plan.exposure_ticks
+    assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
+    assert streamed.core.windows.tallies[0] == 2**40 + n_features
+
+
+def test_the_clock_keeps_its_nanoseconds_at_large_ticks() -> None:
+    clock = ClockModel(1_000_000_000)
+    base = 2**60
+    for k in range(20):
+        host = 10**15 + k * 10**8
+        clock.add_probe(host, base + k * 10**8 + 500, base + k * 10**8 + 600, host + 1100)
+    found, _ = clock.to_host_ns(base + 19 * 10**8 + 550)
+    assert abs(found - (10**15 + 19 * 10**8 + 550)) <= 2
+
+
+def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
+    """Folded weights against rationals: worst relative error 8 units in the last place; dead channels give their constant only."""
+    pytest.importorskip("torch")
+    from pans.trainer.export.writer import EPSILON, fold_normalisation
+
+    rng = np.random.default_rng(3)
+    mean = np.array([0.0, 1.0, 1e-12, 1 - 1e-12, 1e-3, 0.5, 0.999])
+    weight, bias = rng.normal(size=(4, 7)), rng.normal(size=4)
+    gain, shift = rng.normal(size=7), rng.normal(size=7)
+    folded, constant, dead = fold_normalisation(weight, bias, gain, shift, mean)
+    assert dead == (0, 1, 2, 3)
+    assert (folded[:, :4] == 0).all()
+    with mpmath.workdps(50):
+        for h in range(4):
+            total = mpmath.mpf(float(bias[h]))
+            size = abs(total)
+            for i in range(7):
+                m = mpmath.mpf(float(mean[i]))
+                scale = (
+                    mpmath.mpf(0)
+                    if i < 4
+                    else mpmath.mpf(float(gain[i])) / mpmath.sqrt(m * (1 - m) + mpmath.mpf(EPSILON))
+                )
+                exact = mpmath.mpf(float(weight[h, i])) * scale
+                assert abs(mpmath.mpf(float(folded[h, i])) - exact) <= 8 * abs(exact) * mpmath.mpf(2) ** -52
+                term = mpmath.mpf(float(weight[h, i])) * (mpmath.mpf(float(shift[i])) - m * scale)
+                total, size = total + term, size + abs(term)
+            assert abs(mpmath.mpf(float(constant[h])) - total) <= 16 * size * mpmath.mpf(2) ** -52

@@ -1,0 +1,245 @@
+"""The core: the same frames give the same decisions, and a window with a gap never gives a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plans import parallel, shot_major
+
+from pans.runtime.core.still import MAX_MARKS, NO_LABEL, Core
+from pans.runtime.core.window import DecisionWindows
+from pans.runtime.decide.backends import Verdict, softmax_winner
+from pans.runtime.record.recorder import DECISION_DTYPE, DecisionFlag
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
+
+N_FEATURES = 3
+PLAN = shot_major(N_FEATURES, 2)  # 4 slots per cycle, 2 cycles per object
+
+
+class CountingDecider:
+    """Decides the number of clicks; remembers what it was asked."""
+
+    name, n_features, n_classes = "counting", N_FEATURES, N_FEATURES + 1
+
+    def __init__(self) -> None:
+        self.asked: list[list[int]] = []
+
+    def decide(self, counts: np.ndarray, shots: int) -> Verdict:
+        self.asked.append(counts.tolist())
+        return Verdict(int(counts.sum()) // shots, 0.5)
+
+
+def make(n_cycles: int = 6) -> tuple[Core, CountingDecider]:
+    decider = CountingDecider()
+    return Core(PLAN, decider, 1, n_cycles), decider  # type: ignore[arg-type]
+
+
+def frame(data: bytes) -> Frame:
+    return FrameDecoder().feed(data)[0]
+
+
+def cycle(seq: int, number: int, bits: list[int], patterns: list[int] | None = None) -> Frame:
+    shown = np.array(patterns or PLAN.slot_pattern, np.uint16)
+    return frame(
+        wire.encode_clicks(
+            ClickBlock(seq, 0, 1000 + 400 * number, 4 * number, 100, number // 2, shown, np.array(bits, np.uint8)), 1
+        )
+    )
+
+
+def completed(next_exposure: int, tick: int = 10**6) -> Frame:
+    return frame(wire.encode_status(Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, tick, next_exposure), 1))
+
+
+def test_decisions_carry_what_the_log_needs() -> None:
+    core, decider = make()
+    core.step(frame(wire.encode_mark(Mark(0, 0, 2, 0, 1000, 4.5), 1)))
+    output = core.step(cycle(1, 0, [1, 1, 0, 1]))
+    assert output.block_end_tick == 1000 + 300 + 60
+    (decision,) = output.decisions
+    assert decision._replace(counts_crc=0) == (0, 1360, 3, 0, 0, 2, 2, 2, 0, 0.5, 0)
+    assert decider.asked == [[1, 0, 1]]
+    assert np.array([decision], DECISION_DTYPE)["label"][0] == 2
+    assert core.marks[0].photons == 4.5
+
+
+def test_a_gap_abstains_and_the_next_window_is_whole_again() -> None:
+    core, decider = make()
+    core.step(cycle(0, 0, [0, 0, 0, 0]))
+    output = core.step(cycle(2, 2, [0, 1, 1, 1]))
+    gap, whole = output.decisions
+    assert output.events == [
+        {"kind": "gap", "first_exposure": 4, "exposures": 4, "messages": 1, "dropped_by_device": 0}
+    ]
+    assert (gap.label, gap.flags) == (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED)
+    assert (whole.label, whole.flags, whole.object) == (3, 0, 1)
+    assert len(decider.asked) == 2
+    assert core.n_abstained == 1
+
+
+def test_a_wrong_pattern_abstains() -> None:
+    core, decider = make()
+    (decision,) = core.step(cycle(0, 0, [0, 1, 1, 1], [0xFFFF, 0, 2, 1])).decisions
+    assert decision.flags == DecisionFlag.WRONG_PATTERN | DecisionFlag.ABSTAINED
+    assert decider.asked == []
+
+
+def test_completion_settles_what_never_came() -> None:
+    core, _ = make()
+    core.step(cycle(0, 0, [0, 0, 0, 0]))
+    assert not core.step(completed(24)).decisions  # it may have overtaken what is missing
+    assert not core.step(completed(24)).decisions  # a repetition says nothing new
+    assert not core.completed
+    assert core.step(completed(24, tick=10**6 + 1)).decisions
+    assert core.completed
+    assert core.n_decisions == 6
+    assert core.tracker.counters.lost_exposures == 20
+    assert core.step(completed(24)).decisions == []
+
+
+def test_blocks_that_a_status_overtook_still_count() -> None:
+    core, decider = make(n_cycles=1)
+    core.step(completed(4))
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].flags == 0
+    core.step(completed(4, tick=10**6 + 1))
+    assert core.completed
+    assert core.tracker.counters.lost_exposures == 0
+    assert decider.asked == [[1, 0, 0]]
+
+
+def test_what_comes_after_the_end_was_settled_is_dropped_and_counted() -> None:
+    core, decider = make(n_cycles=1)
+    core.step(completed(4))
+    assert core.step(completed(4, tick=10**6 + 1)).decisions[0].flags & DecisionFlag.GAP
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions == []
+    assert (core.tracker.counters.repeated, decider.asked) == (1, [])
+
+
+def test_another_stream_settles_the_open_visit_and_counts_anew() -> None:
+    core, decider = make(n_cycles=6)  # three visits of two cycles
+    core.begin(0, 6)
+    core.step(cycle(0, 0, [0, 1, 1, 1]))
+    core.step(cycle(1, 1, [0, 1, 1, 1]))
+    core.step(cycle(2, 2, [0, 1, 1, 1]))
+    ended = core.end()
+    assert ended.events == [{"kind": "stream_end_unknown", "first_exposure": 12}]
+    assert core.cycles_left(6) == 2
+    (given_up,) = core.begin(5000, 2).decisions
+    assert given_up.flags == DecisionFlag.GAP | DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED
+    assert given_up.number == 3
+    (decision,) = core.step(cycle(0, 0, [0, 1, 1, 0])).decisions
+    assert (decision.number, decision.flags, decision.exposure_index) == (4, 0, 3)
+    assert len(decider.asked) == 4
+
+
+def test_a_stream_that_was_stopped_reports_what_was_exposed_and_never_came() -> None:
+    core, _ = make(n_cycles=0)
+    core.begin(0, 0)
+    core.step(cycle(0, 0, [0, 1, 1, 1]))
+    stopped = wire.encode_status(Status(DeviceState.IDLE, StateReason.STOPPED, 0, 0, 2000, 9), 1)
+    assert core.step(frame(stopped)).events == []
+    ended = core.end()
+    assert [event["exposures"] for event in ended.events] == [5]
+    assert len(ended.decisions) == 1  # the window that lies whole in the gap
+    assert core.end().events == []
+
+
+def test_an_absurd_exposure_number_is_damage_not_a_million_windows() -> None:
+    core, _ = make(n_cycles=0)
+    assert core.step(cycle(0, 1 << 17, [0, 0, 0, 0])).decisions == []
+    assert core.tracker.counters.malformed == 1
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].flags == 0
+
+
+def test_an_earlier_runs_completion_is_no_news() -> None:
+    core, _ = make()
+    core.start_tick = 500
+    assert core.step(completed(24, tick=499)).decisions == []
+    assert not core.completed
+
+
+def test_exposures_beyond_the_plan_are_refused() -> None:
+    core, decider = make(n_cycles=1)
+    output = core.step(cycle(0, 5, [0, 0, 0, 0]))
+    assert output.decisions == []
+    assert {"kind": "beyond_plan", "exposure_index": 20} in output.events
+    assert decider.asked == []
+
+
+def test_the_same_frames_give_the_same_log_whatever_came_before_in_the_process() -> None:
+    rng = np.random.default_rng(3)
+    frames = [cycle(seq, seq, rng.integers(0, 2, 4).tolist()) for seq in range(6) if seq != 2]
+    logs = [[d for f in frames for d in make()[0].step(f).decisions] for _ in range(2)]
+    assert logs[0] == logs[1]
+    core, _ = make()
+    log = [d for f in frames for d in core.step(f).decisions]
+    assert [d.number for d in log] == list(range(6))
+
+
+def test_damaged_frames_change_nothing() -> None:
+    core, _ = make()
+    assert core.step(Frame(wire.MessageType.CLICKS, 0, 1, b"xx")).decisions == []
+    assert core.step(Frame(wire.MessageType.STATUS, 0, 1, b"xx")).decisions == []
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].label == 1
+
+
+def test_marks_are_bounded() -> None:
+    core, _ = make()
+    for seq in range(MAX_MARKS + 10):
+        core.step(frame(wire.encode_mark(Mark(seq, seq, 0, 0, 0, 0.0), 1)))
+    assert len(core.marks) == MAX_MARKS
+    assert MAX_MARKS + 9 in core.marks
+    assert 0 not in core.marks
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_losses_never_reach_the_decider(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    core, decider = make(n_cycles=200)
+    log = []
+    for seq in range(200):
+        if rng.random() > 0.2:
+            log += core.step(cycle(seq, seq, rng.integers(0, 2, 4).tolist())).decisions
+    log += core.step(completed(800)).decisions + core.step(completed(800, tick=10**6 + 1)).decisions
+    assert len(log) == 200
+    flagged = [d for d in log if d.flags & DecisionFlag.GAP]
+    assert len(flagged) + len(decider.asked) == 200
+    assert core.tracker.counters.lost_exposures == 4 * len(flagged)
+
+
+@pytest.mark.parametrize("score", [float("nan"), float("inf")])
+def test_scores_that_are_not_finite_give_no_label(score: float) -> None:
+    core, decider = make()
+    decider.decide = lambda counts, shots: softmax_winner(np.array([0.0, score], np.float32))  # type: ignore[method-assign]
+    (decision,) = core.step(cycle(0, 0, [0, 1, 0, 1])).decisions
+    assert (decision.label, decision.probability) == (NO_LABEL, 0.0)
+    assert decision.flags == DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
+    assert core.n_abstained == 1
+
+
+def test_the_tick_is_the_end_of_the_windows_own_last_exposure() -> None:
+    plan = parallel(N_FEATURES, 4)
+    core = Core(plan, CountingDecider(), 2, 0)  # type: ignore[arg-type]
+    block = wire.FrameBlock(0, 0, 1000, 0, 100, 0, np.ones((5, 1), np.uint8))
+    output = core.step(frame(wire.encode_frames(block, 1)))
+    assert [(d.exposure_index, d.tick) for d in output.decisions] == [(2, 1260), (4, 1460)]
+    assert output.block_end_tick == 1460
+
+
+def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
+    plan = parallel(N_FEATURES + 8, 4)
+    core = Core(plan, CountingDecider(), 1, 0)  # type: ignore[arg-type]
+    core.windows = DecisionWindows(plan, N_FEATURES + 8, 1)
+    too_narrow = wire.FrameBlock(0, 0, 0, 0, 100, 0, np.ones((5, 1), np.uint8))
+    two_visits = wire.FrameBlock(1, 0, 0, 5, 100, 0, np.ones((6, 2), np.uint8))
+    other_kind = ClickBlock(2, 0, 0, 11, 100, 0, np.zeros(2, np.uint16), np.ones(2, np.uint8))
+    for message in (
+        wire.encode_frames(too_narrow, 1),
+        wire.encode_frames(two_visits, 1),
+        wire.encode_clicks(other_kind, 1),
+    ):
+        output = core.step(frame(message))
+        assert output.events[-1]["kind"] == "beyond_plan"
+        assert all(d.flags & DecisionFlag.GAP for d in output.decisions)
+    assert core.tracker.counters.malformed == 3

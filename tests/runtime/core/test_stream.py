@@ -1,0 +1,245 @@
+"""The streaming core against the plain one: the same bytes give the same rows, counts and events, whatever happens to them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zlib
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+from heads import head_bundle, random_layers
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plans import parallel, shot_major
+
+from pans.runtime.core import stream
+from pans.runtime.core.still import Core
+from pans.runtime.core.stream import StreamCore, count_crc_tables
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.verdict import Verdicts
+from pans.runtime.errors import UsageError
+from pans.runtime.record.format import DECISION_DTYPE, NO_LABEL, DecisionFlag
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
+
+SESSION = 7
+_DECIDERS: dict[tuple[int, int, str], Any] = {}
+
+
+def decider_for(n_features: int, shots: int, backend: str) -> Any:
+    key = (n_features, shots, backend)
+    if key not in _DECIDERS:
+        bundle = head_bundle(random_layers([n_features, 12, 4], seed=n_features))
+        _DECIDERS[key] = make_decider(bundle, shots=shots, backend=backend)
+    return _DECIDERS[key]
+
+
+CASES = [(10, 1, 4, "table"), (3, 3, 2, "count-table"), (11, 2, 3, "sparse"), (2, 300, 1, "sparse")]
+
+
+def frames(plan: Any, n_features: int, n_visits: int, rng: np.random.Generator, block: int) -> list[bytes]:
+    """A clean stream: a mark and blocks for every visit, as a device sends them; words may be wider than they need be."""
+    sent, seq, slots = [], 0, plan.slots_per_cycle
+    word_bytes = {1: 1, 2: 2}[-(-n_features // 8)] * int(rng.integers(1, 3))
+    for visit in range(n_visits):
+        truth = int(rng.integers(-1, 4))
+        mark = Mark(seq, visit, truth, visit * slots, 1000 + 100 * visit * slots, 2.5)
+        sent.append(wire.encode_mark(mark, SESSION))
+        seq += 1
+        for first in range(0, slots, block):
+            count = min(block, slots - first)
+            words = rng.integers(0, 256, (count, word_bytes)).astype(np.uint8)
+            exposure = visit * slots + first
+            blk = FrameBlock(seq, 0, 1000 + 100 * exposure, exposure, 100, visit, words)
+            sent.append(wire.encode_frames(blk, SESSION))
+            seq += 1
+    end = Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, 10**6, n_visits * slots)
+    return [*sent, wire.encode_status(end, SESSION), wire.encode_status(end, SESSION)]
+
+
+def by_core(
+    plan: Any, decider: Any, shots: int, pieces: list[bytes]
+) -> tuple[np.ndarray, list[Any], Core, FrameDecoder]:
+    core, decoder = Core(plan, decider, shots, 0), FrameDecoder()
+    rows: list[Any] = []
+    events: list[Any] = []
+    for piece in pieces:
+        for frame in decoder.feed(piece):
+            if frame.session == SESSION and frame.type in (0x84, 0x90, 0x91, 0x92):
+                output = core.step(frame)
+                rows += output.decisions
+                events += output.events
+    return np.array([tuple(row) for row in rows], DECISION_DTYPE), events, core, decoder
+
+
+def by_stream(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> tuple[np.ndarray, list[Any], StreamCore]:
+    streamed = StreamCore(plan, decider, shots, 0, SESSION)
+    rows, events = [np.zeros(0, DECISION_DTYPE)], []
+    for piece in pieces:
+        for batch in streamed.feed(piece):
+            rows.append(batch.rows.copy())
+            events += batch.events
+    return np.concatenate(rows), events, streamed
+
+
+def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndarray:
+    expected, expected_events, core, decoder = by_core(plan, decider, shots, pieces)
+    rows, events, streamed = by_stream(plan, decider, shots, pieces)
+    for name in DECISION_DTYPE.names or ():
+        assert rows[name].tolist() == expected[name].tolist(), name
+    assert events == expected_events
+    assert asdict(streamed.core.tracker.counters) == asdict(core.tracker.counters)
+    assert asdict(streamed.decoder.counters) == asdict(decoder.counters)
+    assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
+    for name in ("n_decisions", "n_abstained", "completed", "last_tick"):
+        assert getattr(streamed.core, name) == getattr(core, name), name
+    assert streamed.core.tracker.position == core.tracker.position
+    assert streamed.core.windows.position == core.windows.position
+    return rows
+
+
+@pytest.mark.parametrize(("n_features", "shots", "n_windows", "backend"), CASES)
+def test_a_clean_stream(n_features: int, shots: int, n_windows: int, backend: str) -> None:
+    plan, decider = parallel(n_features, shots * n_windows), decider_for(n_features, shots, backend)
+    rng = np.random.default_rng(3)
+    data = b"".join(frames(plan, n_features, 9, rng, 7))
+    rows = compare(plan, decider, shots, [data])
+    assert len(rows) == 9 * n_windows
+    assert not rows["flags"].any()
+    assert (rows["label"] < 4).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_any_faults_any_cuts(data: st.DataObject) -> None:
+    n_features, shots, n_windows, backend = data.draw(st.sampled_from(CASES[:3]))
+    plan, decider = parallel(n_features, shots * n_windows), decider_for(n_features, shots, backend)
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    clean = frames(plan, n_features, 6, rng, int(rng.integers(1, 9)))
+    foreign = [
+        wire.encode_ping(1, 5, SESSION),
+        wire.encode_mark(Mark(0, 1, 2, 0, 0, 1.0), SESSION + 1),
+        wire.encode_frame(MessageType.FRAMES, bytes(40), SESSION),
+        wire.encode_frame(MessageType.MARK, bytes(5), SESSION),
+        wire.encode_frames(FrameBlock(3, 0, 0, 2**63, 1, 0, np.ones((2, 1), np.uint8)), SESSION),
+        wire.encode_frames(FrameBlock(4, 2, 2**63, 0, 1, 0, np.ones((50, 8), np.uint8)), SESSION),
+    ]
+    sent: list[bytes] = []
+    for message in clean:
+        fate = data.draw(st.sampled_from(["arrives"] * 6 + ["lost", "damaged", "twice", "foreign", "held"]))
+        if fate == "damaged":
+            spoilt = bytearray(message)
+            spoilt[int(rng.integers(len(spoilt)))] ^= 1 << int(rng.integers(8))
+            message = bytes(spoilt)
+        if fate == "foreign":
+            sent.append(foreign[int(rng.integers(len(foreign)))])
+        if fate != "lost":
+            sent += [message] * (2 if fate == "twice" else 1)
+        if fate == "held" and len(sent) > 1:
+            sent[-1], sent[-2] = sent[-2], sent[-1]
+    whole = b"".join(sent)
+    at = sorted(rng.integers(0, len(whole) + 1, int(rng.integers(0, 6))).tolist())
+    compare(plan, decider, shots, [whole[a:b] for a, b in zip([0, *at], [*at, len(whole)])])
+
+
+def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "ROWS_PER_BATCH", 5)
+    plan, decider = parallel(10, 8), decider_for(10, 1, "table")
+    clean = frames(plan, 10, 5, np.random.default_rng(4), 3)
+    assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40
+    del clean[7:12]
+    assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40
+
+
+def test_what_device_drops_and_sequence_wraps_do() -> None:
+    plan, decider = parallel(3, 4), decider_for(3, 1, "table")
+    words = np.ones((5, 1), np.uint8)
+    blocks = [
+        FrameBlock(0, 0, 0, 0, 10, 0, words),
+        FrameBlock(1, 5, 100, 10, 10, 2, words),
+        FrameBlock(2, 5, 150, 15, 10, 3, words),
+    ]
+    rows = compare(plan, decider, 1, [b"".join(wire.encode_frames(block, SESSION) for block in blocks)])
+    assert (rows["flags"] == DecisionFlag.GAP | DecisionFlag.ABSTAINED).tolist() == [False] * 4 + [True] * 4 + [
+        False
+    ] * 8
+    streamed = StreamCore(plan, decider, 1, 0, SESSION)
+    streamed.core.tracker.next_seq = 2**32 - 1
+    for seq, first in ((2**32 - 1, 0), (0, 5)):
+        block = FrameBlock(seq, 0, 0, first, 10, 0, words)
+        assert sum(len(batch.rows) for batch in streamed.feed(wire.encode_frames(block, SESSION))) == 4
+    assert streamed.core.tracker.counters.gaps == 0
+
+
+def test_blocks_beyond_the_plan_and_photons() -> None:
+    plan, decider = parallel(3, 2), decider_for(3, 1, "table")
+    streamed = StreamCore(plan, decider, 1, 1, SESSION)
+    streamed.warm_up()
+    clean = b"".join(frames(plan, 3, 2, np.random.default_rng(4), 3))
+    batches = [(batch.rows.copy(), batch.events, batch.others) for batch in streamed.feed(clean)]
+    assert sum(len(rows) for rows, _, _ in batches) == 2
+    assert [event["kind"] for _, events, _ in batches for event in events] == ["beyond_plan"]
+    assert {frame.type for _, _, others in batches for frame in others} == {MessageType.STATUS}
+    photons = streamed.photons_of(np.array([0, 1, 5]))
+    assert photons[:2].tolist() == [2.5, 2.5]
+    assert np.isnan(photons[2])
+
+
+def test_scores_that_are_not_finite_abstain_in_bulk() -> None:
+    class Lost:
+        name, n_features, n_classes = "lost", 3, 4
+
+        def verdicts(self, counts: np.ndarray, shots: int) -> Verdicts:
+            bad = counts.sum(axis=1) % 2 == 1
+            return Verdicts(np.full(len(counts), 2, np.uint16), np.where(bad, 0, 0.5).astype(np.float32))
+
+        def decide(self, counts: np.ndarray, shots: int) -> Any:
+            labels, probabilities = self.verdicts(counts[None], shots)
+            return int(labels[0]), float(probabilities[0])
+
+    plan = parallel(3, 6)
+    rows = compare(plan, Lost(), 1, [b"".join(frames(plan, 3, 4, np.random.default_rng(1), 5))])
+    bad = rows["clicks"] % 2 == 1
+    assert 0 < bad.sum() < len(rows)
+    assert (rows["label"][bad] == NO_LABEL).all()
+    assert (rows["flags"][bad] == DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED).all()
+
+
+@pytest.mark.parametrize(("n_features", "shots"), [(1, 1), (10, 1), (3, 255), (5, 256), (2, 70_000)])
+def test_the_checksum_of_counts_from_tables(n_features: int, shots: int) -> None:
+    table, zero = count_crc_tables(n_features, shots)
+    rng = np.random.default_rng(8)
+    for counts in [np.full(n_features, shots), *rng.integers(0, shots + 1, (20, n_features))]:
+        crc = int(zero[0])
+        for byte in range(len(table)):
+            for feature, count in enumerate(counts.tolist()):
+                crc ^= int(table[byte, feature, (count >> 8 * byte) & 0xFF])
+        assert crc == zlib.crc32(counts.astype("<i8").tobytes())
+
+
+def test_sequential_plans_are_refused() -> None:
+    with pytest.raises(UsageError, match="parallel"):
+        StreamCore(shot_major(3, 1), decider_for(3, 1, "table"), 1, 0, SESSION)
+
+
+def test_kernels_without_the_compiler() -> None:
+    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+        pytest.skip("this is the run without compilation")
+    names = [
+        "test_a_clean_stream[10-1-4-table]",
+        "test_a_clean_stream[11-2-3-sparse]",
+        "test_more_rows_than_a_batch_holds",
+    ]
+    names += ["test_what_device_drops_and_sequence_wraps_do"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

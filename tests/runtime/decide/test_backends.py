@@ -1,0 +1,345 @@
+"""Decisions: table and head answer alike, as the slow oracles do, and refuse what they cannot answer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import naive_decide as naive
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.model import Bundle, make_bundle, word_means
+from pans.runtime.decide import kernels as decide_kernels
+from pans.runtime.decide.backends import OnnxDecider, TableDecider, make_decider, softmax_winner
+from pans.runtime.decide.verdict import choice_of
+from pans.runtime.errors import DamagedFileError, UsageError
+
+
+def onnx_model(nodes: list[Any], inputs: list[Any], outputs: list[Any], weights: list[Any]) -> bytes:
+    pytest.importorskip("onnx")
+    from onnx import helper
+
+    graph = helper.make_graph(nodes, "head", inputs, outputs, weights)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+
+
+def tensor(name: str, shape: list[Any], kind: str = "FLOAT") -> Any:
+    from onnx import TensorProto, helper
+
+    return helper.make_tensor_value_info(name, getattr(TensorProto, kind), shape)
+
+
+def affine_head(weights: np.ndarray, bias: np.ndarray, batch: Any = "n") -> bytes:
+    pytest.importorskip("onnx")
+    from onnx import helper, numpy_helper
+
+    return onnx_model(
+        [helper.make_node("Gemm", ["means", "w", "b"], ["scores"])],
+        [tensor("means", [batch, weights.shape[0]])],
+        [tensor("scores", [batch, weights.shape[1]])],
+        [
+            numpy_helper.from_array(weights.astype(np.float32), "w"),
+            numpy_helper.from_array(bias.astype(np.float32), "b"),
+        ],
+    )
+
+
+def bundle(d_f: int, classes: int, **back_end: Any) -> Bundle:
+    return make_bundle(
+        name="toy",
+        task="test",
+        classes=[f"c{i}" for i in range(classes)],
+        image_shape=(1, 1),
+        levels=2,
+        pattern_levels=np.ones((d_f, 1), dtype=np.int64),
+        photons_per_level=1.0,
+        provenance={},
+        **back_end,
+    )
+
+
+def affine_bundle(d_f: int, classes: int, batch: Any = "n") -> tuple[Bundle, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(5)
+    weights = rng.normal(size=(d_f, classes)).astype(np.float32)
+    bias = rng.normal(size=classes).astype(np.float32)
+    return bundle(d_f, classes, head_onnx=affine_head(weights, bias, batch)), weights, bias
+
+
+def replaced(old: Bundle, **changes: Any) -> Bundle:
+    return Bundle(**({item.name: getattr(old, item.name) for item in fields(old)} | changes))
+
+
+def all_clicks(d_f: int) -> np.ndarray:
+    return word_means(np.arange(1 << d_f), d_f).astype(np.int64)
+
+
+@pytest.mark.parametrize("backend", ["table", "onnx"])
+def test_every_word_as_the_oracle(backend: str) -> None:
+    made, weights, bias = affine_bundle(6, 4)
+    decider = make_decider(made, backend=backend)
+    assert (decider.name, decider.n_features, decider.n_classes) == (backend, 6, 4)
+    clicks = all_clicks(6)
+    labels = decider.decide_batch(clicks, 1)
+    assert labels.dtype == np.int64
+    for row in clicks:
+        scores = naive.affine_scores(row.tolist(), 1, weights.tolist(), bias.tolist())
+        label, probability = naive.winner(scores)
+        verdict = decider.decide(row, 1)
+        assert verdict.label == label == labels[naive.word_of(row.tolist())]
+        assert verdict.probability == pytest.approx(probability, abs=1e-5)
+        np.testing.assert_allclose(decider.scores_batch(row[None], 1)[0], scores, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", ["n", 1, None])
+def test_the_head_answers_means_of_several_shots(batch: Any) -> None:
+    made, weights, bias = affine_bundle(5, 3, batch)
+    decider = make_decider(made, shots=7, backend="onnx")
+    counts = np.random.default_rng(3).integers(0, 8, size=(40, 5))
+    scores = decider.scores_batch(counts, 7)
+    assert scores.dtype == np.float32
+    for row, found in zip(counts, scores):
+        wanted = naive.affine_scores(row.tolist(), 7, weights.tolist(), bias.tolist())
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+        assert decider.decide(row, 7).label == naive.winner(wanted)[0]
+    # the bound buffers carry nothing over from one object to the next
+    first = decider.decide(counts[0], 7)
+    decider.decide(counts[1], 7)
+    assert decider.decide(counts[0], 7) == first
+
+
+def test_fewer_shots_than_planned_are_still_means() -> None:
+    made, weights, bias = affine_bundle(3, 2)
+    wanted = naive.winner(naive.affine_scores([1, 0, 2], 2, weights.tolist(), bias.tolist()))
+    found = make_decider(made, shots=5, backend="onnx").decide(np.array([1, 0, 2]), 2)
+    assert found.label == wanted[0]
+    assert found.probability == pytest.approx(wanted[1], abs=1e-5)
+
+
+def test_ties_go_to_the_lowest_label() -> None:
+    table = np.array([[1, 1, 0], [0, 2, 2], [3, 3, 3], [0, 0, 1]], dtype=np.float32)
+    made = bundle(2, 3, table=table)
+    assert make_decider(made).decide_batch(all_clicks(2), 1).tolist() == [0, 1, 0, 2]
+
+
+@pytest.mark.parametrize("scores", [[1e4, 0, -1e4], [0, 0, 0], [-3e38, 3e38, 0], [88.8, 88.7, -100], [1e-30, 0, 0]])
+def test_the_winning_probability_is_stable(scores: list[float]) -> None:
+    label, probability = naive.winner([float(np.float32(score)) for score in scores])
+    found = softmax_winner(np.array(scores, dtype=np.float32))
+    assert found.label == label
+    assert found.probability == pytest.approx(probability, rel=1e-12)
+    table = np.tile(np.array(scores, dtype=np.float32), (2, 1))
+    assert make_decider(bundle(1, 3, table=table)).decide(np.array([1]), 1).probability == pytest.approx(probability)
+
+
+@pytest.mark.parametrize("score", [np.nan, np.inf])
+def test_scores_that_are_not_finite_have_no_probability(score: float) -> None:
+    assert softmax_winner(np.array([0.0, score], dtype=np.float32)).probability == 0.0
+
+
+@pytest.mark.parametrize("classes", [3, 300])
+def test_words_in_bulk(classes: int) -> None:
+    rng = np.random.default_rng(9)
+    table = rng.normal(size=(64, classes)).astype(np.float32)
+    decider = TableDecider(bundle(6, classes, table=table))
+    for dtype in (np.uint32, np.uint64):
+        words = rng.integers(0, 64, size=500).astype(dtype)
+        out = np.empty(500, dtype=decider.labels.dtype)
+        assert decider.decide_words(words, out) is out
+        assert out.tolist() == [naive.winner(table[int(word)].tolist())[0] for word in words]
+        words[17] = 64
+        with pytest.raises(UsageError, match="click word 64 at 17, allowed: below 64"):
+            decider.decide_words(words)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("label_dtype", [np.uint8, np.uint16])
+def test_the_kernel_as_its_oracle(compiled: bool, label_dtype: Any) -> None:
+    kernel = decide_kernels.label_words
+    if not compiled:
+        kernel = getattr(kernel, "py_func", kernel)
+    rng = np.random.default_rng(2)
+    labels = rng.integers(0, 250, size=32).astype(label_dtype)
+    for highest in (32, 40, 1 << 63):
+        words = rng.integers(0, highest, size=50).astype(np.uint64)
+        out, wanted = np.zeros(50, dtype=label_dtype), [0] * 50
+        assert kernel(labels, words, out) == naive.label_words(labels.tolist(), words.tolist(), wanted)
+        assert out.tolist() == wanted
+
+
+def test_the_kernel_without_the_compiler() -> None:
+    code = (
+        "import numpy as np; from pans.runtime.decide.kernels import label_words, warm_up; warm_up();"
+        "out = np.zeros(3, np.uint8); l = np.array([5, 6], np.uint8);"
+        "print(label_words(l, np.array([1, 0, 2], np.uint64), out), out.tolist(), hasattr(label_words, 'py_func'))"
+    )
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2", "[6,", "5,", "0]", "False"]
+
+
+def test_the_table_refuses_what_it_cannot_answer() -> None:
+    decider = make_decider(bundle(3, 2, table=np.zeros((8, 2))))
+    with pytest.raises(UsageError, match="single shots"):
+        decider.decide(np.array([0, 1, 2]), 1)
+    with pytest.raises(UsageError, match="single shots"):
+        decider.decide(np.array([0, -1, 1]), 1)
+    with pytest.raises(UsageError, match="single shots"):
+        decider.decide(np.array([0, 1, 1]), 2)
+    with pytest.raises(UsageError, match="counts run from 0 to 2, allowed: 0 to 1"):
+        decider.decide_batch([[0, 1, 2]], 1)
+    with pytest.raises(UsageError, match=r"integers \(n, 3\)"):
+        decider.decide_batch([[0, 1]], 1)
+    with pytest.raises(UsageError, match="integers"):
+        decider.scores_batch([[0.0, 1.0, 0.0]], 1)
+
+
+def test_the_choice_of_the_back_end() -> None:
+    both, _, _ = affine_bundle(3, 2)
+    assert make_decider(both).name == "table"
+    measured = make_decider(both, shots=2)
+    assert measured.name in ("count-table", "sparse", "onnx")
+    assert choice_of(measured)["chosen"] == measured.name
+    assert set(choice_of(measured)["p50_us"]) == {"count-table", "sparse", "onnx"}
+    assert make_decider(both, backend="onnx").name == "onnx"
+    only_table = bundle(3, 2, table=np.zeros((8, 2)))
+    for wrong in ({"backend": "onnx"}, {"shots": 2}, {"backend": "gpu"}, {"shots": 0}):
+        with pytest.raises(UsageError):
+            make_decider(only_table, **wrong)
+    only_head = replaced(both, table=None)
+    assert make_decider(only_head, backend="onnx").name == "onnx"
+    with pytest.raises(UsageError, match="no table"):
+        make_decider(only_head, backend="table")
+    with pytest.raises(UsageError, match="single shots, not 3"):
+        make_decider(both, backend="table", shots=3)
+
+
+@pytest.mark.parametrize("backend", ["table", "onnx"])
+def test_golden_vectors_are_held_against_the_back_end(backend: str) -> None:
+    made, _, _ = affine_bundle(4, 3)
+    scores = made.golden_scores.copy()
+    scores[5, 1] += 1e-3
+    with pytest.raises(DamagedFileError, match="golden vectors of the bundle: the scores of vector 5"):
+        make_decider(replaced(made, golden_scores=scores), backend=backend)
+
+
+def test_golden_vectors_catch_a_head_that_rolls_dice() -> None:
+    pytest.importorskip("onnx")
+    from onnx import helper
+
+    nodes = [
+        helper.make_node("RandomNormalLike", ["means"], ["noise"]),
+        helper.make_node("Add", ["means", "noise"], ["scores"]),
+    ]
+    dice = onnx_model(nodes, [tensor("means", ["n", 13])], [tensor("scores", ["n", 13])], [])
+    made = bundle(13, 13, head_onnx=dice)
+    with pytest.raises(DamagedFileError, match="golden"):
+        make_decider(made, backend="onnx")
+
+
+def hostile_heads() -> dict[str, tuple[bytes, str]]:
+    pytest.importorskip("onnx")
+    from onnx import helper, numpy_helper
+
+    def head(nodes: list[Any], inputs: list[Any], outputs: list[Any], weights: list[Any] | None = None) -> bytes:
+        return onnx_model(nodes, inputs, outputs, weights or [])
+
+    identity = helper.make_node("Identity", ["x"], ["y"])
+    outside = numpy_helper.from_array(np.zeros((2, 2), dtype=np.float32), "w")
+    outside.ClearField("raw_data")
+    outside.data_location = 1
+    outside.external_data.add(key="location", value="secret.bin")
+    flat = helper.make_node("ReduceSum", ["x"], ["y"], keepdims=1)
+    x, y = tensor("x", ["n", 2]), tensor("y", ["n", 2])
+    return {
+        "not a model": (b"\xff" * 40, "ONNX"),
+        "empty": (b"", "1 to|ONNX"),
+        "random": (np.random.default_rng(1).bytes(300), "ONNX"),
+        "wrong input width": (
+            head([identity], [tensor("x", ["n", 3])], [tensor("y", ["n", 3])]),
+            r"allowed: \(n or 1, 2\)",
+        ),
+        "wrong output width": (
+            head([helper.make_node("Concat", ["x", "x"], ["y"], axis=1)], [x], [tensor("y", ["n", 4])]),
+            "output",
+        ),
+        "wrong rank": (head([identity], [tensor("x", ["n", 2, 1])], [tensor("y", ["n", 2, 1])]), "shape"),
+        "fixed batch of two": (head([identity], [tensor("x", [2, 2])], [tensor("y", [2, 2])]), "shape"),
+        "doubles": (head([identity], [tensor("x", ["n", 2], "DOUBLE")], [tensor("y", ["n", 2], "DOUBLE")]), "tensor"),
+        "labels for scores": (
+            head([helper.make_node("ArgMax", ["x"], ["y"], axis=1)], [x], [tensor("y", ["n", 1], "INT64")]),
+            "tensor",
+        ),
+        "two inputs": (head([helper.make_node("Add", ["x", "z"], ["y"])], [x, tensor("z", ["n", 2])], [y]), "2 inputs"),
+        "rows mixed": (head([flat], [x], [tensor("y", None)]), "output for 1 rows"),
+        "weights elsewhere": (
+            head([helper.make_node("MatMul", ["x", "w"], ["y"])], [x], [y], [outside]),
+            "another file",
+        ),
+        "a name that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"means", b"\xf0eans"), "ONNX head"),
+        "an initial that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"n", b"\xad"), "ONNX head"),
+        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "refuses it"),
+        "unknown operator": (head([helper.make_node("Teleport", ["x"], ["y"])], [x], [y]), "onnxruntime"),
+    }
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *(
+            "not a model",
+            "empty",
+            "random",
+            "wrong input width",
+            "wrong output width",
+            "wrong rank",
+            "fixed batch of two",
+        ),
+        *("doubles", "labels for scores", "two inputs", "rows mixed", "weights elsewhere", "unknown operator"),
+        *("a name that is no text", "an initial that is no text", "an operator that is no text"),
+    ],
+)
+def test_hostile_heads_are_refused_with_the_reason(kind: str, capfd: pytest.CaptureFixture[str]) -> None:
+    model, reason = hostile_heads()[kind]
+    good, _, _ = affine_bundle(2, 2)
+    with pytest.raises(DamagedFileError, match=reason):
+        OnnxDecider(replaced(good, head_onnx=model))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_weights_elsewhere_are_found_inside_attributes_and_branches() -> None:
+    onnx = pytest.importorskip("onnx")
+    from onnx import helper, numpy_helper
+
+    outside = numpy_helper.from_array(np.ones((1, 2), dtype=np.float32), "c")
+    outside.ClearField("raw_data")
+    outside.data_location = 1
+    outside.external_data.add(key="location", value="secret.bin")
+    constant = helper.make_node("Constant", [], ["c"], value=outside)
+    branch = helper.make_graph([constant], "branch", [], [tensor("c", [1, 2])])
+    choose = helper.make_node("If", ["yes"], ["c2"], then_branch=branch, else_branch=branch)
+    nodes = [choose, helper.make_node("Add", ["x", "c2"], ["y"])]
+    yes = numpy_helper.from_array(np.array(True), "yes")
+    model = onnx_model(nodes, [tensor("x", ["n", 2])], [tensor("y", ["n", 2])], [yes])
+    assert onnx.load_from_string(model)
+    good, _, _ = affine_bundle(2, 2)
+    with pytest.raises(DamagedFileError, match="another file"):
+        OnnxDecider(replaced(good, head_onnx=model))
+
+
+def test_the_table_path_needs_neither_numba_nor_onnxruntime(tmp_path: Path) -> None:
+    from pans.runtime.bundle.model import write_bundle
+
+    write_bundle(bundle(3, 2, table=np.arange(16).reshape(8, 2)), tmp_path / "t.pans")
+    code = (
+        "import sys, numpy as np; from pans.runtime.bundle.model import load_bundle; from pans.runtime.decide.backends import make_decider;"
+        "print(make_decider(load_bundle(sys.argv[1])[0]).decide(np.array([0, 1, 1]), 1).label,"
+        "sorted({'numba', 'onnxruntime', 'onnx', 'torch'} & set(sys.modules)))"
+    )
+    path = str(tmp_path / "t.pans")
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1 []"

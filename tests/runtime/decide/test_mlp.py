@@ -1,0 +1,277 @@
+"""The head's own kernels: against plain loops, against float64, and against themselves one by one and in a batch."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import naive_decide as naive
+import numpy as np
+import pytest
+from heads import head_bundle, onnx_chain, random_layers
+
+from pans.runtime.bundle.int8 import Int8Head, int8_reference, quantise_head
+from pans.runtime.bundle.layers import Layer, read_layers, reference_scores
+from pans.runtime.bundle.model import bundle_bytes, parse_bundle
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.mlp import Int8Decider, ReferenceDecider, SparseDecider, golden_counts
+from pans.runtime.decide.table import CountTableDecider, fits_count_table
+from pans.runtime.decide.verdict import softmax_winner, verdicts_of
+from pans.runtime.errors import DamagedFileError, UsageError
+
+SHAPES = [[5, 3], [10, 24, 10], [7, 33, 17, 4]]
+EPSILON = 2.0**-24  # float32: half a unit in the last place of 1
+
+
+def counts_of(n_features: int, shots: int, n: int = 40, seed: int = 1) -> np.ndarray:
+    counts = np.random.default_rng(seed).integers(0, shots + 1, (n, n_features))
+    counts[0], counts[1] = 0, shots
+    return counts
+
+
+def error_bound(layers: tuple[Layer, ...], means: np.ndarray) -> np.ndarray:
+    """What rounding may do at most: (operations + 2) half units of the sum of all magnitudes, layer by layer."""
+    size, bound = means.astype(np.float64), np.zeros(means.shape)
+    for layer in layers:
+        weights = np.abs(layer.weights.astype(np.float64))
+        grown = size @ weights + np.abs(layer.bias)
+        bound = bound @ weights + (len(weights) + 2) * EPSILON * grown
+        size = grown
+    return bound
+
+
+@pytest.mark.parametrize("sizes", SHAPES)
+@pytest.mark.parametrize("shots", [1, 7])
+def test_sparse_scores_are_the_oracles_within_the_bound_of_rounding(sizes: list[int], shots: int) -> None:
+    layers = random_layers(sizes)
+    decider = SparseDecider(head_bundle(layers))
+    counts = counts_of(sizes[0], shots)
+    found = decider.scores_batch(counts, shots)
+    plain = [(layer.weights.tolist(), layer.bias.tolist(), layer.relu) for layer in layers]
+    wanted = np.array([naive.mlp_scores(row, shots, plain) for row in counts.tolist()])
+    bound = error_bound(layers, counts / shots) + EPSILON * 4 * np.abs(wanted)
+    assert (np.abs(found - wanted) <= bound).all()
+    np.testing.assert_allclose(reference_scores(layers, counts / shots), wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["sparse", "int8"])
+def test_one_alone_and_many_give_the_same_bits(backend: str) -> None:
+    layers = random_layers([10, 40, 6])
+    decider = make_decider(head_bundle(layers, int8_head=quantise_head(layers)), backend=backend)
+    for shots in (1, 5):
+        counts = counts_of(10, shots)
+        labels, probabilities = verdicts_of(decider, counts, shots)
+        scores = decider.scores_batch(counts, shots)
+        assert decider.decide_batch(counts, shots).tolist() == labels.tolist() == scores.argmax(axis=1).tolist()
+        for row, label, probability, score in zip(counts, labels, probabilities, scores):
+            verdict = decider.decide(row, shots)
+            assert (verdict.label, np.float32(verdict.probability)) == (label, probability)
+            assert verdict.probability == pytest.approx(softmax_winner(score).probability, rel=1e-6)
+
+
+def test_ties_and_scores_that_are_not_finite() -> None:
+    flat = (Layer(np.zeros((3, 4), np.float32), np.array([1, 2, 2, 0], np.float32), False),)
+    decider = SparseDecider(head_bundle(flat))
+    assert decider.decide(np.zeros(3, np.int64), 1).label == 1
+    steep = (Layer(np.array([[3e38, 1]], np.float32), np.array([3e38, 0], np.float32), False),)
+    large = SparseDecider(head_bundle((Layer(steep[0].weights * 0, steep[0].bias * 0, False),)))
+    numbers = np.zeros(4, np.float32)
+    numbers[[0, 1, 2]] = 3e38, 1, 3e38  # one row of weights, then the biases: their sum is no float32
+    meta = large.layers.meta.copy()
+    meta[-2] = 0  # no groups: the rows are added as they are
+    large.layers = large.layers._replace(meta=meta, numbers=numbers)
+    verdict = large.decide(np.ones(1, np.int64), 1)
+    assert verdict.probability == 0.0
+
+
+@pytest.mark.parametrize(("style", "float_data"), [("gemm", False), ("transposed", False), ("matmul", True)])
+def test_layers_are_read_from_onnx(style: str, float_data: bool) -> None:
+    layers = random_layers([4, 9, 3])
+    found = read_layers(onnx_chain(layers, style, float_data), 4, 3)
+    assert found is not None
+    for wanted, layer in zip(layers, found):
+        assert (layer.weights == wanted.weights).all()
+        assert (layer.bias == wanted.bias).all()
+        assert layer.relu == wanted.relu
+
+
+def test_what_is_no_plain_chain_is_left_to_onnxruntime() -> None:
+    helper = pytest.importorskip("onnx.helper")
+    from onnx import TensorProto, numpy_helper
+
+    weights = numpy_helper.from_array(np.ones((2, 2), np.float32), "w")
+    nodes = [helper.make_node("MatMul", ["means", "w"], ["sums"]), helper.make_node("Sigmoid", ["sums"], ["scores"])]
+    ends = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 2]) for name in ("means", "scores")]
+    model = helper.make_model(helper.make_graph(nodes, "head", ends[:1], ends[1:], [weights])).SerializeToString()
+    assert read_layers(model, 2, 2) is None
+    assert read_layers(b"\xff\xff", 2, 2) is None
+    assert read_layers(onnx_chain(random_layers([4, 3])), 4, 2) is None
+
+
+def test_a_head_that_contradicts_its_golden_vectors_is_refused() -> None:
+    bundle = head_bundle(random_layers([4, 8, 3]))
+    other = head_bundle(random_layers([4, 8, 3], seed=9))
+    changed = {name: getattr(bundle, name) for name in bundle.__slots__} | {"head_onnx": other.head_onnx}
+    for kind in (SparseDecider, ReferenceDecider):
+        with pytest.raises(DamagedFileError, match="golden"):
+            kind(type(bundle)(**changed))
+
+
+def test_golden_means_are_told_as_counts() -> None:
+    means = np.array([[0, 1], [1 / 3, 1], [0.5, 0.25], [0.123, 0.4]], np.float32)
+    rows, counts, shots = golden_counts(means)
+    assert rows.tolist() == [0, 1, 2]
+    assert (counts.tolist(), shots.tolist()) == ([[0, 1], [1, 3], [2, 1]], [1, 3, 4])
+
+
+# -- tables of counts ------------------------------------------------------------------------------------------------------
+
+
+def test_a_table_of_counts_is_exactly_the_head() -> None:
+    bundle = head_bundle(random_layers([4, 16, 5]))
+    decider = CountTableDecider(bundle, 3)
+    every = np.array([[r // 4**i % 4 for i in range(4)] for r in range(256)])
+    onnx = make_decider(bundle, backend="onnx")
+    assert (decider.scores_batch(every, 3) == onnx.scores_batch(every, 3)).all()
+    assert (decider.decide_batch(every, 3) == onnx.decide_batch(every, 3)).all()
+    for row in every[::17]:
+        assert decider.decide(row, 3).label == decider.decide_batch(row[None], 3)[0]
+    with pytest.raises(UsageError, match="answers 3 shots"):
+        decider.decide(every[0], 2)
+
+
+def test_tables_of_counts_stay_small() -> None:
+    assert fits_count_table(16, 1)
+    assert not fits_count_table(17, 1)
+    assert not fits_count_table(4000, 60000)
+    with pytest.raises(UsageError, match="rows"):
+        CountTableDecider(head_bundle(random_layers([13, 4])), 4)
+
+
+# -- int8 ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sizes", SHAPES)
+@pytest.mark.parametrize("shots", [1, 5])
+def test_int8_scores_are_those_of_the_definition(sizes: list[int], shots: int) -> None:
+    layers = random_layers(sizes)
+    head = quantise_head(layers)
+    decider = Int8Decider(head_bundle(layers, int8_head=head))
+    counts = counts_of(sizes[0], shots)
+    np.testing.assert_allclose(
+        decider.scores_batch(counts, shots), int8_reference(head, counts, shots), rtol=3e-7, atol=1e-6
+    )
+
+
+def test_the_sums_of_layer_one_are_exact_integers() -> None:
+    head = quantise_head(random_layers([64, 32, 4], seed=3))
+    weights, scale, bias = head.matrices()[0]
+    plain = Int8Head(
+        np.array([64, 32]), head.weights[: 64 * 32], np.stack([np.ones(32), np.zeros(32)]).astype(np.float32)
+    )
+    decider = Int8Decider(head_bundle(random_layers([64, 32]), int8_head=plain))
+    counts = counts_of(64, 1, 200)
+    for row, found in zip(counts, decider.scores_batch(counts, 1)):
+        assert found.tolist() == naive.integer_sums(row.tolist(), weights.tolist())
+    assert np.abs(weights.astype(int)).max() == 127
+    assert len(scale) == len(bias) == 32
+
+
+def test_int8_errors_stay_within_their_bound() -> None:
+    """Rounding moves a weight by at most half its column's scale and a hidden value by half a step; nothing else happens."""
+    layers = random_layers([12, 64, 6], seed=4)
+    calibration = counts_of(12, 1, 4096, seed=2)
+    head = quantise_head(layers, calibration)
+    (w1, s1, _), (w2, s2, _) = head.matrices()
+    step = (
+        np.abs(layers[0].bias).sum() * 0
+        + np.maximum(calibration @ layers[0].weights + layers[0].bias, 0).max(0) * 1.05 / 255
+    )
+    step = np.where(step > 0, step, 1 / 255)
+    found, wanted = int8_reference(head, calibration, 1), reference_scores(layers, calibration)
+    hidden_error = calibration.sum(1)[:, None] * (s1 * step / 2)[None, :] + step / 2
+    hidden = np.maximum(calibration @ layers[0].weights.astype(float) + layers[0].bias, 0)
+    bound = (
+        hidden_error @ np.abs(layers[1].weights.astype(float))
+        + (hidden / step + 1) @ (s2 / 2 * np.ones((64, 6))) * 1.02
+    )
+    assert (np.abs(found - wanted) <= bound).all()
+    assert np.abs(found - wanted).max() < 0.1 * np.abs(wanted).max()
+    assert w1.dtype == w2.dtype == np.int8
+
+
+def test_dead_units_and_columns_do_no_harm() -> None:
+    weights = np.array([[0.0, -1.0], [0.0, -2.0]], np.float32)
+    layers = (Layer(weights, np.array([0.0, -1.0], np.float32), True), Layer(weights, np.zeros(2, np.float32), False))
+    head = quantise_head(layers)
+    assert np.isfinite(head.affine).all()
+    assert int8_reference(head, np.array([[1, 1]]), 1).tolist() == [[0.0, 0.0]]
+
+
+def test_heads_that_eight_bits_cannot_hold_are_refused() -> None:
+    with pytest.raises(UsageError, match="rectified"):
+        quantise_head(tuple(Layer(layer.weights, layer.bias, False) for layer in random_layers([3, 4, 2])))
+    infinite = (Layer(np.full((2, 2), np.inf, np.float32), np.zeros(2, np.float32), False),)
+    with np.errstate(invalid="ignore"), pytest.raises(UsageError, match="finite"):
+        quantise_head(infinite)
+
+
+def test_a_bundle_keeps_its_int8_head() -> None:
+    layers = random_layers([6, 8, 3])
+    head = quantise_head(layers)
+    bundle = head_bundle(layers, int8_head=head, int8_onnx=onnx_chain(layers))
+    back = parse_bundle(bundle_bytes(bundle), "test")
+    assert back.int8_head is not None
+    for name in ("sizes", "weights", "affine"):
+        assert (getattr(back.int8_head, name) == getattr(head, name)).all()
+        assert getattr(back.int8_head, name).dtype == getattr(head, name).dtype
+    assert back.int8_onnx == bundle.int8_onnx
+    assert make_decider(back, backend="int8-onnx").name == "int8-onnx"
+    counts = counts_of(6, 1)
+    assert (
+        make_decider(back, backend="int8").scores_batch(counts, 1) == Int8Decider(bundle).scores_batch(counts, 1)
+    ).all()
+
+
+def test_int8_heads_of_wrong_shape_are_refused() -> None:
+    layers = random_layers([6, 8, 3])
+    head = quantise_head(layers)
+    for change in ({"sizes": np.array([6, 8, 4])}, {"weights": head.weights[1:]}, {"affine": head.affine[:, 1:]}):
+        parts = {name: getattr(head, name) for name in ("sizes", "weights", "affine")} | change
+        with pytest.raises(UsageError, match="int8"):
+            head_bundle(layers, int8_head=Int8Head(**parts))
+
+
+def test_kernels_without_the_compiler() -> None:
+    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+        pytest.skip("this is the run without compilation")
+    names = ["test_sparse_scores_are_the_oracles_within_the_bound_of_rounding[1-sizes0]"]
+    names += ["test_int8_scores_are_those_of_the_definition[5-sizes1]", "test_ties_and_scores_that_are_not_finite"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(("d_f", "bits"), [(1, 5), (10, 5), (11, 5), (32, 4), (64, 0)])
+def test_single_shots_from_groups_of_patterns(d_f: int, bits: int) -> None:
+    """Fewer sums than row by row, each rounded once: no further from float64, give or take a half."""
+    layers = random_layers([d_f, 512, 10], seed=d_f)
+    decider = SparseDecider(head_bundle(layers))
+    assert int(decider.layers.meta[-2]) == bits
+    counts = np.random.default_rng(d_f).integers(0, 2, (300, d_f))
+    found = decider.scores_batch(counts, 1)
+    wanted = reference_scores(layers, counts.astype(np.float64))
+    meta = decider.layers.meta.copy()
+    meta[-2] = 0
+    grouped, decider.layers = decider.layers, decider.layers._replace(meta=meta)
+    plain = decider.scores_batch(counts, 1)
+    decider.layers = grouped
+    assert (found != plain).any() == (bits > 0 and d_f > 5)
+    assert np.abs(found - wanted).max() <= 1.5 * np.abs(plain - wanted).max() + 1e-7
+    alone = [decider.decide(row, 1).label for row in counts]
+    assert alone == decider.decide_batch(counts, 1).tolist()

@@ -1,0 +1,391 @@
+"""Profiles: the shipped ones are complete and possible, and a wrong line is named with its place and its remedy."""
+
+import dataclasses
+import hashlib
+import math
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tree import ROOT
+
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.profile import MAX_PROFILE_BYTES, load_profile, parse_profile, shipped_profiles
+from pans.runtime.instrument.toml_position import key_positions, position_of
+
+GOOD = """\
+[profile]
+name = "lab"
+description = "a profile for tests"
+mode = "sequential"
+measure = ["detector.dark_rate_hz"]
+
+[projector]
+kind = "OLED"
+width_px = 64
+height_px = 32
+levels = 16
+pixel_pitch_um = 50
+pattern_rate_max_hz = 60.0
+pattern_memory = 100
+peak_photoelectrons_hz = 1e3
+
+[object]
+contrast = 50.0
+levels = 256
+
+[detector]
+kind = "SPAD"
+channels = 1
+efficiency = 0.5
+dark_rate_hz = 20.0
+
+[exposure]
+min_us = 100.0
+max_us = 1000.0
+readout_us = 10.0
+
+[clock]
+tick_hz = 1_000_000
+
+[timing]
+decision_deadline_us = 1000.0
+lease_ms = 500
+
+[sources]
+"detector.efficiency" = "data sheet"
+"""
+
+
+def edited(key: str, line: str, text: str = GOOD) -> str:
+    """GOOD with the one line that sets `section.key` replaced ("" removes it)."""
+    section, name = key.split(".")
+    lines, at = text.splitlines(), ""
+    for number, old in enumerate(lines):
+        if old.startswith("["):
+            at = old.strip("[]")
+        elif at == section and old.split(" =")[0] == name:
+            lines[number] = line
+            return "\n".join(lines) + "\n"
+    raise AssertionError(f"no line sets {key}")
+
+
+def fault(text: str) -> ConfigError:
+    with pytest.raises(ConfigError) as caught:
+        parse_profile(text, "lab.toml")
+    return caught.value
+
+
+def line_of(text: str, start: str) -> int:
+    return next(number for number, line in enumerate(text.splitlines(), 1) if line.startswith(start))
+
+
+def test_reads_a_good_profile():
+    profile = parse_profile(GOOD, "lab.toml")
+    assert profile.name == "lab"
+    assert profile.projector.pixel_pitch_um == 50.0
+    assert isinstance(profile.projector.pixel_pitch_um, float)  # a whole number is a number
+    assert profile.clock.tick_hz == 1_000_000
+    assert isinstance(profile.clock.tick_hz, int)
+    assert profile.sources == {"detector.efficiency": "data sheet"}
+    assert profile.measure == ("detector.dark_rate_hz",)
+    assert profile.min_transmission == 0.02
+    assert profile.text == GOOD
+    assert profile.sha256 == hashlib.sha256(GOOD.encode()).hexdigest()
+
+
+def test_effects_that_are_not_declared_are_absent():
+    detector = parse_profile(GOOD, "lab.toml").detector
+    assert detector.read_noise_e == detector.dead_time_ns == 0.0
+    assert detector.afterpulse_probability == detector.crosstalk_probability == 0.0
+    bare = GOOD.replace("[object]\ncontrast = 50.0\nlevels = 256\n", "")
+    assert parse_profile(bare, "lab.toml").object_modulator is None
+    assert parse_profile(bare, "lab.toml").min_transmission == 0.0
+
+
+def test_only_contrast_may_be_infinite():
+    assert parse_profile(edited("object.contrast", "contrast = inf"), "lab.toml").min_transmission == 0.0
+    assert "found inf" in fault(edited("exposure.max_us", "max_us = inf")).message
+
+
+@pytest.mark.parametrize(
+    ("key", "line", "words"),
+    [
+        ("profile.mode", 'mode = "serial"', ['must be "sequential" or "parallel"', 'found the text "serial"']),
+        ("profile.name", 'name = "../up"', ["letters, digits", "../up"]),
+        ("profile.name", 'name = ""', ["text in quotes, not empty"]),
+        ("profile.measure", 'measure = "detector.dark_rate_hz"', ["list of keys"]),
+        ("profile.measure", 'measure = ["detector.dead_time_ns"]', ["not a key of this profile"]),
+        ("projector.kind", "kind = 3", ["text in quotes", "found 3"]),
+        ("projector.levels", "levels = 1", ["a whole number from 2 to 65536", "found 1"]),
+        ("projector.levels", "levels = 65537", ["a whole number from 2 to 65536"]),
+        ("projector.levels", "levels = 16.0", ["a whole number", "found 16.0"]),
+        ("projector.levels", "levels = true", ["a whole number", "found the boolean true"]),
+        ("projector.width_px", "width_px = " + "9" * 400, ["an enormous whole number"]),
+        ("projector.pattern_memory", "pattern_memory = 65536", ["from 1 to 65535"]),
+        ("projector.pattern_rate_max_hz", "pattern_rate_max_hz = 0", ["above 0", "found 0"]),
+        ("projector.peak_photoelectrons_hz", "peak_photoelectrons_hz = -1.0", ["above 0", "found -1.0"]),
+        ("projector.pixel_pitch_um", 'pixel_pitch_um = "50"', ["a number", 'the text "50"']),
+        ("object.contrast", "contrast = 1.0", ["above 1 and at most", "or inf"]),
+        ("object.contrast", "contrast = nan", ["found nan"]),
+        ("detector.efficiency", "efficiency = 0", ["above 0 and at most 1", "found 0"]),
+        ("detector.efficiency", "efficiency = 68", ["above 0 and at most 1", "found 68"]),
+        ("detector.efficiency", "efficiency = nan", ["found nan"]),
+        ("detector.efficiency", "efficiency = false", ["found the boolean false"]),
+        ("detector.dark_rate_hz", "dark_rate_hz = -0.1", ["from 0 to", "found -0.1"]),
+        ("detector.dark_rate_hz", "dark_rate_hz = inf", ["found inf"]),
+        ("detector.dark_rate_hz", "dark_rate_hz = [1.0]", ["found a list"]),
+        ("detector.channels", "channels = true", ["a whole number", "found the boolean true"]),
+        ("detector.efficiency", "efficiency = true", ["a number", "found the boolean true"]),
+        ("detector.channels", "channels = 4", ["must be 1 in sequential mode", "found 4"]),
+        ("exposure.min_us", "min_us = 2000.0", ["at most exposure.max_us = 1000", "found 2000"]),
+        ("exposure.min_us", "min_us = 9.0", ["at least 10 ticks = 10 us", "found 9"]),
+        ("exposure.readout_us", "readout_us = -1", ["from 0 to"]),
+        ("clock.tick_hz", "tick_hz = 999", ["from 1000 to 10000000000", "found 999"]),
+        ("clock.tick_hz", "tick_hz = 1e6", ["a whole number", "found 1000000.0"]),
+        ("timing.lease_ms", "lease_ms = 1", ["above timing.decision_deadline_us = 1 ms", "found 1"]),
+        ("timing.lease_ms", "lease_ms = 1979-05-27", ["found a date"]),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_place(key, line, words):
+    text = edited(key, line)
+    error = fault(text)
+    assert error.message.startswith(f"lab.toml:{line_of(text, line)}:1: ")
+    assert key in error.message
+    for word in words:
+        assert word in error.message
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("threshold_e = 0.0", ["above 0"]),
+        ("read_noise_e = -0.1", ["from 0 to"]),
+        ("afterpulse_probability = 1.5", ["from 0 to 1", "found 1.5"]),
+        ("crosstalk_probability = 0.1", ["must be 0 with 1 channel"]),
+        ("dead_time_ns = 110001", ["at most exposure.min_us + exposure.readout_us = 110000 ns", "found 110001"]),
+    ],
+)
+def test_a_wrong_optional_value_is_named_too(line, words):
+    text = edited("detector.dark_rate_hz", f"dark_rate_hz = 20.0\n   {line}")
+    error = fault(text)
+    assert error.message.startswith(f"lab.toml:{line_of(text, '   ' + line)}:4: ")
+    for word in words:
+        assert word in error.message
+    assert parse_profile(text.replace(line, "dead_time_ns = 110000"), "lab.toml").detector.dead_time_ns == 110000
+
+
+def test_parallel_needs_channels():
+    text = edited("profile.mode", 'mode = "parallel"')
+    assert "at least 2 in parallel mode" in fault(text).message
+    assert parse_profile(edited("detector.channels", "channels = 2", text), "lab.toml").detector.channels == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "message", "remedy"),
+    [
+        ("dead_time_us = 3", "the unit is part of the name, and this one is dead_time_ns", "convert the value to ns"),
+        ("dead_time = 3", "the unit is part of the name", "convert the value to ns"),
+        ("eficiency = 0.5", "[detector] takes kind, channels, efficiency", "did you mean efficiency?"),
+        ("lease_ms = 5", "not a key", "belongs in [timing]"),
+        ("zzz = 1", "not a key", "docs/PROFILES.md"),
+    ],
+)
+def test_an_unknown_key_is_an_error_with_a_suggestion(line, message, remedy):
+    text = edited("detector.dark_rate_hz", f"dark_rate_hz = 20.0\n{line}")
+    error = fault(text)
+    assert error.message.startswith(f"lab.toml:{line_of(text, line)}:1: detector.{line.split(' ')[0]} is not a key")
+    assert message in error.message
+    assert remedy in error.remedy
+
+
+def test_an_unknown_section_is_an_error():
+    error = fault(GOOD + "[detectors]\n")
+    assert error.message.startswith(f"lab.toml:{line_of(GOOD, '[sources]') + 2}:1: detectors is not a section")
+    assert "[detector]" in error.remedy
+    assert "[profile] has a key of that name" in fault('name = "lab"\n' + GOOD).remedy
+    assert (
+        "must be a section, found 3" in fault("clock = 3\n" + GOOD.replace("[clock]\ntick_hz = 1_000_000", "")).message
+    )
+
+
+REQUIRED = [
+    f"{section}.{key}" for section, table in tomllib.loads(GOOD).items() for key in table if section != "sources"
+]
+
+
+@pytest.mark.parametrize("key", sorted(set(REQUIRED) - {"profile.description", "profile.measure"}))
+def test_a_missing_key_is_named(key):
+    error = fault(edited(key, ""))
+    section = key.split(".")[0]
+    assert error.message == f"lab.toml:{line_of(GOOD, f'[{section}]')}:1: {key} is missing"
+    assert key.split(".")[1] in error.remedy
+
+
+def test_description_and_measure_may_be_missing():
+    text = edited("profile.description", "", edited("profile.measure", ""))
+    assert parse_profile(text, "lab.toml").measure == ()
+
+
+@pytest.mark.parametrize("section", ["profile", "projector", "detector", "exposure", "clock", "timing"])
+def test_a_missing_section_is_named(section):
+    kept = "\n".join(block for block in GOOD.split("\n\n") if not block.startswith(f"[{section}]"))
+    assert f"section [{section}] is missing" in fault(kept).message
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('"detector.efficency" = "x"', ["detector.efficency", "not a key"]),
+        ('"detector.efficiency" = ""', ["must be text"]),
+        ("detector.dark_rate_hz = 3", ["found a table"]),
+    ],
+)
+def test_sources_must_name_keys(line, words):
+    text = GOOD.replace('"detector.efficiency" = "data sheet"', line)
+    error = fault(text)
+    assert error.message.startswith(f"lab.toml:{line_of(text, line)}:1: ")
+    for word in words:
+        assert word in error.message
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("[profile]\nname = \n", "2:8"),
+        ("[profile]\nname = 'lab'\nname = 'lab'\n", "3:"),
+        ("[profile]\nname = 'lab", "2:"),
+        ("[profile]\nx = [[1,\n", "3:1"),
+    ],
+)
+def test_text_that_is_not_toml_is_named_with_its_place(text, where):
+    error = fault(text)
+    assert error.message.startswith(f"lab.toml:{where}")
+    assert "not valid TOML" in error.message
+
+
+def test_a_number_without_end_is_an_error_not_a_crash():
+    assert "lab.toml:1:1: not valid TOML" in fault(edited("projector.levels", "levels = " + "9" * 5000)).message
+    assert "found an enormous whole number" in fault(edited("object.contrast", "contrast = " + "9" * 400)).message
+
+
+def test_deep_nesting_is_an_error_not_a_crash():
+    assert "lab.toml:1:1:" in fault("x = " + "[" * 100_000 + "]" * 100_000).message
+
+
+def test_a_file_that_is_too_large_or_not_utf8_is_refused(tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_bytes(GOOD.encode() + b"#" * MAX_PROFILE_BYTES)
+    with pytest.raises(ConfigError, match="at most 1048576 bytes"):
+        load_profile(path)
+    path.write_bytes(GOOD.encode() + b"# caf\xe9\n")
+    with pytest.raises(ConfigError, match=rf"lab\.toml:{GOOD.count(chr(10)) + 1}:6: byte 0xe9 is not UTF-8"):
+        load_profile(path)
+
+
+def test_loads_a_path_and_ignores_the_line_ends_of_the_system(tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_bytes(GOOD.replace("\n", "\r\n").encode("utf-8-sig"))
+    assert load_profile(path) == load_profile(str(path)) == parse_profile(GOOD, "lab.toml")
+
+
+def test_an_unknown_name_lists_the_shipped_profiles():
+    with pytest.raises(ConfigError, match="dmd-spad, flow-snspd, ideal, oled-qcmos, wdm-snspd") as caught:
+        load_profile("oled-qcmso")
+    assert "did you mean oled-qcmos?" in caught.value.remedy
+    assert caught.value.exit_code == 2
+
+
+def test_four_profiles_are_shipped():
+    assert set(shipped_profiles()) >= {"oled-qcmos", "dmd-spad", "wdm-snspd", "ideal"}
+
+
+@pytest.mark.parametrize("name", shipped_profiles())
+def test_every_figure_of_a_shipped_profile_has_a_source_or_is_to_be_measured(name):
+    profile = load_profile(name)
+    assert profile.name == name
+    assert profile.description
+    for section, table in tomllib.loads(profile.text).items():
+        for key, value in table.items():
+            if isinstance(value, (int, float)):
+                assert f"{section}.{key}" in {*profile.sources, *profile.measure}
+
+
+@pytest.mark.parametrize("name", shipped_profiles())
+def test_every_shipped_key_is_explained(name):
+    page = (ROOT / "docs" / "PROFILES.md").read_text(encoding="utf-8")
+    for section, table in tomllib.loads(load_profile(name).text).items():
+        assert f"[{section}]" in page
+        if section != "sources":
+            assert [key for key in table if f"`{key}`" not in page] == []
+
+
+def test_figures_of_the_paper():
+    profile = load_profile("oled-qcmos")
+    assert (profile.projector.width_px, profile.projector.height_px, profile.projector.levels) == (1920, 1080, 124)
+    assert profile.object_modulator is not None
+    assert profile.object_modulator.contrast == 50
+    assert profile.detector.efficiency == 0.86
+    assert (profile.exposure.min_us, profile.exposure.max_us) == (600, 3000)
+    frame_us = 1e6 / profile.projector.pattern_rate_max_hz
+    assert 5 * (profile.exposure.max_us + profile.exposure.readout_us) < frame_us
+    assert math.isclose(profile.timing.decision_deadline_us, frame_us, rel_tol=1e-4)
+
+
+def test_a_profile_is_frozen_and_becomes_plain_data():
+    profile = load_profile("ideal")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        profile.name = "other"  # type: ignore[misc]
+    assert dataclasses.asdict(profile)["detector"]["efficiency"] == 1.0
+
+
+def test_positions_are_found_among_all_that_toml_allows():
+    text = """# [no.section]
+"quoted key" = 1
+a . b = '''
+[not.a.section]
+c = 1'''
+list = [ # ]
+  "]", '[',
+]   # comment
+inline = { x = 1, y = "}" }
+ [ s . "t.u" ] # after
+    v = \"\"\"
+w = 1 \\\"\"\"\"
+\t\\u0061 = 2
+[[many]]
+k = 1
+[[many]]
+k = 2
+""".replace("\\u0061", '"\\u0061"')
+    tables, found = tomllib.loads(text), key_positions(text)
+    assert found == {
+        ("quoted key",): (2, 1),
+        ("a",): (3, 1),
+        ("a", "b"): (3, 1),
+        ("list",): (6, 1),
+        ("inline",): (9, 1),
+        ("s", "t.u"): (10, 2),
+        ("s", "t.u", "v"): (11, 5),
+        ("s", "t.u", "a"): (13, 2),
+        ("many",): (14, 1),
+        ("many", "0"): (14, 1),
+        ("many", "0", "k"): (15, 1),
+        ("many", "1"): (16, 1),
+        ("many", "1", "k"): (17, 1),
+    }
+    assert set(tables["s"]["t.u"]) == {"v", "a"}
+    assert position_of(("inline", "x"), found) == (9, 1)
+    assert position_of(("nowhere",), found) == (1, 1)
+
+
+@given(st.text(alphabet="ab.=\"'[]{}#\n\\ 1,", max_size=60))
+def test_any_text_is_read_or_refused_and_positions_cover_every_table(text):
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        assert fault(text).message.startswith("lab.toml:")
+        return
+    found = key_positions(text)
+    assert {path[0] for path in found if path} == set(tables)

@@ -1,0 +1,512 @@
+"""One contract for every link: pty, socket://, pyserial's URL handler, pyusb, a process of its own, and virtual time.
+
+The instrument behind each is the simulator, reached through real pyserial and real pyusb. Waits are bounded; nothing sleeps."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tree import ROOT
+
+from pans.firmware_sim.ports import usb_backend
+from pans.firmware_sim.ports.inprocess import ThreadedInstrument
+from pans.firmware_sim.ports.protocol_panssim import register
+from pans.firmware_sim.ports.serve import SimOptions, build_instrument
+from pans.firmware_sim.ports.shell import open_port, serve
+from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.link import base as link_module
+from pans.runtime.link import reader as link_reader
+from pans.runtime.link.base import Link, open_link
+from pans.runtime.link.connection import Connection
+from pans.runtime.link.reader import LinkReader
+from pans.runtime.link.recovery import Recovery
+from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
+from pans.runtime.link.usb import UsbLink, usb_target
+from pans.runtime.live.loop import Onlookers, RunConfig, run_live
+from pans.runtime.wire import messages as wire
+
+PATIENCE_S = 20.0
+OPTIONS = SimOptions("ideal", "uniform")
+
+
+@dataclass
+class Rig:
+    """An open link, and how to take the instrument away from it."""
+
+    link: Link
+    vanish: Callable[[], None]
+    url: str
+    comes_back: Callable[[], None] | None = None
+
+
+def served(listen: str) -> tuple[str, Callable[[], None]]:
+    device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
+    port = open_port(listen)
+    stopped = threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+
+    def vanish() -> None:
+        if not stopped.is_set():
+            stopped.set()
+            thread.join(PATIENCE_S)
+            port.close()
+
+    return port.url, vanish
+
+
+def rig(kind: str) -> Rig:
+    if kind in ("pty", "tcp"):
+        url, vanish = served("pty" if kind == "pty" else "tcp:127.0.0.1:0")
+        return Rig(open_link(url), vanish, url)
+    if kind == "usb elsewhere":
+        url, vanish = served("tcp:127.0.0.1:0")
+        url = url.replace("serial:", "simusb:")
+        return Rig(open_link(url), vanish, url)
+    url = {
+        "handler": "simserial:ideal?scene=uniform",
+        "usb": "simusb:ideal?scene=uniform",
+        "child": "sim:ideal?scene=uniform",
+        "virtual": "sim:ideal?scene=uniform&pace=fast",
+    }[kind]
+    link: Any = open_link(url)
+    if kind == "usb":
+        return Rig(
+            link, lambda: setattr(link.backend, "plugged", False), url, lambda: setattr(link.backend, "plugged", True)
+        )
+    if kind == "handler":
+        return Rig(link, link._port._instrument.close, url)
+    if kind == "child":
+        return Rig(link, link._end_child, url)
+    return Rig(link, lambda: setattr(link, "_broken", True), url, lambda: None)
+
+
+KINDS = ["tcp", "handler", "usb", "usb elsewhere", "child", "virtual", *(["pty"] if hasattr(os, "openpty") else [])]
+
+
+@pytest.fixture(params=KINDS)
+def rigged(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    made = rig(request.param)
+    yield made
+    made.link.close()
+    made.vanish()
+
+
+def test_a_link_says_what_it_is(rigged: Rig) -> None:
+    link = rigged.link
+    assert isinstance(link.name, str)
+    assert link.name
+    assert link.simulated in (True, False)
+    assert link.virtual in (True, False)
+    assert link.now_ns() <= link.now_ns()
+
+
+def test_without_data_a_read_comes_back_empty_after_its_time(rigged: Rig) -> None:
+    before_ns = rigged.link.now_ns()
+    assert rigged.link.read(0.03) == b""
+    waited_s = (rigged.link.now_ns() - before_ns) / 1e9
+    assert 0.02 < waited_s < PATIENCE_S
+
+
+def test_every_byte_arrives_in_order(rigged: Rig) -> None:
+    """Two thousand probes in writes of many sizes: 256 byte values, long writes, and one answer each."""
+    link = rigged.link
+    connection = Connection(link)
+    connection.handshake()
+    nonce = connection.session.nonce
+    connection.reader.stop()
+    probes = 2000
+    data = b"".join(wire.encode_ping(number, number * 0x0101_0101_0101, nonce) for number in range(probes))
+    writer = threading.Thread(target=write_in_parts, args=(link, data), daemon=True)
+    decoder = wire.FrameDecoder()
+    answers: list[wire.Pong] = []
+    if link.virtual:
+        write_in_parts(link, data)
+    else:
+        writer.start()
+    deadline = time.monotonic() + PATIENCE_S
+    while len(answers) < probes and time.monotonic() < deadline:
+        for frame in decoder.feed(link.read(0.05)):
+            if frame.type == wire.MessageType.PONG:
+                answers.append(wire.decode_pong(frame.payload))
+    assert [answer.probe_id for answer in answers] == list(range(probes))
+    assert all(answer.host_ns == answer.probe_id * 0x0101_0101_0101 for answer in answers)
+    assert decoder.counters.bytes_discarded == 0
+
+
+def write_in_parts(link: Link, data: bytes) -> None:
+    rng = np.random.default_rng(1)
+    while data:
+        size = int(rng.choice([1, 7, 64, 500, 4096]))
+        link.write(data[:size])
+        data = data[size:]
+
+
+def test_a_closed_link_is_gone_and_may_be_closed_again(rigged: Rig) -> None:
+    rigged.link.close()
+    rigged.link.close()
+    with pytest.raises(LinkError):
+        rigged.link.read(0.01)
+    with pytest.raises(LinkError):
+        rigged.link.write(b"\0")
+
+
+def test_when_the_instrument_vanishes_the_reader_ends_loudly(rigged: Rig) -> None:
+    reader = LinkReader(rigged.link)
+    rigged.vanish()
+    deadline = time.monotonic() + PATIENCE_S
+    with pytest.raises(LinkError):
+        while time.monotonic() < deadline:
+            reader.wait(0.05)
+    reader.stop()
+
+
+def one_shot_core(plan: Plan, bundle: Bundle, config: RunConfig) -> Core:
+    return Core(plan, make_decider(bundle), 1, config.n_cycles)
+
+
+def test_a_whole_run_decides(rigged: Rig) -> None:
+    profile, bundle, plan = grid_setup("sequential")
+    config = RunConfig(n_cycles=200, deadline_us=1e9, realtime=False)
+    result = run_live(rigged.link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
+    assert (result.ended, result.tally.decisions, result.tally.abstained) == ("completed", 200, 0)
+    assert result.stream["lost_exposures"] == 0
+    assert result.device["simulated"] is True
+
+
+def test_a_device_that_comes_back_is_found_again() -> None:
+    """Over pyusb: the cable is pulled after some blocks and plugged in again; the run goes on and completes."""
+    made = rig("usb")
+    profile, bundle, plan = grid_setup("sequential")
+    seen = [0]
+
+    def pull(run: Any, output: Any) -> None:
+        seen[0] += 1
+        if seen[0] == 50:
+            made.vanish()
+
+    def plug(seconds: float) -> None:
+        assert made.comes_back is not None
+        made.comes_back()
+
+    recovery = Recovery.of(made.link, made.url, 10.0)
+    recovery = Recovery(recovery.reopen, 10.0, plug)
+    config = RunConfig(n_cycles=400, deadline_us=1e9, realtime=False)
+    try:
+        result = run_live(
+            made.link,
+            profile,
+            bundle,
+            plan,
+            one_shot_core(plan, bundle, config),
+            config,
+            recovery=recovery,
+            onlookers=Onlookers(pull),
+        )
+    finally:
+        made.link.close()
+    assert (result.ended, result.reconnects, result.link_lost) == ("completed", 1, False)
+    assert result.tally.decisions == 400
+    assert result.tally.abstained <= 8
+    kinds = [event["kind"] for event in result.events]
+    assert kinds.index("link_lost") < kinds.index("reconnected") < len(kinds)
+
+
+def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
+    made = rig("virtual")
+    profile, bundle, plan = grid_setup("sequential")
+
+    def pull(run: Any, output: Any) -> None:
+        made.vanish()
+
+    def absent(lost: Link) -> Link:
+        raise LinkError("it is not there")
+
+    recovery = Recovery(absent, 5.0, made.link.pause)  # type: ignore[attr-defined]
+    config = RunConfig(n_cycles=400, deadline_us=1e9)
+    result = run_live(
+        made.link,
+        profile,
+        bundle,
+        plan,
+        one_shot_core(plan, bundle, config),
+        config,
+        recovery=recovery,
+        onlookers=Onlookers(pull),
+    )
+    assert result.link_lost
+    assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"
+
+
+# -- opening -----------------------------------------------------------------------------------------------------------
+
+
+def test_none_busy_and_no_permission_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    import serial
+
+    with pytest.raises(LinkError, match="it is not there"):
+        open_link("serial:/dev/no-such-port")
+    for number, words in ((13, "no permission"), (16, "it is busy")):
+
+        def refuse(*args: Any, _number: int = number, **options: Any) -> None:
+            raise serial.SerialException(_number, "could not open port")
+
+        monkeypatch.setattr(serial, "serial_for_url", refuse)
+        with pytest.raises(LinkError, match=words) as caught:
+            open_link("serial:/dev/ttyACM0")
+        assert caught.value.remedy
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
+def test_a_port_that_another_link_holds_is_busy() -> None:
+    made = rig("pty")
+    try:
+        with pytest.raises(LinkError, match="busy"):
+            open_link(made.url)
+    finally:
+        made.link.close()
+        made.vanish()
+
+
+def test_usb_errors_are_told_apart() -> None:
+    backend = usb_backend.SimBackend(ThreadedInstrument(OPTIONS))
+    name = f"{usb_backend.VENDOR_ID:04x}:{usb_backend.PRODUCT_ID:04x}"
+    try:
+        first = UsbLink(name, backend)
+        with pytest.raises(LinkError, match="busy"):
+            UsbLink(f"{name}:{usb_backend.SERIAL_NUMBER}", backend)
+        with pytest.raises(LinkError, match="is not there"):
+            UsbLink(f"{name}:OTHER", backend)
+        first.close()
+        UsbLink(name, backend).close()
+        backend.plugged = False
+        with pytest.raises(LinkError, match="is not there"):
+            UsbLink(name, backend)
+    finally:
+        backend.close()
+    assert usb_target("1209:0001:A:B") == (0x1209, 1, "A:B")
+    with pytest.raises(UsageError, match="in hex"):
+        open_link("usb:xyz")
+
+
+def test_ports_are_named_by_vendor_product_and_serial(monkeypatch: pytest.MonkeyPatch) -> None:
+    from serial.tools import list_ports
+    from serial.tools.list_ports_common import ListPortInfo
+
+    ports = []
+    for number in range(2):
+        port = ListPortInfo(f"/dev/ttyACM{number}")
+        port.vid, port.pid, port.serial_number = 0x1209, 1, f"A{number}"
+        ports.append(port)
+    monkeypatch.setattr(list_ports, "comports", lambda: ports)
+    assert port_of("1209:0001:A1") == "/dev/ttyACM1"
+    assert port_of("/dev/ttyS0") == "/dev/ttyS0"
+    assert port_of("COM7") == "COM7"
+    with pytest.raises(LinkError, match=r"matches 2 ports: /dev/ttyACM0 \(serial number A0\)"):
+        port_of("1209:0001")
+    with pytest.raises(LinkError, match="matches 0 ports: none"):
+        port_of("1209:0002")
+
+
+def test_the_url_handler_is_an_ordinary_pyserial_port() -> None:
+    import serial
+
+    register()
+    with serial.serial_for_url("panssim://ideal?scene=uniform", timeout=5) as port:
+        port.write(wire.encode_hello(7))
+        assert port.read_until(b"\0") == b"\0"  # the end of whatever an earlier host left
+        frame = wire.FrameDecoder().feed(port.read_until(b"\0"))[0]
+    assert frame.type == wire.MessageType.WELCOME
+    with pytest.raises(serial.SerialException, match="no profile"):
+        serial.serial_for_url("panssim://nowhere")
+    with pytest.raises(LinkError, match="cannot open"):
+        SerialLink("panssim://nowhere")
+
+
+def test_an_ftdi_adapters_latency_is_read(tmp_path: Any) -> None:
+    folder = tmp_path / "bus" / "usb-serial" / "devices" / "ttyUSB3"
+    folder.mkdir(parents=True)
+    (folder / "latency_timer").write_text("16\n")
+    assert latency_timer_ms("/dev/ttyUSB3", tmp_path) == 16
+    assert latency_timer_ms("/dev/ttyACM0", tmp_path) is None
+
+
+# -- the reader --------------------------------------------------------------------------------------------------------
+
+
+class Flood:
+    """A link that never runs dry."""
+
+    name, simulated, virtual = "flood", True, False
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def read(self, timeout_s: float) -> bytes:
+        self.reads += 1
+        return b"x" * 1000
+
+    def write(self, data: bytes) -> None:
+        pass
+
+    def now_ns(self) -> int:
+        return time.perf_counter_ns()
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_readers_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_reader, "MAX_QUEUED_BYTES", 10_000)
+    flood = Flood()
+    reader = LinkReader(flood)
+    deadline = time.monotonic() + PATIENCE_S
+    while reader._queued_bytes <= 10_000 and time.monotonic() < deadline:
+        threading.Event().wait(0.001)
+    first = flood.reads
+    threading.Event().wait(0.02)
+    assert flood.reads <= first + 1  # the thread has stopped reading
+    assert sum(len(chunk.data) for chunk in reader.wait(1.0)) <= 12_000
+    reader.close()
+
+
+class Counting(Flood):
+    """A link that sends 0, 1, 2, ... one byte per read, until it breaks."""
+
+    broken = False
+
+    def read(self, timeout_s: float) -> bytes:
+        if self.broken:
+            raise LinkError("the cable was pulled")
+        threading.Event().wait(0.0005)
+        self.reads += 1
+        return bytes([(self.reads - 1) % 256])
+
+
+def test_a_thread_stands_in_while_the_loop_is_busy_and_keeps_the_order() -> None:
+    link = Counting()
+    reader = LinkReader(link)
+    arrived: list[Any] = []
+    deadline = time.monotonic() + PATIENCE_S
+    stood_in = 0
+    while stood_in < 3 and time.monotonic() < deadline:
+        arrived += reader.wait(0.1, eager=len(arrived) % 2 == 0)
+        before = link.reads
+        threading.Event().wait(0.03)  # the loop is busy
+        stood_in += link.reads > before
+    arrived += reader.wait(0.1)
+    reader.stop()
+    while left := list(reader._chunks):
+        arrived += reader.wait(0.0)
+        assert left
+    assert stood_in == 3
+    assert b"".join(chunk.data for chunk in arrived) == bytes(number % 256 for number in range(len(arrived)))
+    stamps = [chunk.arrival_ns for chunk in arrived]
+    assert stamps == sorted(stamps)
+
+
+def test_a_link_that_breaks_while_the_loop_is_busy_ends_every_further_wait() -> None:
+    link = Counting()
+    reader = LinkReader(link)
+    assert reader.wait(0.1)
+    link.broken = True
+    deadline = time.monotonic() + PATIENCE_S
+    while reader._death is None and time.monotonic() < deadline:
+        threading.Event().wait(0.001)
+    for _ in range(3):
+        with pytest.raises(LinkError, match="the cable was pulled"):
+            while True:
+                reader.wait(0.01)
+    reader.stop()
+
+
+def test_an_instrument_in_a_thread_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    instrument = ThreadedInstrument(OPTIONS)
+    instrument.connect().close()
+    instrument.close()
+    assert not instrument._thread.is_alive()
+
+
+# -- a driver of one's own ---------------------------------------------------------------------------------------------
+
+
+class FifoPort:
+    """The instrument's end of two named pipes."""
+
+    url = "fifo"
+
+    def __init__(self, name: str) -> None:
+        os.mkfifo(f"{name}.in")
+        os.mkfifo(f"{name}.out")
+        self._in = os.open(f"{name}.in", os.O_RDWR | os.O_NONBLOCK)
+        self._out = os.open(f"{name}.out", os.O_RDWR | os.O_NONBLOCK)
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self._in, 1 << 16)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> int:
+        try:
+            return os.write(self._out, data)
+        except BlockingIOError:
+            return 0
+
+    def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
+        return bool(select.select([self._in], [self._out] if wants_to_write else [], [], timeout_s)[0])
+
+    def hang_up(self) -> None:
+        pass
+
+    def close(self) -> None:
+        os.close(self._in)
+        os.close(self._out)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "docs" / "LINKS.md").read_text()
+    source = text.partition("```python\n")[2].partition("```")[0]
+    assert len(source.splitlines()) <= 60
+    driver = types.ModuleType("mylab_pipe")
+    exec(compile(source, "docs/LINKS.md", "exec"), driver.__dict__)
+    monkeypatch.setitem(sys.modules, "mylab_pipe", driver)
+    point = EntryPoint("pipe", "mylab_pipe:open_pipe", "pans.devices")
+    monkeypatch.setattr(link_module, "entry_points", lambda group: [point])
+    with pytest.raises(LinkError, match="start the instrument first"):
+        open_link(f"pipe:{tmp_path}/none")
+    device, clock = build_instrument(OPTIONS, time.perf_counter_ns())
+    port, stopped = FifoPort(f"{tmp_path}/lab"), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        link = open_link(f"pipe:{tmp_path}/lab")
+        profile, bundle, plan = grid_setup("sequential")
+        config = RunConfig(n_cycles=100, deadline_us=1e9, realtime=False)
+        result = run_live(link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
+        assert (result.ended, result.tally.decisions) == ("completed", 100)
+        link.close()
+        with pytest.raises(LinkError, match="is closed"):
+            link.read(0.01)
+    finally:
+        stopped.set()
+        thread.join(PATIENCE_S)
+        port.close()

@@ -1,0 +1,281 @@
+"""The whole way, in virtual time, against the simulated instrument: decisions, losses, recordings, replays, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.firmware_sim.ports.serve import open_sim
+from pans.runtime.bundle.model import Bundle, load_bundle, make_bundle, write_bundle
+from pans.runtime.cli import main
+from pans.runtime.core.plan import build_plan
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import DeviceError, LinkError
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link.base import Link
+from pans.runtime.link.connection import plan_chunks, plan_from_chunks
+from pans.runtime.live.loop import RunConfig, RunResult, run_live
+from pans.runtime.record.recorder import read_recording
+
+PROFILE = load_profile("oled-qcmos")
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    rng = np.random.default_rng(1)
+    levels = rng.integers(0, 124, (4, 64))
+    levels[rng.random(levels.shape) < 0.9] = 0
+    levels[0, 0] = 123
+    made = make_bundle(
+        name="loop-test",
+        task="test",
+        classes=("a", "b", "c"),
+        image_shape=(8, 8),
+        levels=124,
+        pattern_levels=levels.astype(np.uint16),
+        photons_per_level=8.0 / 123,
+        table=rng.normal(size=(16, 3)).astype(np.float32),
+        provenance={},
+    )
+    path = tmp_path_factory.mktemp("bundle") / "test.pans"
+    write_bundle(made, path)
+    return load_bundle(path)[0]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(2)
+    path = tmp_path_factory.mktemp("scene") / "tiny.npz"
+    images = rng.integers(0, 256, (6, 8, 8)).astype(np.uint8)
+    np.savez(path, images=images, labels=np.arange(6, dtype=np.int16) % 3, classes=np.array(["a", "b", "c"]))
+    return path
+
+
+class Disturbed:
+    """A link that passes every chunk from the device through `disturb`."""
+
+    def __init__(self, link: Link, disturb: Any) -> None:
+        self._link, self._disturb = link, disturb
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.write, self.now_ns, self.close = link.write, link.now_ns, link.close
+
+    def read(self, timeout_s: float) -> bytes:
+        return bytes(self._disturb(self._link.read(timeout_s)))
+
+
+def run(
+    bundle: Bundle,
+    scene: Path,
+    n_objects: int = 6,
+    trials: int = 3,
+    shots: int = 1,
+    disturb: Any = None,
+    wrap: Any = None,
+    **options: Any,
+) -> RunResult:
+    plan = build_plan(PROFILE, bundle, shots_per_object=trials * shots, **options)
+    link: Link = open_sim(f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast")
+    if disturb is not None:
+        link = Disturbed(link, disturb)
+    if wrap is not None:
+        link = wrap(link)
+    config = RunConfig(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
+    return run_live(
+        link, PROFILE, bundle, plan, Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles), config
+    )
+
+
+@pytest.mark.parametrize("order", ["pattern-major", "shot-major"])
+def test_every_object_is_decided_on_time_and_truth_is_known(bundle: Bundle, scene: Path, order: str) -> None:
+    result = run(bundle, scene, order=order)
+    summary = result.tally.summary()
+    assert result.ended == "completed"
+    assert (summary["decisions"], summary["objects"], summary["trials"], summary["abstained"]) == (18, 6, 3, 0)
+    assert (result.timing.late, result.stream["lost_exposures"], result.wrong_patterns) == (0, 0, 0)
+    assert 0 < summary["clicks_mean"] <= 4
+    assert summary["photons_mean"] > summary["clicks_mean"] * 0.5
+    assert result.slot_jitter_us == 0.0
+    assert result.dark.exposures > 0
+    assert result.clock["drift_ppm"] == pytest.approx(-20, abs=1)
+
+
+def test_virtual_runs_are_the_same_bit_for_bit(bundle: Bundle, scene: Path) -> None:
+    first, second = run(bundle, scene), run(bundle, scene)
+    assert first.tally.summary() == second.tally.summary()
+    np.testing.assert_array_equal(first.tally.confusion, second.tally.confusion)
+
+
+def test_bytes_one_at_a_time_change_nothing(bundle: Bundle, scene: Path) -> None:
+    class Drip(Disturbed):
+        """One byte per read; the next one is there at once."""
+
+        held = bytearray()
+
+        def read(self, timeout_s: float) -> bytes:
+            self.held += self._link.read(0.0 if self.held else timeout_s)
+            out = bytes(self.held[:1])
+            del self.held[:1]
+            return out
+
+    dripped = run(bundle, scene, n_objects=2, wrap=lambda link: Drip(link, None))
+    assert dripped.tally.summary() == run(bundle, scene, n_objects=2).tally.summary()
+
+
+def test_damaged_frames_become_flagged_decisions_never_wrong_ones(bundle: Bundle, scene: Path) -> None:
+    rng = np.random.default_rng(4)
+
+    def flip(data: bytes) -> bytes:
+        noisy = bytearray(data)
+        if len(noisy) >= 55 and rng.random() < 0.2:  # click blocks, not the short answers of the set-up
+            noisy[int(rng.integers(5, len(noisy) - 1))] ^= 0x10
+        return bytes(noisy)
+
+    result = run(bundle, scene, n_objects=40, disturb=flip)
+    assert result.decoder["crc_errors"] + result.decoder["cobs_errors"] + result.decoder["short_frames"] > 0
+    assert result.stream["lost_exposures"] > 0
+    assert result.tally.decisions == 120
+    assert result.tally.abstained > 0
+    gaps = [event for event in result.events if event["kind"] == "gap"]
+    assert sum(gap["exposures"] for gap in gaps) == result.stream["lost_exposures"]
+
+
+def test_a_silent_device_is_a_link_error(bundle: Bundle, scene: Path) -> None:
+    with pytest.raises(LinkError, match="no WELCOME"):
+        run(bundle, scene, disturb=lambda data: b"")
+
+
+def test_a_device_that_dies_ends_the_run_loudly(bundle: Bundle, scene: Path) -> None:
+    seen = [0]
+
+    def die(data: bytes) -> bytes:
+        seen[0] += len(data)
+        return data if seen[0] < 6000 else b""
+
+    result = run(bundle, scene, n_objects=200, disturb=die)
+    assert result.ended == "the link was lost: the device fell silent"
+    assert result.link_lost
+
+
+def test_a_cable_that_is_pulled_still_gives_the_figures_so_far(bundle: Bundle, scene: Path) -> None:
+    seen = [0]
+
+    def pull(data: bytes) -> bytes:
+        seen[0] += len(data)
+        if seen[0] > 6000:
+            raise LinkError("the cable was pulled")
+        return data
+
+    result = run(bundle, scene, n_objects=200, disturb=pull)
+    assert result.link_lost
+    assert "the cable was pulled" in result.ended
+    assert 0 < result.tally.decisions < 600
+
+
+def test_a_device_of_another_kind_is_refused(bundle: Bundle, scene: Path) -> None:
+    plan = build_plan(PROFILE, bundle, shots_per_object=1)
+    link = open_sim(f"sim:dmd-spad?scene={scene}&pace=fast")
+    with pytest.raises(DeviceError, match=r"projector levels: 2, needed 124"):
+        run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunConfig(n_cycles=1))
+
+
+def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    helper, proto = onnx.helper, onnx.TensorProto
+    weights = np.random.default_rng(7).normal(size=(4, 3)).astype(np.float32)
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["x", "w"], ["y"])],
+        "head",
+        [helper.make_tensor_value_info("x", proto.FLOAT, [None, 4])],
+        [helper.make_tensor_value_info("y", proto.FLOAT, [None, 3])],
+        [onnx.numpy_helper.from_array(weights, "w")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    headed = make_bundle(
+        name="headed",
+        task="test",
+        classes=bundle.classes,
+        image_shape=bundle.image_shape,
+        levels=124,
+        pattern_levels=bundle.pattern_levels,
+        photons_per_level=bundle.photons_per_level,
+        head_onnx=model.SerializeToString(),
+        provenance={},
+    )
+    result = run(headed, scene, shots=4, trials=2)
+    assert result.tally.decisions == 12
+    assert result.tally.clicks / 12 > 4 * 0.2
+    assert result.tally.summary()["photons_mean"] == pytest.approx(
+        4 * run(headed, scene).tally.summary()["photons_mean"]
+    )
+
+
+def test_the_plan_survives_the_wire(bundle: Bundle) -> None:
+    plan = build_plan(PROFILE, bundle, shots_per_object=3)
+    back = plan_from_chunks(plan_chunks(plan), PROFILE.clock.tick_hz)
+    for name in plan.__slots__:
+        np.testing.assert_array_equal(getattr(back, name), getattr(plan, name), err_msg=name)
+
+
+def test_a_recording_replays_to_the_same_hash_and_another_bundle_does_not(
+    bundle: Bundle, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "test.pans"
+    write_bundle(bundle, path)
+    device = f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast"
+    assert (
+        main(
+            [
+                "run",
+                str(path),
+                "--device",
+                device,
+                "--trials",
+                "2",
+                "--decisions",
+                "12",
+                "--out",
+                str(tmp_path),
+                "--json",
+            ]
+        )
+        == 0
+    )
+    summary = json.loads(capsys.readouterr().out)
+    for key in (
+        "accuracy",
+        "clicks_mean",
+        "photons_mean",
+        "decisions",
+        "late",
+        "lost",
+        "latency_us",
+        "verdict",
+        "recording",
+        "report",
+    ):
+        assert key in summary
+    assert summary["simulated"] is True
+    assert "SIMULATED" in Path(summary["report"]).read_text()
+    assert main(["replay", summary["recording"], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"] is True
+    assert len(read_recording(summary["recording"]).decisions()) == 12
+
+    other = make_bundle(
+        name="other",
+        task="test",
+        classes=bundle.classes,
+        image_shape=bundle.image_shape,
+        levels=124,
+        pattern_levels=bundle.pattern_levels,
+        photons_per_level=bundle.photons_per_level,
+        table=-np.asarray(bundle.table),
+        provenance={},
+    )
+    write_bundle(other, tmp_path / "other.pans")
+    assert main(["replay", summary["recording"], "--bundle", str(tmp_path / "other.pans"), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["identical"] is False

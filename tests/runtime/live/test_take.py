@@ -1,0 +1,38 @@
+"""What has arrived is decided and recorded to the last message, also when the link breaks while acting on the first."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pans.runtime.core.follower import Action, Output
+from pans.runtime.errors import LinkError
+from pans.runtime.link.connection import Arrived
+from pans.runtime.live.run import LiveRun
+from pans.runtime.wire.framing import Messages
+
+
+def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+
+    def step_messages(messages: Messages, place: int) -> tuple[int, Output]:
+        seen.append(place)
+        return 1, Output([], [], None, (), (Action(place, 5, 1, 0),))
+
+    def act(self: LiveRun, now_ns: int) -> None:
+        raise LinkError("the port is gone")
+
+    run = LiveRun.__new__(LiveRun)
+    run.core = SimpleNamespace(step_messages=step_messages)  # type: ignore[assignment]
+    run.lateness = SimpleNamespace(stepped=lambda begin, end: None)  # type: ignore[assignment]
+    run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7))  # type: ignore[assignment]
+    run._recorder, run._broken = None, None
+    monkeypatch.setattr(LiveRun, "_act", act)
+    monkeypatch.setattr(LiveRun, "_account", lambda self, output, times_ns: None)
+    messages = Messages(np.zeros(8, np.uint8), np.zeros((3, 2), np.int64))
+    with pytest.raises(LinkError, match="the port is gone"):
+        run.take([Arrived(1, messages)])
+    assert seen == [0, 1, 2]
+    assert run.take([]) == []  # told once

@@ -1,0 +1,68 @@
+"""What decisions add up to, with both spreads kept apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pans.runtime.core.still import NO_LABEL, Decision
+from pans.runtime.live.tally import RunTally
+from pans.runtime.record.recorder import DecisionFlag
+
+NAN = float("nan")
+
+
+def decision(obj: int, trial: int, label: int, truth: int, clicks: int = 4, flags: int = 0) -> Decision:
+    return Decision(0, 0, 0, obj, trial, clicks, label, truth, flags, 0.9, 0)
+
+
+def test_spreads_over_trials_and_objects_are_different_things() -> None:
+    right = np.array([[1, 1, 0], [1, 0, 0], [1, 1, 1], [0, 0, 0]])  # objects x trials
+    tally = RunTally(2, 1)
+    for obj, row in enumerate(right):
+        for trial, value in enumerate(row):
+            tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
+    summary = tally.summary()
+    assert summary["accuracy"] == pytest.approx(right.mean())
+    assert summary["accuracy_std_trials"] == pytest.approx(right.mean(axis=0).std(ddof=1))
+    assert summary["accuracy_stderr_objects"] == pytest.approx(right.mean(axis=1).std(ddof=1) / 2)
+    assert (summary["objects"], summary["trials"], summary["decisions"]) == (4, 3, 12)
+    assert (summary["clicks_mean"], summary["photons_mean"]) == (4.0, 6.0)
+    assert tally.confusion.tolist() == [[0, 0], [6, 6]]
+
+
+def test_an_abstention_is_not_right_and_stands_in_no_column() -> None:
+    tally = RunTally(2, 1)
+    tally.add(decision(0, 0, 1, 1), NAN)
+    tally.add(decision(0, 1, NO_LABEL, 1, flags=int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)), NAN)
+    assert tally.accuracy == 0.5
+    assert tally.abstained == 1
+    assert tally.confusion.sum() == 1
+    assert tally.summary()["photons_mean"] is None
+
+
+def test_without_truth_there_is_no_accuracy() -> None:
+    tally = RunTally(2, 2)
+    tally.add(decision(0, 0, 1, -1), 3.0)
+    summary = tally.summary()
+    assert summary["accuracy"] is None
+    assert summary["accuracy_std_trials"] is None
+    assert summary["photons_mean"] == 6.0  # two shots of three photons each
+
+
+def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    right = rng.random((500, 4)) < rng.random((500, 1))
+    summaries = []
+    for most in (1 << 14, 7):
+        monkeypatch.setattr("pans.runtime.live.tally.MAX_OBJECTS", most)
+        tally = RunTally(2, 1)
+        for obj, row in enumerate(right):
+            for trial, value in enumerate(row):
+                tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
+        assert len(tally._objects) <= most
+        summaries.append(tally.summary())
+    whole, summed = summaries
+    assert summed["objects"] == 500
+    assert summed.pop("accuracy_stderr_objects") == pytest.approx(whole.pop("accuracy_stderr_objects"), rel=1e-12)
+    assert summed == whole

@@ -1,0 +1,411 @@
+"""Recordings: every byte is covered, a cut file reads up to its last whole block, and what went in comes out."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import itertools
+import json
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.model import bundle_bytes, make_bundle
+from pans.runtime.errors import DamagedFileError, PansError, UsageError
+from pans.runtime.record.recorder import (
+    DECISION_DTYPE,
+    TIMING_DTYPE,
+    DecisionFlag,
+    Kind,
+    Recorder,
+    Recording,
+    decision_log_sha256,
+    read_recording,
+)
+from pans.runtime.timing.clock import CLOCK_DTYPE
+
+HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}
+
+
+def decision(index: int) -> tuple[Any, ...]:
+    return (index, 1000 * index, 9 * index + 8, index, 0, 4, index % 3, -1, 0, 0.5, 12345)
+
+
+def write_recording(path: Path, decisions: int = 5, bundle: bytes = b"") -> str:
+    with Recorder.open(path, HEADER, bundle=bundle) as recorder:
+        recorder.add_command(10, b"arm")
+        for index in range(decisions):
+            recorder.add_message(100 + index, bytes([index % 256]) * (index % 7))
+            recorder.add_decision(decision(index))
+            recorder.add_timing((index, 1, 2, 3, 4))
+        recorder.add_clock(np.array([(5, 6, 7), (8, 9, 10)], dtype=CLOCK_DTYPE))
+        recorder.add_event({"kind": "gap", "lost": 3})
+        recorder.add_event({"kind": "late", "text": "a line\nof two"})
+        return recorder.close({"accuracy": 0.75})
+
+
+def facts(recording: Recording) -> tuple[int, bool]:
+    return recording.n_decisions, recording.complete
+
+
+def test_everything_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    digest = write_recording(path)
+    found = read_recording(path)
+    assert found.complete
+    assert found.damage == ""
+    assert found.header["seed"] == 7
+    assert found.header["format_version"] == found.version == 2
+    assert found.summary == {"accuracy": 0.75}
+    assert found.end_offset == found.size == path.stat().st_size
+    assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
+    assert list(found.commands()) == [(10, b"arm")]
+    wanted = np.array([decision(i) for i in range(5)], dtype=DECISION_DTYPE)
+    np.testing.assert_array_equal(found.decisions(), wanted)
+    assert digest == found.decisions_sha256 == decision_log_sha256(wanted)
+    assert found.timings()["index"].tolist() == [0, 1, 2, 3, 4]
+    assert found.timings().dtype == TIMING_DTYPE
+    assert found.clock_samples().tolist() == [(5, 6, 7), (8, 9, 10)]
+    assert list(found.events()) == [{"kind": "gap", "lost": 3}, {"kind": "late", "text": "a line\nof two"}]
+    assert found.bundle_data() == b""
+    with pytest.raises(UsageError, match="no bundle"):
+        found.bundle()
+
+
+def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
+    """Written out by hand from docs/FORMATS.md, with none of the code under test."""
+
+    def block(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
+        start = struct.pack("<II", len(payload), index) + bytes([kind, 0, 0, 0])
+        first = zlib.crc32(start, chain)
+        last = zlib.crc32(payload, first)
+        return start + struct.pack("<I", first) + payload + struct.pack("<I", last), last
+
+    start = b"PANSRECD" + struct.pack("<I", 2)
+    chain = zlib.crc32(start)
+    wanted = start + struct.pack("<I", chain)
+    run = struct.pack("<QQQIIIIIIhH", 0, 0, 8, 0, 0, 1, 0, 0, 0, -1, 0)
+    verdict = struct.pack("<IHIfI", 4, 0, 0, 0.5, 12345)
+    parts = [hashlib.sha256(part).digest() for part in (verdict, bytes(2), run)]
+    log = hashlib.sha256(b"".join(parts)).hexdigest()
+    end = {"blocks": 3, "decisions": 1, "decisions_sha256": log, "summary": {}}
+    header = {**HEADER, "format_version": 2}
+    payloads = [
+        (1, json.dumps(header, sort_keys=True, separators=(",", ":")).encode()),
+        (3, struct.pack("<qI", -5, 2) + b"hi"),
+        (6, struct.pack("<III", 1, 1, 1) + run + verdict + bytes(2)),
+        (9, json.dumps(end, sort_keys=True, separators=(",", ":")).encode()),
+    ]
+    for index, (kind, payload) in enumerate(payloads):
+        data, chain = block(kind, index, chain, payload)
+        wanted += data
+    with Recorder(tmp_path / "a.pansrec", HEADER) as recorder:
+        recorder.add_decision(decision(0))
+        recorder.add_message(-5, b"hi")
+        recorder.close({})
+    assert (tmp_path / "a.pansrec").read_bytes() == wanted
+
+
+def test_rows_are_packed_as_documented() -> None:
+    assert DECISION_DTYPE.itemsize == 52
+    assert TIMING_DTYPE.itemsize == 40
+    flags = [int(flag) for flag in DecisionFlag]
+    assert flags == [1, 2, 4, 8, 16, 32, 64, 128, 256]
+
+
+def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path, decisions=2)
+    data = path.read_bytes()
+    for position in range(len(data)):
+        for flip in (0x01, 0xFF):
+            changed = bytearray(data)
+            changed[position] ^= flip
+            path.write_bytes(changed)
+            with pytest.raises(DamagedFileError):
+                read_recording(path)
+
+
+def test_a_cut_file_reads_up_to_the_last_whole_block(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path)
+    data = path.read_bytes()
+    whole = read_recording(path)
+    ends = [block.end for block in whole.iter_blocks()]
+    decided = next(block.end for block in whole.iter_blocks(Kind.DECISIONS))
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        if length < ends[0]:
+            with pytest.raises(DamagedFileError, match="cut after"):
+                read_recording(path)
+            continue
+        found = read_recording(path)
+        assert not found.complete
+        assert found.summary == {}
+        assert found.end_offset == max(end for end in ends if end <= length)
+        assert found.n_decisions == (5 if length >= decided else 0)
+        assert len(list(found.iter_blocks())) == sum(end <= length for end in ends)
+        assert len(found.decisions()) == found.n_decisions
+
+
+def test_zeros_left_by_a_power_cut_are_a_cut(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path)
+    ends = [block.end for block in read_recording(path).iter_blocks()]
+    path.write_bytes(path.read_bytes()[: ends[2]] + bytes(5000))
+    found = read_recording(path)
+    assert not found.complete
+    assert (found.end_offset, found.size) == (ends[2], ends[2] + 5000)
+
+
+def test_moved_removed_and_doubled_blocks_are_detected(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path)
+    data = path.read_bytes()
+    ends = [16, *(block.end for block in read_recording(path).iter_blocks())]
+    pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
+    for i in range(len(pieces) - 1):
+        swapped = [*pieces[:i], pieces[i + 1], pieces[i], *pieces[i + 2 :]]
+        for order in (swapped, pieces[:i] + pieces[i + 1 :], [*pieces[: i + 1], *pieces[i:]]):
+            path.write_bytes(data[:16] + b"".join(order))
+            with pytest.raises(DamagedFileError):
+                read_recording(path)
+    path.write_bytes(data + b"\0")
+    with pytest.raises(DamagedFileError, match="behind the END"):
+        read_recording(path)
+
+
+def test_salvage_reads_what_stands_before_the_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path)
+    ends = [block.end for block in read_recording(path).iter_blocks()]
+    data = bytearray(path.read_bytes())
+    data[ends[-2] - 1] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(
+        DamagedFileError, match=f"block {len(ends) - 2} at byte {ends[-3]}: altered.*{len(ends) - 2} whole"
+    ):
+        read_recording(path)
+    found = read_recording(path, salvage=True)
+    assert "altered" in found.damage
+    assert not found.complete
+    assert found.end_offset == ends[-3]
+    assert len(found.decisions()) == found.n_decisions == 5
+
+
+def forged(path: Path, blocks: list[tuple[int, bytes]]) -> Path:
+    """A file whose checksums all fit, whatever its blocks say."""
+    start = b"PANSRECD" + struct.pack("<I", 2)
+    chain = zlib.crc32(start)
+    out = start + struct.pack("<I", chain)
+    for index, (kind, payload) in enumerate(blocks):
+        head = struct.pack("<IIBxxx", len(payload), index, kind)
+        first = zlib.crc32(head, chain)
+        chain = zlib.crc32(payload, first)
+        out += head + struct.pack("<I", first) + payload + struct.pack("<I", chain)
+    path.write_bytes(out)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("blocks", "reason"),
+    [
+        ([(3, b"")], "MESSAGES does not belong"),
+        ([(1, b"{}"), (1, b"{}")], "HEADER does not belong"),
+        ([(1, b"[]")], "JSON object"),
+        ([(1, b'{"a": NaN}')], "JSON"),
+        ([(1, b"{}"), (77, b"")], "kind 77"),
+        ([(1, b"{}"), (2, b"abc")], "header says None"),
+        ([(1, b"{}"), (6, b"abc")], "3 bytes"),
+        ([(1, b"{}"), (9, b"{}")], "blocks = None, found 1"),
+        ([(1, b"{}"), (9, json.dumps({"blocks": 1, "decisions": 9}).encode())], "decisions = 9, found 0"),
+        ([(1, b"{}"), (3, bytes((2 << 20) + 1))], "allowed at most 2097152"),
+    ],
+)
+def test_a_forged_file_is_refused_with_the_reason(blocks: list[tuple[int, bytes]], reason: str, tmp_path: Path) -> None:
+    with pytest.raises(DamagedFileError, match=reason):
+        read_recording(forged(tmp_path / "f.pansrec", blocks))
+
+
+@pytest.mark.parametrize(
+    "payload", [b"short", struct.pack("<qI", 0, 50) + b"x" * 49, struct.pack("<qI", 0, 0xFFFFFFFF)]
+)
+def test_messages_cannot_reach_past_their_block(payload: bytes, tmp_path: Path) -> None:
+    found = read_recording(forged(tmp_path / "f.pansrec", [(1, b"{}"), (3, payload)]))
+    with pytest.raises(DamagedFileError, match="past its block"):
+        list(found.messages())
+
+
+def test_a_length_beyond_the_file_allocates_nothing(tmp_path: Path) -> None:
+    start = b"PANSRECD" + struct.pack("<I", 2)
+    head = struct.pack("<IIBxxx", 0xFFFFFFFF, 0, 1)
+    crc = zlib.crc32(start)
+    path = tmp_path / "f.pansrec"
+    path.write_bytes(start + struct.pack("<I", crc) + head + struct.pack("<I", zlib.crc32(head, crc)))
+    with pytest.raises(DamagedFileError, match="4294967295 bytes of kind 1, allowed at most 4194304"):
+        read_recording(path)
+
+
+def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    write_recording(path)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match="exists already"):
+        Recorder.open(path, HEADER)
+    assert path.read_bytes() == before
+    with Recorder.open(path, HEADER, overwrite=True) as recorder:
+        recorder.close({})
+    assert facts(read_recording(path)) == (0, True)
+    with pytest.raises(UsageError, match="cannot be written"):
+        Recorder.open(tmp_path / "no" / "folder.pansrec", HEADER)
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_recording(tmp_path / "none.pansrec")
+
+
+def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    recorder = Recorder.open(path, HEADER)
+
+    def broken_run() -> None:
+        with recorder:
+            recorder.add_decision(decision(0))
+            raise RuntimeError("the run broke")
+
+    with pytest.raises(RuntimeError, match="the run broke"):
+        broken_run()
+    assert facts(read_recording(path)) == (1, False)
+    with pytest.raises(UsageError, match="closed"):
+        recorder.add_clock(np.zeros(1, CLOCK_DTYPE))
+
+
+def test_what_is_flushed_is_readable_while_recording_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    with Recorder.open(path, HEADER) as recorder:
+        recorder.add_decision(decision(0))
+        assert facts(read_recording(path)) == (0, False)
+        recorder.flush()
+        assert facts(read_recording(path)) == (1, False)
+        recorder.add_decision(decision(1))
+        recorder.sync()
+        assert facts(read_recording(path)) == (2, False)
+
+
+def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    rng = np.random.default_rng(4)
+    sizes = [*rng.integers(0, 3000, size=400).tolist(), 1 << 20, 262_144 - 12, 262_145, 0]
+    messages = [(i, bytes([i % 251]) * size) for i, size in enumerate(sizes)]
+    with Recorder.open(path, HEADER) as recorder:
+        for host_ns, data in messages:
+            recorder.add_message(host_ns, memoryview(data))
+        for index in range(10_000):
+            recorder.add_decision(decision(index))
+            recorder.add_event({"index": index})
+        recorder.close({})
+    found = read_recording(path)
+    assert list(found.messages()) == messages
+    assert found.kinds[Kind.DECISIONS] == 3
+    assert found.decisions()["index"].tolist() == list(range(10_000))
+    assert [event["index"] for event in found.events()] == list(range(10_000))
+    assert max(len(block.payload) for block in found.iter_blocks()) <= (1 << 20) + 12
+    with Recorder.open(tmp_path / "b.pansrec", HEADER) as recorder:
+        with pytest.raises(UsageError, match="message of 1048577"):
+            recorder.add_message(0, bytes((1 << 20) + 1))
+        with pytest.raises(UsageError, match="an event of"):
+            recorder.add_event({"text": "x" * 70_000})
+
+
+def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.pansrec"
+    recorder = Recorder.open(path, HEADER)
+    recorder.add_decision(decision(0))
+    recorder.flush()
+
+    class FullDisk:
+        """Takes ten more bytes, then refuses."""
+
+        def __init__(self, file: Any) -> None:
+            self.file, self.room = file, 10
+
+        def write(self, data: memoryview) -> int:
+            if not self.room:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            taken = self.file.write(data[: self.room])
+            self.room -= taken
+            return int(taken)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.file, name)
+
+    monkeypatch.setattr(recorder, "_file", FullDisk(recorder._file))
+    recorder.add_decision(decision(1))
+    with pytest.raises(PansError, match="recording stops after"):
+        recorder.flush()
+    found = read_recording(path)
+    assert facts(found) == (1, False)
+    assert found.size == found.end_offset
+
+
+def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.pansrec"
+    with Recorder.open(path, HEADER) as recorder:
+        real = recorder._file
+
+        class Trickle:
+            def write(self, data: memoryview) -> int:
+                return int(real.write(data[:7]))
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(real, name)
+
+        monkeypatch.setattr(recorder, "_file", Trickle())
+        recorder.add_message(1, b"hello" * 20)
+        recorder.close({})
+    assert list(read_recording(path).messages()) == [(1, b"hello" * 20)]
+
+
+def test_the_bundle_travels_along(tmp_path: Path) -> None:
+    made = make_bundle(
+        name="toy",
+        task="test",
+        classes=("a", "b"),
+        image_shape=(1, 1),
+        levels=2,
+        pattern_levels=[[1]],
+        photons_per_level=1.0,
+        table=[[1, 0], [0, 1]],
+        provenance={},
+    )
+    path = tmp_path / "a.pansrec"
+    write_recording(path, bundle=bundle_bytes(made))
+    found = read_recording(path)
+    assert found.header["bundle_sha256"] == hashlib.sha256(bundle_bytes(made)).hexdigest()
+    assert found.bundle_data() == bundle_bytes(made)
+    assert found.bundle().classes == ("a", "b")
+
+
+def test_a_header_that_json_cannot_hold_makes_no_file(tmp_path: Path) -> None:
+    for strange in (float("nan"), np.float32(1.0), {1: 2}):
+        with pytest.raises((ValueError, TypeError)):
+            Recorder.open(tmp_path / "a.pansrec", {"value": strange})
+    assert os.listdir(tmp_path) == []
+
+
+def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
+    wanted = np.array([decision(i) for i in range(50_000)], dtype=DECISION_DTYPE)
+    one, many = tmp_path / "one.pansrec", tmp_path / "many.pansrec"
+    with Recorder.open(one, HEADER) as recorder:
+        for row in wanted[:10].tolist():
+            recorder.add_decision(row)
+        recorder.add_decisions(wanted[10:])
+        digest = recorder.close({})
+    with Recorder.open(many, HEADER) as recorder:
+        recorder.add_decisions(wanted)
+        assert recorder.close({}) == digest == decision_log_sha256(wanted)
+    for path in (one, many):
+        np.testing.assert_array_equal(read_recording(path).decisions(), wanted)

@@ -1,0 +1,132 @@
+"""Report pages and replays of runs in which objects passed by: whole, cut, and in parts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pages import page_of, words_of
+
+from pans.runtime.cli import main
+from pans.runtime.record.recorder import read_recording
+from pans.runtime.report.page_flow import _late_numbers, _pulses, _spread
+
+pytest.importorskip("matplotlib", reason="needs the plot extra")
+
+
+@pytest.fixture(scope="module")
+def run(flow_folder: Path) -> Path:
+    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
+    words = ["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", str(flow_folder / "flow.toml")]
+    assert main([*words, "--seconds", "0.2", "--gate-class", "a", "--out", str(flow_folder / "page")]) == 0
+    return flow_folder / "page" / "run.pansrec"
+
+
+def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
+    page = page_of(run, tmp_path)
+    words, summary = words_of(page), read_recording(run).summary
+    for text in (
+        "Objects that passed by",
+        f"{summary['accuracy']:.3%}",
+        f"{summary['missed']:.3%}",
+        f"{summary['yield']:.3%}",
+        f"{summary['purity']:.3%}",
+        ", ".join(str(n) for n in summary["gates"].values()),
+        "Decisions by what became of them",
+        "true class in rows",
+    ):
+        assert text in words
+    assert "spread over trials" not in words
+    assert "Late and missing" not in words
+
+
+def test_a_cut_recording_still_tells_of_its_passages(run: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.pansrec"
+    data = run.read_bytes()
+    cut.write_bytes(data[: int(len(data) * 0.7)])
+    words = words_of(page_of(cut, tmp_path))
+    assert "INCOMPLETE" in words
+    assert "accuracy per passage alone" in words
+
+
+def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> None:
+    recording = read_recording(run)
+    bundle = recording.bundle()
+    asked = recording.decisions()["index"][recording.decisions()["label"] == 0].astype(int)
+
+    class Told:
+        header, path = recording.header, recording.path
+
+        def decisions(self) -> Any:
+            return recording.decisions()
+
+        def events(self) -> Any:
+            yield {"kind": "gate_refused", "decision": int(asked[0]), "text": "late"}
+            yield {"kind": "gate_refused", "command_id": 3}  # of no decision
+            yield {"kind": "gate_expired", "decision": int(asked[2])}
+            yield from ({"kind": "late", "decision": number, "latency_us": 2e3} for number in (3, 4, 9, 20))
+            yield {"kind": "blame", "what": "late", "cause": "link", "first_decision": 3, "last_decision": 4}
+            yield {"kind": "blame", "what": "late", "cause": "host", "first_decision": 9, "last_decision": 20}
+
+    told: Any = Told()
+    pulses = _pulses(told, bundle)
+    assert pulses["asked"].tolist() == asked.tolist()
+    assert (pulses["refused"].tolist(), pulses["expired"].tolist()) == ([asked[0]], [asked[2]])
+    assert len(pulses["done"]) == len(asked) - 2
+    assert {cause: rows.tolist() for cause, rows in _late_numbers(told).items()} == {"link": [3, 4], "host": [9, 20]}
+
+
+def test_spread_puts_every_decision_into_one_bin(run: Path) -> None:
+    decisions = read_recording(run).decisions()
+    rows = _spread(decisions, {"all": decisions["index"], "none": np.zeros(0, np.int64)})
+    assert list(rows) == ["all"]
+    assert rows["all"].sum() == len(decisions)
+    part = decisions[100:]  # a later part of a run: numbers go on
+    assert _spread(part, {"all": part["index"]})["all"].sum() == len(part)
+
+
+def test_late_decisions_stand_on_the_page_with_their_causes(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = read_recording(run)
+    extra = [
+        {"kind": "late", "decision": 5, "latency_us": 2000.0},
+        {"kind": "blame", "what": "late", "cause": "gc", "decisions": 1, "first_decision": 5, "last_decision": 5, "why": "it swept"},
+        {"kind": "blame", "what": "lost", "cause": "device", "exposures": 40, "why": "it dropped them"},
+    ]  # fmt: skip
+    events = list(recording.events())
+    monkeypatch.setattr(type(recording), "events", lambda self: iter([*events, *extra]))
+    words = words_of(page_of(run, tmp_path))
+    assert "Late and missing, by cause" in words
+    for text in ("gc", "it swept", "device", "it dropped them", "Late decisions over the run"):
+        assert text in words
+
+
+def test_parts_of_a_flow_tell_of_their_passages(
+    flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
+    words = ["run", str(flow_folder / "thirds.pans"), "--device", device, "--flow", str(flow_folder / "flow.toml")]
+    words += ["--seconds", "1.5", "--rotate-mb", "1", "--out", str(tmp_path), "--json"]
+    assert main(words) == 0
+    summary = json.loads(capsys.readouterr().out)
+    parts = sorted(tmp_path.glob("run-*.pansrec"))
+    assert len(parts) >= 2
+    assert main(["replay", str(tmp_path), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["parts"]
+    marks = sum(row["passages"]["marks"] for row in rows)
+    assert 0.98 * summary["passages"]["marks"] <= marks <= summary["passages"]["marks"]
+    for row in rows:
+        assert row["identical"]
+        assert abs(row["accuracy"] - summary["accuracy"]) < 0.05
+        assert row["passages"]["without_mark"] <= 3
+        assert row["missed"] < 0.02
+    assert main(["replay", str(parts[1])]) == 0
+    text = capsys.readouterr().out
+    assert "passages" in text
+    assert "accuracy" in text
+    words_on_page = words_of(page_of(parts[1], tmp_path))
+    assert "This is one part of a run" in words_on_page

@@ -1,0 +1,304 @@
+"""Who is to blame: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
+
+from __future__ import annotations
+
+import gc
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pans.firmware_sim.ports.serve import open_sim
+from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.runtime.bundle.model import make_bundle
+from pans.runtime.core.plan import build_plan
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.live.loop import RunConfig, run_live
+from pans.runtime.record.recorder import Recorder, read_recording
+from pans.runtime.timing.attribution import CAUSES, QUIET_NS, Incidents, LateWork, judge, judge_gap
+from pans.runtime.timing.evidence import (
+    DISK,
+    GC,
+    IDLE,
+    INFERENCE,
+    OVERSLEPT,
+    Evidence,
+    Facts,
+    Span,
+    Stamped,
+    longest_pause_ns,
+)
+
+MS = 1_000_000
+
+
+def facts(
+    arrival: float = 40,
+    end: float = 40.2,
+    spans: tuple[Span, ...] = (),
+    run_delay: float = 0,
+    stamped: tuple[Stamped, ...] = (),
+    cpu: float = 2,
+    arrivals: tuple[float, ...] = (),
+) -> Facts:
+    """Late work whose exposure ended at 0; times in ms; a block every millisecond."""
+    stamps = tuple(int(one * MS) for one in arrivals)
+    begin, came, decided = 0, int(arrival * MS), int(end * MS)
+    return Facts(begin, came, decided, 0, spans, stamps, MS, int(cpu * MS), int(run_delay * MS), 0, 0, stamped)
+
+
+def span(kind: str, begin: float, end: float) -> Span:
+    return Span(kind, int(begin * MS), int(end * MS))
+
+
+def pong(sent: float, reached: float, left: float, arrival: float) -> Stamped:
+    return Stamped(*(int(value * MS) for value in (sent, reached, left, arrival)))
+
+
+IDLE_ALL = span(IDLE, 0, 40)
+CASES = {
+    "a collection while bytes wait": (facts(0.2, 40, (span(GC, 0.1, 39),)), "gc", True),
+    "a collection holds up the reader, so the bytes seem late": (facts(39, 40, (span(GC, 0.1, 39),)), "gc", True),
+    "a write before the bytes could be taken": (facts(0.2, 40, (span(DISK, 0.1, 39),)), "disk", True),
+    "this decision's own computation": (facts(0.2, 40, (span(INFERENCE, 0.3, 40),), cpu=39), "inference", True),
+    "the computation of the decision before": (facts(0.2, 40, (span(INFERENCE, 0, 39.8),), cpu=39), "inference", True),
+    "a back end that waits for other hardware while bytes come": (
+        facts(0.2, 40, (span(INFERENCE, 0.3, 40),), arrivals=(10, 20, 30)), "inference", True
+    ),
+    "stopped within the decision": (facts(0.2, 40, (span(INFERENCE, 0.3, 40),)), "host", True),
+    "stopped between two waits": (facts(39.9, 40, (span(IDLE, -5, 0.5),)), "host", True),
+    "a collection within the computation": (
+        facts(0.2, 40, (span(INFERENCE, 0.3, 40), span(GC, 1, 39))), "gc", True
+    ),
+    "a processor taken away within the computation": (
+        facts(0.2, 40, (span(INFERENCE, 0.3, 40),), run_delay=38), "host", True
+    ),
+    "a processor taken away while bytes come": (facts(39, 40, (span(IDLE, 0, 39),), run_delay=38), "host", True),
+    "stopped in the middle of a wait": (facts(39, 40, (span(IDLE, 0, 5), span(OVERSLEPT, 5, 39))), "host", True),
+    "its own work": (facts(0.2, 40, cpu=39), "decode", True),
+    "silence without a witness": (facts(spans=(IDLE_ALL,)), "link", False),
+    "a probe stuck on its way there": (facts(spans=(IDLE_ALL,), stamped=(pong(5, 39.8, 39.8, 40),)), "link", True),
+    "an answer stuck on its way back": (facts(spans=(IDLE_ALL,), stamped=(pong(1, 1.1, 1.1, 40),)), "link", True),
+    "a status stuck on its way": (
+        facts(spans=(IDLE_ALL,), stamped=(Stamped(None, None, 3 * MS, 40 * MS),)), "link", True
+    ),
+    "a probe there and back in the silence": (
+        facts(spans=(IDLE_ALL,), stamped=(pong(5, 5.1, 5.1, 5.2),)), "device", True
+    ),
+    "a probe that the device kept": (facts(spans=(IDLE_ALL,), stamped=(pong(5, 5.1, 39.9, 40),)), "device", True),
+    "a round trip before the silence proves nothing": (
+        facts(spans=(IDLE_ALL,), stamped=(pong(-5, -4.9, -4.9, -4.8),)), "link", False
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_cause_is_named(name: str) -> None:
+    known, cause, sure = CASES[name]
+    verdict = judge(known)
+    assert (verdict.cause, verdict.sure) == (cause, sure), verdict
+    assert verdict.share_ns > 0.8 * (known.end_ns - known.begin_ns)
+    assert "ms" in verdict.why
+
+
+@given(
+    st.integers(1, 10**9),
+    st.floats(0, 1),
+    st.lists(st.tuples(st.sampled_from([GC, DISK, INFERENCE, IDLE, OVERSLEPT]), st.floats(-0.5, 1), st.floats(0, 1)), max_size=6),
+    st.floats(0, 2),
+)  # fmt: skip
+def test_no_cause_explains_more_than_the_delay(
+    total: int, arrival: float, spans: list[tuple[str, float, float]], delay: float
+) -> None:
+    pieces, reached = [], -total // 2
+    for kind, gap, length in spans:  # a loop does one thing after the other
+        begin = reached + int(abs(gap) * total / 4)
+        reached = begin + int(length * total / 2)
+        pieces.append(Span(kind, begin, reached))
+    verdict = judge(
+        Facts(0, int(arrival * total), total, 0, tuple(pieces), (), 1, total // 3, int(delay * total), 0, 0, ())
+    )
+    assert verdict.cause in CAUSES
+    assert all(0 <= share <= total for share in verdict.shares_ns.values())
+    assert verdict.share_ns == max(verdict.shares_ns.values())
+    assert sum(verdict.shares_ns.values()) <= 2 * total + 5  # the scheduler's counters may overlap what was seen
+
+
+def gap(dropped: int, exposures: int = 10) -> dict[str, int]:
+    return {"first_exposure": 5, "exposures": exposures, "messages": 2, "dropped_by_device": dropped}
+
+
+def test_what_never_came_is_the_links_fault_unless_the_device_dropped_it() -> None:
+    quiet = facts()
+    assert judge_gap(gap(0), quiet, 3).cause == "link"
+    assert "3 damaged frames" in judge_gap(gap(0), quiet, 3).why
+    held_up = facts(0.2, 400, (span(DISK, 0.1, 399),))
+    verdict = judge_gap(gap(10), held_up, 0)
+    assert verdict.cause == "disk"
+    assert verdict.why.startswith("the device dropped 10 exposures because its buffer was full; before that, writing")
+    assert judge_gap(gap(10), facts(0.1, 0.2), 0)[:3:2] == ("device", False)
+
+
+def verdict_of(incidents: Incidents, now_ns: int) -> dict[str, Any] | None:
+    """What is known is gathered in one call and judged in the next."""
+    return incidents.verdict(now_ns) or incidents.verdict(now_ns)
+
+
+def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
+    evidence = Evidence(lambda: 0, 10 * MS, virtual=True)
+    evidence.worked(DISK, 100 * MS, 150 * MS)
+    incidents = Incidents(evidence)
+    assert incidents.verdict(0) is None
+    for number, begin in enumerate(range(101, 131, 10)):
+        incidents.late(LateWork(number, begin * MS, begin * MS + 1000, 151 * MS, 0))
+    assert incidents.verdict(152 * MS) is None  # not quiet yet
+    event = verdict_of(incidents, 151 * MS + QUIET_NS)
+    assert event is not None
+    assert (event["cause"], event["decisions"], event["first_decision"], event["last_decision"]) == ("disk", 3, 0, 2)
+    assert event["worst_us"] == 50_000
+    assert incidents.causes == {"disk": 3}
+    assert incidents.verdict(10**12) is None
+
+
+def test_late_work_that_does_not_overlap_is_judged_apart() -> None:
+    evidence = Evidence(lambda: 0, 10 * MS, virtual=True)
+    evidence.worked(DISK, 100 * MS, 120 * MS)
+    evidence.worked(INFERENCE, 121 * MS, 161 * MS)
+    incidents = Incidents(evidence)
+    incidents.late(LateWork(0, 101 * MS, 101 * MS, 120 * MS, 0))
+    incidents.late(LateWork(1, 121 * MS, 121 * MS, 161 * MS, 0))
+    assert [verdict_of(incidents, 10**12)["cause"] for _ in range(2)] == ["disk", "inference"]  # type: ignore[index]
+
+
+def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
+    incidents = Incidents(Evidence(lambda: 0, MS, virtual=True))
+    verdicts = []
+    for number in range(5000):
+        incidents.late(LateWork(number, number * MS, number * MS + 1, (number + 20) * MS, 0))
+        verdicts.append(incidents.verdict((number + 20) * MS))
+    events = [event for event in verdicts if event is not None]
+    assert len(events) == 4
+    assert sum(incidents.causes.values()) == sum(event["decisions"] for event in events)
+
+
+def test_a_real_collection_is_seen_with_its_length() -> None:
+    evidence = Evidence(time.perf_counter_ns, MS)
+    heap = [[[]] for _ in range(400_000)]
+    evidence.watch()
+    try:
+        begin = time.perf_counter_ns()
+        gc.collect()
+        end = time.perf_counter_ns()
+    finally:
+        evidence.close()
+    assert evidence._on_gc not in gc.callbacks
+    assert len(heap) == 400_000
+    known = evidence.facts(begin, begin, end, 0)
+    assert {one.kind for one in known.spans} == {GC}
+    assert judge(known).cause == "gc"
+
+
+def test_waits_that_end_on_time_are_idle_and_others_overslept() -> None:
+    evidence = Evidence(lambda: 0, MS, virtual=True)
+    evidence.waited(0, 0.02, 20 * MS)
+    evidence.waited(20 * MS, 0.02, 90 * MS)
+    evidence.waited(90 * MS, 0.02, 90 * MS + 10)
+    assert evidence.facts(0, 0, 100 * MS, 0).spans == (
+        Span(IDLE, 0, 40 * MS),  # two waits with nothing of note between them
+        Span(OVERSLEPT, 40 * MS, 90 * MS),
+        Span(IDLE, 90 * MS, 90 * MS + 10),
+    )
+
+
+def test_samples_around_a_stretch_of_time_are_compared() -> None:
+    evidence = Evidence(time.perf_counter_ns, MS)
+    evidence.watch([None])
+    begin = time.perf_counter_ns()
+    deadline = time.thread_time_ns() + 30 * MS
+    while time.thread_time_ns() < deadline:
+        pass
+    end = time.perf_counter_ns()
+    patience = time.monotonic() + 10
+    known = evidence.facts(begin, begin, end, 0)  # nothing was read since: it reads, or the other thread is at it
+    while known.cpu_ns < 20 * MS and time.monotonic() < patience:
+        time.sleep(0.05)
+        known = evidence.facts(begin, begin, end, 0)
+    evidence.close()
+    assert known.cpu_ns >= 20 * MS  # the kernel counts in steps of some ms while a thread goes on
+    assert known.run_delay_ns >= 0
+    assert known.steal_ns >= 0
+    assert known.switches >= 0
+
+
+def test_memory_is_bounded() -> None:
+    evidence = Evidence(lambda: 0, MS, virtual=True)
+    for number in range(10_000):
+        evidence.worked(DISK, number * MS, number * MS + MS)
+        evidence.stamped(Stamped(None, None, number * MS, number * MS))
+    known = evidence.facts(0, 0, 10**13, 0)
+    assert len(known.spans) == 1024
+    assert len(known.stamped) == 64
+
+
+@pytest.mark.parametrize(
+    ("faults", "causes"),
+    [
+        ("", set()),
+        ("stall:60ms/300ms", {"link"}),
+        ("late:60ms/300ms", {"device"}),
+        ("pause:60ms/300ms", {"host"}),
+        ("loss:0.02", {"link"}),
+    ],
+)
+def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, causes: set[str], tmp_path: Path) -> None:
+    profile, bundle, plan = grid_setup("sequential")
+    config = RunConfig(n_cycles=8000, deadline_us=10_000.0, realtime=False)
+    core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
+    path = tmp_path / "run.pansrec"
+    with Recorder(path, {}) as recorder:
+        link = open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}")
+        result = run_live(link, profile, bundle, plan, core, config, recorder)
+        recorder.close({})
+    assert result.ended == "completed"
+    assert set(result.late_cause) | set(result.lost_cause) == causes
+    assert sum(result.late_cause.values()) == result.timing.late
+    assert sum(result.lost_cause.values()) == result.stream["lost_exposures"]
+    verdicts = [event for event in read_recording(path).events() if event["kind"] == "blame"]
+    assert sum(event.get("decisions", 0) for event in verdicts) == result.timing.late
+    if faults and "loss" not in faults:
+        assert len(verdicts) > 1
+        assert all(event["sure"] for event in verdicts), [event["why"] for event in verdicts]
+
+
+@pytest.mark.parametrize(("shots", "dark"), [(1, 0), (3, 1), (5, 2)])
+@pytest.mark.parametrize("order", ["pattern-major", "shot-major"])
+def test_the_longest_pause_between_blocks(shots: int, dark: int, order: str) -> None:
+    levels = np.zeros((4, 9), np.uint16)
+    levels[:, 0] = 123
+    table = np.zeros((16, 2), np.float32)
+    bundle = make_bundle(
+        name="p", task="p", classes=("a", "b"), image_shape=(3, 3), levels=124, pattern_levels=levels,
+        photons_per_level=8.0 / 123, table=table, provenance={},
+    )  # fmt: skip
+    plan = build_plan(
+        load_profile("oled-qcmos"), bundle, shots_per_object=shots, dark_slots_per_cycle=dark, order=order
+    )
+    ends, length = [], 0
+    for cycle in range(2):
+        for slot in range(plan.slots_per_cycle):
+            length += 1
+            here = int(plan.slot_offset_ticks[slot])
+            last = slot + 1 == plan.slots_per_cycle
+            step = 0 if last else int(plan.slot_offset_ticks[slot + 1]) - here
+            if last or length == plan.block_exposures or step != plan.slot_period_ticks:
+                ends.append(cycle * plan.cycle_ticks + here)
+                length = 0
+    naive = max(after - before for before, after in pairwise(ends))
+    assert longest_pause_ns(plan) == pytest.approx(naive * plan.tick_us * 1000, abs=1)

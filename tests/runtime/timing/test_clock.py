@@ -1,0 +1,144 @@
+"""The clock model against simulated crystals and links; a fake clock throughout."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pans.firmware_sim.trials.clock import CASES, REQUIRED, run_clock_case
+from pans.runtime.errors import LinkError
+from pans.runtime.timing.clock import CLOCK_DTYPE, ClockModel, unwrap_tick
+
+TICK_HZ = 10_000_000
+NS_PER_TICK = 100
+
+
+def simulate(
+    drift_ppm: float, offset_ticks: int, seconds: float, seed: int, jitter_us: float = 30.0
+) -> tuple[list[float], list[float]]:
+    """Probe every 97 ms over a jittery, asymmetric link; return true errors and published uncertainties, in ns."""
+    rng = np.random.default_rng(seed)
+    rate = 1 + drift_ppm * 1e-6
+    model = ClockModel(TICK_HZ)
+    errors, bounds = [], []
+
+    def tick_at(host_ns: int) -> int:
+        return offset_ticks + int(host_ns * rate / NS_PER_TICK)
+
+    for step in range(16 + int(seconds / 0.097)):
+        sent = 5_000_000_000 + (step * 1_000_000 if step < 16 else step * 97_000_000)
+        out, back = (40_000 + rng.exponential(jitter_us * 1000, 2)).astype(int)
+        arrived = sent + int(out)
+        model.add_probe(sent, tick_at(arrived), tick_at(arrived + 20_000), arrived + 20_000 + int(back))
+        when = arrived + int(rng.integers(0, 97_000_000))
+        host_ns, bound = model.to_host_ns(tick_at(when))
+        errors.append(abs(host_ns - when))
+        bounds.append(bound)
+    return errors, bounds
+
+
+@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 20.0, 100.0])
+@pytest.mark.parametrize("offset_ticks", [0, 2**31 - 5, 2**62])
+def test_the_true_error_lies_within_the_published_uncertainty(drift_ppm: float, offset_ticks: int) -> None:
+    errors, bounds = simulate(drift_ppm, offset_ticks, 60.0, seed=1)
+    assert np.mean(np.array(errors) <= np.array(bounds)) >= 0.999
+    assert np.median(errors[100:]) < 30_000
+    assert np.median(bounds[100:]) < 120_000
+
+
+def test_the_drift_is_found() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(100):
+        sent = step * 97_000_000
+        tick = int((sent + 50_000) * (1 + 37e-6) / NS_PER_TICK)
+        model.add_probe(sent, tick, tick, sent + 100_000)
+    assert model.fit is not None
+    assert model.fit.drift_ppm == pytest.approx(-37.0, abs=0.5)  # host time per device time runs slow by as much
+
+
+def test_ticks_and_times_convert_both_ways_without_losing_digits() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(50):
+        sent = 2**60 + step * 97_000_000
+        tick = 2**61 + (sent + 50_000) // NS_PER_TICK
+        model.add_probe(sent, tick, tick, sent + 100_000)
+    host_ns = 2**60 + 5_000_000_000
+    assert abs(model.to_host_ns(model.to_tick(host_ns))[0] - host_ns) <= NS_PER_TICK
+
+
+def test_slow_probes_do_not_pull_the_line() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(60):
+        sent = step * 97_000_000
+        late = 20_000_000 if step % 2 else 0  # every other answer waits 20 ms on the way back
+        tick = (sent + 50_000) // NS_PER_TICK
+        model.add_probe(sent, tick, tick, sent + 100_000 + late)
+    host_ns, bound = model.to_host_ns(5_000_000_000 // NS_PER_TICK)
+    assert abs(host_ns - 5_000_000_000) < 60_000
+    assert bound < 200_000
+
+
+def test_before_the_first_probe_nothing_is_converted() -> None:
+    with pytest.raises(LinkError, match="no probe"):
+        ClockModel(TICK_HZ).to_host_ns(0)
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_coverage_under_drift_wander_jitter_and_asymmetry(case: object) -> None:
+    """A short form of `python -m pans.firmware_sim.trials.clock`."""
+    row = run_clock_case(case, 40.0, 7)  # type: ignore[arg-type]
+    assert row["within"] >= REQUIRED
+    assert row["steps"] == 0
+    assert row["error_us_median"] < row["uncertainty_us_median"]
+
+
+def test_an_uncertainty_that_is_too_small_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = ClockModel.to_host_ns
+
+    def proud(self: ClockModel, tick: int) -> tuple[int, int]:
+        host_ns, bound = original(self, tick)
+        return host_ns, bound // 2
+
+    monkeypatch.setattr(ClockModel, "to_host_ns", proud)
+    asymmetric = next(case for case in CASES if "asymmetric" in case.name)
+    assert run_clock_case(asymmetric, 40.0, 7)["within"] < REQUIRED
+
+
+def probed(model: ClockModel, step: int, jump_ticks: int = 0) -> object:
+    sent = step * 97_000_000
+    tick = (sent + 50_000) // NS_PER_TICK + jump_ticks
+    return model.add_probe(sent, tick, tick, sent + 100_000)
+
+
+def test_a_counter_that_jumps_starts_a_new_epoch_and_is_told() -> None:
+    model = ClockModel(TICK_HZ)
+    assert all(probed(model, step) is None for step in range(30))
+    step = probed(model, 30, 50_000)  # 5 ms ahead
+    assert step is not None
+    assert step.off_ns == pytest.approx(-5_000_000, abs=200_000)  # type: ignore[attr-defined]
+    assert model.epoch == 1
+    for later in range(31, 40):
+        assert probed(model, later, 50_000) is None
+    host_ns, bound = model.to_host_ns(39 * 970_000 + 50_000)
+    assert abs(host_ns - 39 * 97_000_000) < bound < 500_000
+
+
+def test_every_probe_is_kept_for_the_recording_once() -> None:
+    model = ClockModel(TICK_HZ)
+    for step in range(10):
+        probed(model, step)
+    samples = model.take_samples()
+    assert samples.dtype == CLOCK_DTYPE
+    assert samples["host_ns"].tolist() == [step * 97_000_000 + 50_000 for step in range(10)]
+    assert len(model.take_samples()) == 0
+
+
+@pytest.mark.parametrize("bits", [8, 32])
+def test_a_narrow_counter_is_extended_over_its_wraps(bits: int) -> None:
+    latest = 0
+    for true in range(0, 5 << bits, (1 << bits) // 3):
+        latest = unwrap_tick(true % (1 << bits), latest, bits)
+        assert latest == true
+        assert unwrap_tick((true - 1) % (1 << bits), latest, bits) == max(true - 1, (true - 1) % (1 << bits))
+    with pytest.raises(ValueError, match="does not fit"):
+        unwrap_tick(1 << bits, 0, bits)

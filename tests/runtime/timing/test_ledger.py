@@ -1,0 +1,93 @@
+"""Histograms against sorted samples, lateness and blame, and the real-time set-up's way back."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import numpy as np
+import pytest
+
+from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, _upper_edge, arm_realtime
+
+
+def test_buckets_tile_the_integers() -> None:
+    for bucket in range(2000):
+        histogram = LatencyHistogram()
+        edge = _upper_edge(bucket)
+        histogram.add(edge)
+        assert histogram.counts[bucket] == 1
+        histogram.add(edge + 1)
+        assert histogram.counts[bucket + 1] == 1
+
+
+@pytest.mark.parametrize("low_high", [(0, 1), (0, 3), (2, 9)])
+def test_quantiles_are_at_most_3_2_percent_high(low_high: tuple[int, int]) -> None:
+    samples = (10 ** np.random.default_rng(1).uniform(*low_high, 5000)).astype(int)
+    histogram = LatencyHistogram()
+    for value in samples.tolist():
+        histogram.add(value)
+    ranked = np.sort(samples)
+    for q in (0.001, 0.5, 0.99, 0.999, 1.0):
+        exact = int(ranked[max(1, int(np.ceil(q * len(ranked)))) - 1])
+        assert exact <= histogram.quantile_ns(q) <= exact * (1 + 1 / 31) + 1
+    assert histogram.max_ns == ranked[-1]
+    assert histogram.quantile_ns(1.0) == ranked[-1]
+
+
+def test_extreme_durations() -> None:
+    histogram = LatencyHistogram()
+    assert histogram.summary() == {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
+    histogram.add(-5)  # an arrival before its own exposure ended: clock uncertainty
+    histogram.add(2**62)
+    assert histogram.quantile_ns(0.5) == 0
+    assert histogram.max_ns == 2**62
+    assert len(histogram.counts) == N_BUCKETS
+
+
+def test_a_decision_is_late_only_beyond_the_clocks_uncertainty() -> None:
+    ledger = TimingLedger(deadline_ns=1000)
+    assert not ledger.judge((0, 100, 200, 1000, 1100), 0)
+    assert not ledger.judge((0, 100, 200, 1050, 1100), 50)
+    assert ledger.judge((0, 100, 200, 1051, 1100), 50)
+    assert ledger.late == 1
+
+
+@pytest.mark.parametrize(
+    ("marks", "stage"),
+    [((0, 5000, 5001, 5002, 5003), "link"), ((0, 1, 5000, 5001, 5002), "decode"), ((0, 1, 2, 5000, 5001), "decide")],
+)
+def test_blame_goes_to_the_slowest_stage(marks: tuple[int, int, int, int, int], stage: str) -> None:
+    ledger = TimingLedger(deadline_ns=1000)
+    assert ledger.judge(marks, 0)
+    assert ledger.blame == {stage: 1}
+
+
+def test_recording_is_not_part_of_the_deadline() -> None:
+    ledger = TimingLedger(deadline_ns=1000)
+    assert not ledger.judge((0, 1, 2, 3, 10_000), 0)
+    assert ledger.stages["record"].max_ns == 9997
+
+
+def test_the_realtime_set_up_is_undone() -> None:
+    interval = sys.getswitchinterval()
+    with arm_realtime(True) as granted:
+        assert not gc.isenabled()
+        assert granted["gc_off"] == "granted"
+        assert (
+            granted["sched_fifo"] == "granted"
+            or "refused" in granted["sched_fifo"]
+            or "no SCHED_FIFO" in granted["sched_fifo"]
+        )
+        assert granted["mlockall"]
+    assert gc.isenabled()
+    assert sys.getswitchinterval() == interval
+    if sys.platform == "linux":
+        import os
+
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_without_asking_nothing_is_asked_for() -> None:
+    with arm_realtime(False) as granted:
+        assert set(granted) == {"gc_off", "switch_interval_s"}

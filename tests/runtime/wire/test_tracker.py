@@ -1,0 +1,143 @@
+"""Loss accounting: every exposure arrives once or is in exactly one gap, whatever the link does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.messages import ClickBlock, Frame, FrameDecoder, Mark
+from pans.runtime.wire.tracker import Gap, StreamTracker
+
+
+def clicks(seq: int, first: int, n: int, drops: int = 0) -> Frame:
+    block = ClickBlock(seq % (1 << 32), drops, 10 * first, first, 10, 0, np.zeros(n, np.uint16), np.ones(n, np.uint8))
+    return FrameDecoder().feed(wire.encode_clicks(block, 1))[0]
+
+
+def mark(seq: int) -> Frame:
+    return FrameDecoder().feed(wire.encode_mark(Mark(seq, 3, 1, 0, 0, 0.0), 1))[0]
+
+
+def test_an_undisturbed_stream_has_no_gaps() -> None:
+    tracker = StreamTracker()
+    for seq in range(5):
+        block, gap = tracker.accept(clicks(seq, 4 * seq, 4))
+        assert block is not None
+        assert gap is None
+    assert (tracker.counters.exposures, tracker.counters.gaps, tracker.next_exposure) == (20, 0, 20)
+
+
+def test_a_lost_message_is_a_gap_with_its_exposures() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    _, gap = tracker.accept(clicks(2, 8, 4))
+    assert gap == Gap(first_exposure=4, exposures=4, messages=1, dropped_by_device=0)
+
+
+def test_what_the_device_dropped_is_told_apart() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    _, gap = tracker.accept(clicks(1, 10, 4, drops=6))
+    assert gap == Gap(4, 6, 0, 6)
+    assert (tracker.counters.lost_exposures, tracker.counters.device_drops, tracker.counters.lost_messages) == (6, 6, 0)
+
+
+def test_a_lost_mark_is_a_lost_message_but_no_gap() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    block, gap = tracker.accept(clicks(2, 4, 4))
+    assert block is not None
+    assert gap is None
+    assert tracker.counters.lost_messages == 1
+    assert tracker.accept(mark(3))[0] == Mark(3, 3, 1, 0, 0, 0.0)
+
+
+def test_repeated_and_overtaken_messages_are_dropped() -> None:
+    tracker = StreamTracker()
+    for frame in (clicks(0, 0, 4), clicks(2, 8, 4)):
+        tracker.accept(frame)
+    assert tracker.accept(clicks(1, 4, 4)) == (None, None)
+    assert tracker.accept(clicks(2, 8, 4)) == (None, None)
+    assert tracker.counters.repeated == 2
+    assert tracker.accept(clicks(3, 12, 4))[1] is None
+
+
+def test_sequence_and_drop_counters_wrap() -> None:
+    tracker = StreamTracker()
+    tracker.next_seq = 2**32 - 1
+    tracker._drops = 2**32 - 2
+    assert tracker.accept(clicks(2**32 - 1, 0, 4, drops=2**32 - 2))[1] is None
+    _, gap = tracker.accept(clicks(2**32, 9, 1, drops=3))
+    assert gap == Gap(4, 5, 0, 5)
+    assert tracker.next_seq == 1
+
+
+def test_exposures_beyond_32_bits() -> None:
+    tracker = StreamTracker()
+    tracker.next_exposure = 2**40
+    _, gap = tracker.accept(clicks(0, 2**40 + 3, 2))
+    assert gap == Gap(2**40, 3, 0, 0)
+
+
+def test_a_device_that_counts_backwards_cannot_rewrite_the_past() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 8))
+    assert tracker.accept(clicks(1, 4, 8)) == (None, None)
+    assert tracker.counters.malformed == 1
+
+
+def test_damage_is_counted() -> None:
+    tracker = StreamTracker()
+    assert tracker.accept(Frame(wire.MessageType.CLICKS, 0, 1, b"too short")) == (None, None)
+    assert tracker.accept(Frame(wire.MessageType.STATUS, 0, 1, b"")) == (None, None)
+    assert tracker.counters.malformed == 2
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    fates=st.lists(st.sampled_from(["arrives", "lost", "dropped", "twice", "late"]), min_size=1, max_size=40),
+    size=st.integers(1, 5),
+)
+def test_every_exposure_arrives_once_or_is_lost_once(fates: list[str], size: int) -> None:
+    tracker = StreamTracker()
+    arrived: list[int] = []
+    lost: list[int] = []
+    seq = drops = 0
+    overtaken: list[Frame] = []
+    for number, fate in enumerate(fates):
+        first = number * size
+        if fate == "dropped":  # on the device: no sequence number, but the counter says so
+            drops += size
+            continue
+        frame = clicks(seq, first, size, drops)
+        seq += 1
+        if fate == "lost":
+            continue
+        if fate == "late":
+            overtaken.append(frame)
+            continue
+        for sent in [frame] * (2 if fate == "twice" else 1) + overtaken:
+            block, gap = tracker.accept(sent)
+            if gap is not None:
+                lost += range(gap.first_exposure, gap.first_exposure + gap.exposures)
+            if isinstance(block, ClickBlock):
+                arrived += range(block.exposure_index, block.exposure_index + len(block.patterns))
+        overtaken = []
+    last = tracker.finish(len(fates) * size, drops)
+    if last is not None:
+        lost += range(last.first_exposure, last.first_exposure + last.exposures)
+    assert sorted(arrived + lost) == list(range(len(fates) * size))
+    assert tracker.counters.lost_exposures == len(lost)
+    assert tracker.counters.exposures == len(arrived)
+
+
+@pytest.mark.parametrize("n_features", [3])
+def test_frame_blocks_count_as_exposures(n_features: int) -> None:
+    tracker = StreamTracker()
+    words = np.ones((6, 1), np.uint8)
+    frame = FrameDecoder().feed(wire.encode_frames(wire.FrameBlock(0, 0, 0, 2, 1, 0, words), 1))[0]
+    assert tracker.accept(frame)[1] == Gap(0, 2, 0, 0)
+    assert tracker.next_exposure == 8

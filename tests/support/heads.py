@@ -1,0 +1,79 @@
+"""Heads and bundles for tests, made by hand: chains of layers as ONNX without a trainer."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.layers import Layer
+from pans.runtime.bundle.model import Bundle, make_bundle
+
+
+def random_layers(sizes: list[int], seed: int = 0) -> tuple[Layer, ...]:
+    """Layers with weights of the size that training starts from, rectified but for the last."""
+    rng = np.random.default_rng(seed)
+    return tuple(
+        Layer(
+            (rng.normal(size=(n_in, n_out)) * np.sqrt(2 / n_in)).astype(np.float32),
+            (rng.normal(size=n_out) * 0.3).astype(np.float32),
+            number < len(sizes) - 2,
+        )
+        for number, (n_in, n_out) in enumerate(pairwise(sizes))
+    )
+
+
+def onnx_chain(layers: tuple[Layer, ...], style: str = "gemm", float_data: bool = False) -> bytes:
+    """`layers` as a model in one of the ways that exporters write them: gemm, transposed or matmul."""
+    pytest.importorskip("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes: list[Any] = []
+    weights: list[Any] = []
+
+    def constant(name: str, array: np.ndarray) -> str:
+        if float_data:
+            weights.append(helper.make_tensor(name, TensorProto.FLOAT, array.shape, array.ravel().tolist()))
+        else:
+            weights.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    current = "means"
+    for number, layer in enumerate(layers):
+        following = "scores" if number == len(layers) - 1 else f"sums{number}"
+        if style == "matmul":
+            nodes.append(helper.make_node("MatMul", [current, constant(f"w{number}", layer.weights)], [f"p{number}"]))
+            nodes.append(helper.make_node("Add", [f"p{number}", constant(f"b{number}", layer.bias)], [following]))
+        else:
+            matrix = layer.weights.T if style == "transposed" else layer.weights
+            names = [current, constant(f"w{number}", matrix), constant(f"b{number}", layer.bias)]
+            nodes.append(helper.make_node("Gemm", names, [following], transB=int(style == "transposed")))
+        current = following
+        if layer.relu:
+            nodes.append(helper.make_node("Relu", [current], [f"hidden{number}"]))
+            current = f"hidden{number}"
+    n_in, n_out = layers[0].weights.shape[0], layers[-1].weights.shape[1]
+    source = helper.make_tensor_value_info("means", TensorProto.FLOAT, ["n", n_in])
+    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", n_out])
+    graph = helper.make_graph(nodes, "head", [source], [result], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
+
+
+def head_bundle(layers: tuple[Layer, ...], **parts: Any) -> Bundle:
+    """A bundle whose head is `layers`; its patterns are one pixel each."""
+    n_features, n_classes = layers[0].weights.shape[0], layers[-1].weights.shape[1]
+    return make_bundle(
+        name="chain",
+        task="test",
+        classes=[f"c{i}" for i in range(n_classes)],
+        image_shape=(1, 1),
+        levels=2,
+        pattern_levels=np.ones((n_features, 1), dtype=np.int64),
+        photons_per_level=1.0,
+        provenance={},
+        head_onnx=onnx_chain(layers),
+        **parts,
+    )

@@ -1,0 +1,32 @@
+"""Small scenes that move, and a program that looks at them: for tests of scenes and of the device."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.scene.moving import Cells, Tape
+from pans.firmware_sim.scene.still import Scene, scene_from_arrays
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.commands import PARALLEL
+
+FLOW = load_profile("flow-snspd")
+TICK_HZ = FLOW.clock.tick_hz
+RNG = np.random.default_rng(11)
+PICTURES: Scene = scene_from_arrays(
+    "noise", RNG.integers(0, 256, (5, 6, 8), dtype=np.uint8), np.array([0, 1, 2, 1, 0]), ("a", "b", "c")
+)
+LEVELS = np.where(RNG.random((3, 48)) < 0.4, RNG.integers(1, 256, (3, 48)), 0).astype(np.uint16)
+CELLS = Cells(PICTURES, 5e4, 40_000.0, 0.2, 2)
+TAPE = Tape(10, 4, 50_000.0, 0.03, 1e-3)
+BAR_LEVELS = np.where(RNG.random((3, 80)) < 0.4, RNG.integers(1, 256, (3, 80)), 0).astype(np.uint16)
+
+
+def program(
+    n_slots: int = 16, exposure: int = 200, period: int = 250, dark: tuple[int, ...] = (), gap: int = 0
+) -> Program:
+    shown = np.zeros(n_slots, np.uint16)
+    shown[list(dark)] = wire.DARK_PATTERN
+    offsets = np.arange(n_slots, dtype=np.int64) * period
+    return Program(PARALLEL, 3, exposure, period, n_slots * period + gap, 1, offsets, shown, ((0, n_slots),))

@@ -1,0 +1,450 @@
+"""The alternatives to PANS: equal photons, exact posteriors against loops and closed forms, networks that learn, the command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import naive_baselines
+import numpy as np
+import pytest
+
+from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
+from pans.runtime.errors import UsageError
+from pans.trainer.baselines import bayes as baseline_bayes
+from pans.trainer.baselines import common as baselines
+from pans.trainer.baselines.bayes import FLOORS, bayes, choose_floor, log_joint
+from pans.trainer.baselines.common import Trials, detect, measure, run_trials
+from pans.trainer.baselines.compressive import patterns, walsh
+from pans.trainer.tasks.registry import Objects, Task, load_task
+
+SIDE = 8
+
+
+def bars(n: int, seed: int) -> Objects:
+    """Vertical and horizontal bars and spots on a faint, uneven ground."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 3, n)
+    images = rng.integers(0, 40, (n, SIDE, SIDE))
+    for image, label in zip(images, labels):
+        at, bright = rng.integers(1, SIDE - 1), rng.integers(150, 216)
+        if label == 0:
+            image[:, at] += bright
+        elif label == 1:
+            image[at, :] += bright
+        else:
+            image[at - 1 : at + 2, at - 1 : at + 2] += bright
+    return Objects(images.astype(np.uint8), labels.astype(np.int64))
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return Task("bars", ("|", "-", "o"), bars(1500, 1), bars(240, 2), "0" * 64, "made here")
+
+
+def two_pixels(*grays: tuple[int, int]) -> Task:
+    """One object per class, to train on and to test on."""
+    images = np.array(grays, np.uint8)[:, None, :]
+    objects = Objects(images, np.arange(len(grays)))
+    return Task("pixels", tuple(map(str, range(len(grays)))), objects, objects, "0" * 64, "made here")
+
+
+# ---- light ----
+
+
+@pytest.mark.parametrize("features", [None, 6])
+def test_one_source_gives_the_photons_on_average_and_bright_objects_more(task: Task, features: int | None) -> None:
+    weights = None if features is None else patterns("binary", features, task.image_shape, 0)
+    measurement = measure(task, weights, "source")
+    light = measurement.photoelectrons(measurement.test, 17.0)
+    assert light.sum(axis=1).mean() == pytest.approx(17, rel=1e-6)
+    assert light.sum(axis=1).std() > 0.5
+    shown = np.ones((1, SIDE * SIDE)) if weights is None else weights
+    bright = (task.test.images.reshape(len(task.test), -1) / 255) @ shown.sum(axis=0)
+    np.testing.assert_allclose(light.sum(axis=1), 17 * bright / bright.mean(), rtol=1e-5)
+    # the sum of the patterns: what a transmission of 1 everywhere would give
+    assert measurement.illumination(17.0) == pytest.approx(17 * shown.sum() / bright.mean(), rel=1e-5)
+
+
+def test_a_source_that_follows_the_object_gives_every_object_the_photons(task: Task) -> None:
+    measurement = measure(task, None, "object")
+    light = measurement.photoelectrons(measurement.test, 17.0)
+    np.testing.assert_allclose(light.sum(axis=1), 17, rtol=1e-5)
+    brightness = task.test.images.reshape(len(task.test), -1).sum(axis=1) / 255
+    assert measurement.illumination(17.0) == pytest.approx(float(np.mean(17 / brightness)) * SIDE**2, rel=1e-5)
+
+
+@pytest.mark.parametrize("brightness", baselines.BRIGHTNESS)
+def test_a_black_object_stays_dark(brightness: str) -> None:
+    measurement = measure(two_pixels((0, 0), (255, 0)), None, brightness)
+    assert measurement.photoelectrons(measurement.test, 5.0)[0].tolist() == [0.0, 0.0]
+
+
+def test_what_cannot_be_measured_is_refused(task: Task) -> None:
+    with pytest.raises(UsageError, match="black"):
+        measure(two_pixels((0, 0), (0, 0)), None)
+    for wrong in (np.ones((2, 5)), -np.ones((2, 64)), np.zeros((2, 64))):
+        with pytest.raises(UsageError, match="at least 0"):
+            measure(task, wrong)
+    with pytest.raises(UsageError, match="source, object"):
+        measure(task, None, "sun")
+
+
+def test_detectors_have_the_mean_and_variance_of_their_law() -> None:
+    light, n = np.full(200_000, 0.7, np.float32), 200_000
+    counts = detect(light, "counting", np.random.default_rng(0), dark=0.3)
+    clicks = detect(light, "binary", np.random.default_rng(0), dark=0.3)
+    assert counts.mean() == pytest.approx(1.0, abs=5 / math.sqrt(n))
+    assert counts.var() == pytest.approx(1.0, abs=5 * math.sqrt(3 / n))  # fourth central moment of Poisson(1) is 4
+    p = 1 - math.exp(-1.0)
+    assert set(np.unique(clicks)) == {0.0, 1.0}
+    assert clicks.mean() == pytest.approx(p, abs=5 * math.sqrt(p * (1 - p) / n))
+
+
+# ---- the exact posterior ----
+
+
+@pytest.mark.parametrize("detector", baselines.DETECTORS)
+@pytest.mark.parametrize("brightness", baselines.BRIGHTNESS)
+@pytest.mark.parametrize(("floor", "dark"), [(1e-3, 0.0), (0.02, 0.1), (0.0, 0.05)])
+def test_the_posterior_is_that_of_plain_loops(
+    task: Task, detector: str, brightness: str, floor: float, dark: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(baselines, "_BLOCK", 7)
+    monkeypatch.setattr(baseline_bayes, "_CHUNK", 4)
+    few = Task("bars", task.classes, bars(40, 3), bars(9, 4), "0" * 64, "made here")
+    measurement = measure(few, None, brightness)
+    light = measurement.photoelectrons(measurement.test, 6.0)
+    readouts = detect(light, detector, np.random.default_rng(5), dark)
+    found = log_joint(measurement, readouts, 6.0, detector, floor=floor, dark=dark)
+    posterior = np.exp(found - np.logaddexp.reduce(found, axis=1, keepdims=True))
+    shown = few.train.images.reshape(40, -1) / 255 + floor
+    total = few.test.images.sum() / 255 / 9 if brightness == "source" else shown.sum(axis=1, keepdims=True)
+    lights = (6.0 * shown / total + dark).tolist()
+    for row, readout in zip(posterior, readouts.tolist()):
+        wanted = naive_baselines.posterior(readout, lights, few.train.labels.tolist(), 3, detector)
+        np.testing.assert_allclose(row, wanted, atol=2e-5)
+
+
+def test_bayes_reaches_the_closed_form_of_two_objects() -> None:
+    pair = two_pixels((204, 51), (51, 204))
+    many = Objects(pair.test.images.repeat(2000, axis=0), pair.test.labels.repeat(2000))
+    measurement = measure(Task("pixels", pair.classes, pair.train, many, "0" * 64, "made here"), None)
+    decide, _ = bayes(measurement, 3.0, "counting", seed=0, floor=1e-9)
+    trials = run_trials(measurement, 3.0, "counting", decide, trials=10, seed=1)
+    # right if the bright pixel (2.4) counts more than the dim one (0.6); half right, for one of two objects, on a tie
+    log_p = [[n * math.log(rate) - rate - math.lgamma(n + 1) for n in range(60)] for rate in (2.4, 0.6)]
+    p, q = (np.exp(row) for row in log_p)
+    exact = float(np.tril(np.outer(p, q), -1).sum() + 0.5 * (p * q).sum())
+    assert abs(trials.right.mean() - exact) < 5 * math.sqrt(exact * (1 - exact) / trials.right.size)
+
+
+def test_at_a_million_photons_float32_still_finds_the_object() -> None:
+    rng = np.random.default_rng(6)
+    images = rng.integers(100, 104, (50, 10, 10)).astype(np.uint8)
+    objects = Objects(images, np.arange(50))
+    task = Task("alike", tuple(map(str, range(50))), objects, objects, "0" * 64, "made here")
+    measurement = measure(task, None)
+    decide, _ = bayes(measurement, 1e7, "counting", seed=0, floor=1e-6)
+    assert run_trials(measurement, 1e7, "counting", decide, trials=1, seed=0).right.all()
+
+
+def test_a_class_without_training_objects_is_never_decided(task: Task) -> None:
+    keep = task.train.labels != 1
+    part = Objects(task.train.images[keep], task.train.labels[keep])
+    measurement = measure(Task("bars", task.classes, part, task.test, "0" * 64, "made here"), None)
+    decide, _ = bayes(measurement, 20.0, "binary", seed=0, floor=1e-3)
+    assert set(decide(measurement.photoelectrons(measurement.test, 20.0))) == {0, 2}
+
+
+def test_zero_transmission_without_dark_counts_is_refused(task: Task) -> None:
+    with pytest.raises(UsageError, match="must be above 0"):
+        log_joint(measure(task, None), np.zeros((1, 64), np.float32), 5.0, "counting", floor=0.0)
+
+
+def test_the_floor_is_chosen_without_the_test_labels(task: Task) -> None:
+    other = Objects(task.test.images, task.test.labels[::-1].copy())
+    wrong = Task(task.name, task.classes, task.train, other, task.sha256, task.split)
+    chosen = [choose_floor(measure(one, None), 30.0, "counting", np.random.default_rng(7)) for one in (task, wrong)]
+    assert chosen[0] == chosen[1]
+    assert chosen[0] in FLOORS
+
+
+# ---- the score ----
+
+
+def test_spreads_over_trials_and_over_objects_are_kept_apart() -> None:
+    right = np.zeros((4, 300), bool)
+    right[:, :150] = True  # the same objects every time: no spread over trials, much over objects
+    measured = Trials(right, np.full(300, 2.0), np.full(300, 3.0), 7.0).measured()
+    assert (measured.accuracy_mean, measured.accuracy_std) == (0.5, 0.0)
+    assert measured.accuracy_se_objects == pytest.approx(math.sqrt(0.25 / 299))
+    assert (measured.clicks_mean, measured.photons_mean, measured.illumination) == (2.0, 3.0, 7.0)
+    whole = Trials(right.T.repeat(2, axis=1), np.full(8, 2.0), np.full(8, 3.0), 7.0).measured()
+    assert (whole.accuracy_se_objects, whole.trials) == (0.0, 300)
+    assert whole.accuracy_std == pytest.approx(math.sqrt(0.25 * 300 / 299))
+    first = Trials(right, np.arange(300.0), np.arange(300.0), 7.0).measured(200)
+    assert (first.objects, first.accuracy_mean, first.clicks_mean) == (200, 0.75, 99.5)
+
+
+def test_the_same_seed_gives_the_same_trials(task: Task) -> None:
+    measurement = measure(task, None)
+    decide, _ = bayes(measurement, 5.0, "binary", seed=0, floor=1e-3)
+    one, two, other = (run_trials(measurement, 5.0, "binary", decide, trials=2, seed=s) for s in (3, 3, 4))
+    assert np.array_equal(one.right, two.right)
+    assert not np.array_equal(one.right, other.right)
+    assert not np.array_equal(one.right[0], one.right[1])
+
+
+def test_counting_knows_at_least_what_clicks_know(task: Task) -> None:
+    measurement, accuracy = measure(task, None), {}
+    for detector in baselines.DETECTORS:
+        decide, _ = bayes(measurement, 200.0, detector, seed=0, floor=1e-3)
+        accuracy[detector] = run_trials(measurement, 200.0, detector, decide, trials=5, seed=0).measured()
+    counting, binary = accuracy["counting"], accuracy["binary"]
+    assert counting.clicks_mean == pytest.approx(binary.clicks_mean, rel=0.02)  # pixels that saw light, either way
+    assert counting.clicks_mean < 64 < counting.photons_mean
+    assert counting.accuracy_mean > binary.accuracy_mean + 5 * binary.accuracy_se_objects
+
+
+# ---- fixed patterns ----
+
+
+def test_walsh_functions_are_orthogonal_and_ordered() -> None:
+    functions = walsh(8)
+    assert np.array_equal(functions @ functions.T, 8 * np.eye(8))
+    assert (np.diff(functions, axis=1) != 0).sum(axis=1).tolist() == list(range(8))
+    assert walsh(28).shape == (32, 32)
+
+
+def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
+    every = patterns("hadamard", 64, (8, 8), 0)
+    signs = 2 * every - 1
+    assert np.array_equal(signs @ signs.T, 64 * np.eye(64))
+    assert set(np.unique(every)) == {0.0, 1.0}
+    assert every[0].all()
+    assert patterns("hadamard", 10, (28, 28), 0).shape == (10, 784)
+    with pytest.raises(UsageError, match="allowed for Walsh patterns of 8 x 8: 64"):
+        patterns("hadamard", 65, (8, 8), 0)
+
+
+def test_random_patterns_are_fair_coins_of_their_seed() -> None:
+    found = patterns("binary", 50, (28, 28), 1)
+    assert set(np.unique(found)) == {0.0, 1.0}
+    assert abs(found.mean() - 0.5) < 5 * 0.5 / math.sqrt(found.size)
+    assert np.array_equal(found, patterns("binary", 50, (28, 28), 1))
+    assert not np.array_equal(found, patterns("binary", 50, (28, 28), 2))
+    with pytest.raises(UsageError, match="binary, hadamard"):
+        patterns("gaussian", 5, (8, 8), 0)
+
+
+# ---- networks ----
+
+
+def test_networks_that_know_the_noise_beat_those_that_do_not(task: Task) -> None:
+    torch = pytest.importorskip("torch")
+    from pans.trainer.baselines.direct import aware_cnn, clean_cnn
+
+    before = torch.random.get_rng_state()
+    measurement = measure(task, None)
+    found, clean = {}, clean_cnn(measurement, seed=0, epochs=4)
+    for name, decide in (
+        ("aware", aware_cnn(measurement, 10.0, "counting", seed=0, epochs=4)),
+        ("clean", clean),
+        ("bayes", bayes(measurement, 10.0, "counting", seed=0, floor=1e-3)[0]),
+    ):
+        found[name] = run_trials(measurement, 10.0, "counting", decide, trials=4, seed=0).measured()
+    error = found["clean"].accuracy_se_objects
+    assert found["aware"].accuracy_mean > found["clean"].accuracy_mean + 5 * error
+    assert found["bayes"].accuracy_mean > found["clean"].accuracy_mean + 5 * error
+    assert run_trials(measurement, 1e6, "counting", clean, trials=1, seed=0).right.mean() > 0.9
+    assert torch.equal(before, torch.random.get_rng_state()), "the global generator belongs to the caller"
+
+
+def test_classifiers_of_fixed_patterns_learn_and_repeat(task: Task) -> None:
+    pytest.importorskip("torch")
+    from pans.trainer.baselines.compressive import aware_mlp, clean_mlp
+
+    measurement = measure(task, patterns("hadamard", 16, task.image_shape, 0))
+    aware = [aware_mlp(measurement, 300.0, "counting", seed=s, epochs=12) for s in (0, 0, 1)]
+    trials = [run_trials(measurement, 300.0, "counting", decide, trials=2, seed=0) for decide in aware]
+    assert trials[0].measured().accuracy_mean > 0.8
+    assert np.array_equal(trials[0].right, trials[1].right)
+    assert not np.array_equal(trials[0].right, trials[2].right)
+    at = clean_mlp(measurement, seed=0, epochs=12)
+    accuracy = {
+        n: run_trials(measurement, n, "counting", at(n, "counting"), trials=4, seed=0).measured().accuracy_mean
+        for n in (5.0, 1e6)
+    }
+    assert accuracy[1e6] > 0.85 > accuracy[5.0] + 0.2
+
+
+def test_the_quantiser_has_its_levels_and_passes_the_gradient() -> None:
+    torch = pytest.importorskip("torch")
+    from pans.trainer.baselines.e2e import quantised
+
+    values = torch.linspace(-0.5, 3.0, 500, dtype=torch.float64, requires_grad=True)
+    found = quantised(values, torch.tensor(2.0, dtype=torch.float64), 4)
+    assert len(found.unique()) == 16
+    assert (found.min(), found.max()) == (0, 2)
+    inside = (values > 0) & (values < 2)
+    assert (found - values)[inside].abs().max() <= 2 / 15 / 2 + 1e-12
+    found.sum().backward()
+    assert torch.equal(values.grad, inside.double())
+
+
+@pytest.mark.parametrize("bits", [4, None])
+def test_conventional_end_to_end_works_in_bright_light_only(task: Task, bits: int | None) -> None:
+    pytest.importorskip("torch")
+    from pans.trainer.baselines.e2e import measured_by, train_conventionally
+
+    model = train_conventionally(task, 6, seed=0, bits=bits, epochs=40)
+    measurement, at = measured_by(model, task, "source")
+    assert (measurement.full > 0).all()
+    accuracy = {}
+    for photons in (3.0, 1e6):
+        done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=3, seed=0)
+        accuracy[photons] = done.measured().accuracy_mean
+    assert accuracy[1e6] > 0.85
+    assert accuracy[3.0] < accuracy[1e6] - 0.2
+    binary = run_trials(measurement, 3.0, "binary", at(3.0, "binary"), trials=3, seed=0).measured()
+    assert binary.clicks_mean <= 6
+
+
+# ---- the command ----
+
+KEYS = {"accuracy_mean", "accuracy_std", "clicks_mean", "photons_mean", "illumination", "objects", "trials"}
+
+
+@pytest.fixture(scope="module")
+def task_file(task: Task, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("task") / "bars.npz"
+    arrays = {
+        f"{part}_{kind}": getattr(getattr(task, part), kind)
+        for part in ("train", "test")
+        for kind in ("images", "labels")
+    }
+    np.savez(path, **arrays)
+    return path
+
+
+def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, object]]:
+    code = main(["baseline", *map(str, words), "--json"])
+    answer = capsys.readouterr().out
+    return code, json.loads(answer) if answer else {}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("direct",),
+        ("direct", "--detector", "binary", "--brightness", "object", "--dark", 0.01),
+        ("direct", "--method", "cnn", "--epochs", 1),
+        ("direct", "--method", "clean-cnn", "--epochs", 1),
+        ("compressive", "--features", 8, "--epochs", 1),
+        ("compressive", "--features", 8, "--epochs", 1, "--method", "clean-mlp", "--detector", "binary"),
+        ("compressive", "--features", 8, "--method", "bayes", "--patterns", "hadamard"),
+        ("e2e", "--features", 4, "--epochs", 1),
+        ("e2e", "--features", 4, "--epochs", 1, "--method", "plain", "--detector", "binary"),
+    ],
+)
+def test_every_way_answers_with_the_keys_of_evaluate(
+    words: tuple[object, ...], task_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not (words[0] == "direct" and "--method" not in words):
+        pytest.importorskip("torch")
+    code, answer = called(capsys, *words, "--task", task_file, "--photons", 4, 40, "--trials", 2)
+    assert code == 0
+    rows = answer["rows"]
+    assert isinstance(rows, list)
+    for row in (answer, *rows, answer["first_200"]):
+        assert set(row) >= KEYS
+    assert [row["photons_asked"] for row in rows] == [4.0, 40.0]
+    assert [row["photons_mean"] for row in rows] == pytest.approx([4.0, 40.0], rel=1e-5)
+    assert rows[0]["illumination"] < rows[1]["illumination"]
+    assert rows[0]["clicks_mean"] < rows[1]["clicks_mean"]
+    assert (rows[0]["objects"], rows[0]["first_200"]["objects"], rows[0]["trials"]) == (240, 200, 2)
+    assert answer["simulated"] is True
+
+
+def test_fewer_objects(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--task", task_file, "--photons", 9, "--objects", 50, "--train-objects", 100, "--floor", 0.01)
+    _, answer = called(capsys, "direct", *words)
+    assert (answer["objects"], answer["train_objects"], answer["floor"]) == (50, 100, 0.01)
+
+
+def test_information_grows_with_the_photons(task_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--task", task_file, "--photons", 2, 20, "--trials", 1, "--floor", 0.01, "--information")
+    _, answer = called(capsys, "direct", *words)
+    low, high = answer["rows"]  # type: ignore[misc]
+    assert 0 < low["information"]["lower_bits"] < high["information"]["lower_bits"] < low["information"]["label_bits"]
+    assert 0 < low["fisher"]["trace"] < high["fisher"]["trace"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("direct", "--information", "--detector", "binary"),
+        ("direct", "--method", "mlp"),
+        ("e2e", "--method", "bayes"),
+        ("direct", "--photons", 0),
+        ("direct", "--photons", "nan"),
+        ("direct", "--trials", 0),
+        ("direct", "--floor", 0),
+        ("compressive", "--features", 0),
+        ("e2e", "--bits", 17),
+        ("direct", "--dark", -1),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    words: tuple[object, ...], task_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(["baseline", *map(str, words), "--task", str(task_file)])
+    assert code == EXIT_USAGE
+    assert "allowed" in capsys.readouterr().err
+
+
+def test_an_interrupt_keeps_the_levels_that_are_done(
+    task_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run_trials
+
+    def interrupted(measurement: object, photons: float, *rest: object, **named: object) -> Trials:
+        if photons > 10:
+            raise KeyboardInterrupt
+        return whole(measurement, photons, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(baselines, "run_trials", interrupted)
+    code, answer = called(capsys, "direct", "--task", task_file, "--photons", 4, 40)
+    assert code == EXIT_INTERRUPTED
+    assert answer["interrupted"] is True
+    assert [row["photons_asked"] for row in answer["rows"]] == [4.0]  # type: ignore[attr-defined]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "wanted"), [("fashion-mnist", (45.8, 73.8)), ("mnist", (51.3, 88.3))])
+def test_the_strong_baseline_is_as_strong_as_known(name: str, wanted: tuple[float, float], data_dir: Path) -> None:
+    whole = load_task(name, data_dir)
+    task = Task(name, whole.classes, whole.train, Objects(whole.test.images[:1000], whole.test.labels[:1000]), "", "")
+    measurement = measure(task, None)
+    for photons, accuracy in zip((5.0, 30.0), wanted):
+        decide, _ = bayes(measurement, photons, "counting", seed=0, floor=1e-3)
+        found = run_trials(measurement, photons, "counting", decide, trials=1, seed=0).measured()
+        # known from 3000 other readouts: both errors count
+        error = math.hypot(found.accuracy_se_objects, math.sqrt(accuracy / 100 * (1 - accuracy / 100) / 3000))
+        assert abs(found.accuracy_mean - accuracy / 100) < 5 * error
+
+
+def test_frames_of_a_field_are_intensities_and_take_no_patterns():
+    images = np.array([[[10, 20], [30, 40]], [[0, 5], [200, 255]]], np.uint8)
+    objects = Objects(images, np.array([0, 1]))
+    task = Task("field", ("a", "b"), objects, objects, "0" * 64, "", light="field")
+    measurement = measure(task, None)
+    light = measurement.photoelectrons(measurement.test, 100.0)
+    intensity = (images.astype(np.float64) / 255).reshape(2, 4) ** 2
+    np.testing.assert_allclose(light, intensity * (100 * 2 / intensity.sum()), rtol=1e-5)
+    lifted = measurement.photoelectrons(measurement.test, 100.0, floor=0.5)
+    assert lifted.sum() == pytest.approx(300)  # 200 of the objects, and half of their mean light on every pixel
+    with pytest.raises(UsageError, match="light that reaches us"):
+        measure(task, np.ones((2, 4)))

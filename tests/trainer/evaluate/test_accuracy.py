@@ -1,0 +1,130 @@
+"""Evaluation: exact against a loop over all words, sampled against exact, and what the options do."""
+
+import itertools
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.model import make_bundle
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of, outcome_probabilities
+
+RNG = np.random.default_rng(0)
+PROFILE = load_profile("oled-qcmos")
+LABELS = RNG.integers(0, 3, 60)
+IMAGES = RNG.integers(0, 256, (60, 4, 5), dtype=np.uint8)
+
+
+def bundle(d_f=4, seed=0):
+    rng = np.random.default_rng(seed)
+    return make_bundle(
+        name="small",
+        task="own",
+        classes=("a", "b", "c"),
+        image_shape=(4, 5),
+        levels=124,
+        pattern_levels=rng.integers(0, 124, (d_f, 20)),
+        photons_per_level=1e-3,
+        table=rng.normal(size=(1 << d_f, 3)),
+        provenance={},
+    )
+
+
+def head_bundle():
+    torch = pytest.importorskip("torch", reason="needs the train extra")
+    from pans.trainer.export.writer import head_onnx
+    from pans.trainer.model.heads import MlpHead
+
+    graph, _ = head_onnx(MlpHead(3, 8, 3, torch.Generator().manual_seed(0)), np.full(3, 0.4))
+    facts = {"name": "small", "task": "own", "classes": ("a", "b", "c"), "image_shape": (4, 5), "levels": 124}
+    levels = RNG.integers(0, 124, (3, 20))
+    return make_bundle(**facts, pattern_levels=levels, photons_per_level=1e-3, head_onnx=graph, provenance={})
+
+
+def test_outcomes_are_binomial_products():
+    p = RNG.uniform(size=(3, 2))
+    found = outcome_probabilities(p, 2)
+    for row, (first, second) in itertools.product(range(3), itertools.product(range(3), repeat=2)):
+        chances = [math.comb(2, k) * q**k * (1 - q) ** (2 - k) for k, q in zip((first, second), p[row])]
+        assert found[row, first + 3 * second] == pytest.approx(math.prod(chances), rel=1e-12)
+
+
+def test_exact_accuracy_is_the_sum_over_all_words():
+    model = bundle()
+    light = light_of(model, PROFILE, IMAGES)
+    right = 0.0
+    for p, label in zip(light.probability, LABELS):
+        for word in range(16):
+            chance = math.prod(p[i] if word >> i & 1 else 1 - p[i] for i in range(4))
+            right += chance * (int(model.table[word].argmax()) == label)
+    found = evaluate_exactly(model, light, LABELS)
+    assert found.accuracy_mean == pytest.approx(right / 60, rel=1e-10)
+    assert found.clicks_mean == pytest.approx(light.probability.sum(axis=1).mean())
+    assert found.photons_mean == pytest.approx(light.photoelectrons.sum(axis=1).mean())
+    assert found.illumination == pytest.approx(model.illumination())
+    assert found.trials == 0
+
+
+def test_light_is_pattern_times_transmission():
+    model = bundle()
+    floor = PROFILE.min_transmission
+    shown = floor + (1 - floor) * IMAGES.reshape(60, -1) / 255
+    assert light_of(model, PROFILE, IMAGES).photoelectrons == pytest.approx(shown @ model.patterns().T, rel=1e-10)
+
+
+@pytest.mark.parametrize("shots", [1, 3])
+def test_sampled_agrees_with_exact(shots):
+    model = head_bundle()
+    light = light_of(model, PROFILE, IMAGES)
+    exact = evaluate_exactly(model, light, LABELS, shots=shots)
+    sampled = evaluate_sampled(model, light, LABELS, shots=shots, trials=400, seed=1)
+    assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(400)
+    click_sigma = math.sqrt(shots * (light.probability * (1 - light.probability)).sum() / 60 / (60 * 400))
+    assert abs(sampled.clicks_mean - exact.clicks_mean) < 5 * click_sigma
+    assert sampled.photons_mean == exact.photons_mean
+    assert sampled.accuracy_std == pytest.approx(exact.accuracy_std, rel=5 / math.sqrt(2 * 400))
+
+
+def test_trials_repeat_with_the_seed():
+    model = bundle()
+    light = light_of(model, PROFILE, IMAGES)
+    first, again, other = (evaluate_sampled(model, light, LABELS, trials=5, seed=seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first.accuracy_mean != other.accuracy_mean
+
+
+def test_light_and_dark_options():
+    model = bundle()
+    plain, double = light_of(model, PROFILE, IMAGES), light_of(model, PROFILE, IMAGES, eta=2.0)
+    assert double.photoelectrons == pytest.approx(2 * plain.photoelectrons)
+    assert double.illumination == pytest.approx(2 * plain.illumination)
+    nothing = light_of(model, PROFILE, IMAGES, eta=0.0, dark=0.5)
+    assert nothing.photoelectrons.max() == 0
+    assert nothing.law.dark_per_exposure == 0.5
+    assert np.all(nothing.probability == nothing.probability[0, 0])
+    assert nothing.probability[0, 0] > 0.2
+
+
+def test_impossible_requests_are_refused():
+    model = bundle()
+    light = light_of(model, PROFILE, IMAGES)
+    with pytest.raises(UsageError, match="allowed"):
+        light_of(model, PROFILE, IMAGES[:, :3])
+    with pytest.raises(UsageError, match="eta"):
+        light_of(model, PROFILE, IMAGES, eta=-1.0)
+    with pytest.raises(UsageError, match="trials"):
+        evaluate_sampled(model, light, LABELS, trials=0)
+    with pytest.raises(UsageError, match="outcomes"):
+        evaluate_exactly(model, light, LABELS, shots=40)
+
+
+def test_evaluation_loads_no_torch():
+    code = (
+        "import sys, pans.trainer.commands, pans.trainer.evaluate, pans.trainer.tasks\n"
+        "assert 'torch' not in sys.modules and 'onnx' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

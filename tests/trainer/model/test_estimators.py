@@ -1,0 +1,192 @@
+"""Gradient estimators: exact against finite differences, the unbiased ones against exact, the flips against plain passes."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import naive_ssim
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
+from pans.trainer.model.estimators import ESTIMATORS, cross_entropy, exact, similarity_loss, squared_error
+from pans.trainer.model.heads import MlpHead
+
+READ_NOISE = ClickLaw(dark_per_exposure=1.8e-5, read_noise_e=0.2, threshold_e=0.84)
+D_F, N, CLASSES = 4, 6, 3
+
+
+class TableHead:
+    """A score per word, without normalisation."""
+
+    def __init__(self, scores):
+        self.scores = scores
+
+    def __call__(self, clicks, mean=None):
+        index = (clicks @ (2.0 ** torch.arange(clicks.shape[-1], dtype=clicks.dtype))).long()
+        return self.scores[index]
+
+    def flipped(self, clicks, mean):
+        columns = []
+        for i in range(clicks.shape[1]):
+            other = clicks.clone()
+            other[:, i] = 1 - other[:, i]
+            columns.append(self(other))
+        return torch.stack(columns, dim=1)
+
+
+def problem(seed=0):
+    rng = np.random.default_rng(seed)
+    light = torch.from_numpy(rng.uniform(0.1, 2.5, (N, D_F)))
+    return (
+        light,
+        TableHead(torch.from_numpy(2 * rng.normal(size=(1 << D_F, CLASSES)))),
+        torch.from_numpy(rng.integers(0, CLASSES, N)),
+    )
+
+
+def gradient(name, light, head, labels, random, repeats=1, loss_of=cross_entropy):
+    """Mean and standard error of the gradient in the light over `repeats` estimates."""
+    found = []
+    for _ in range(repeats):
+        at = light.clone().requires_grad_()
+        ESTIMATORS[name](click_probability(at, READ_NOISE), labels, head, loss_of, random).backward()
+        found.append(at.grad)
+    stacked = torch.stack(found)
+    return stacked.mean(dim=0).numpy(), stacked.std(dim=0, correction=0).numpy() / np.sqrt(repeats)
+
+
+def test_exact_gradient_is_the_finite_difference():
+    light, head, labels = problem()
+    found, _ = gradient("exact", light, head, labels, None)
+
+    def loss(values):
+        return float(exact(click_probability(values, READ_NOISE), labels, head, cross_entropy, None))
+
+    for i, j in [(0, 0), (2, 1), (5, 3)]:
+        step = torch.zeros_like(light)
+        step[i, j] = 1e-6
+        assert found[i, j] == pytest.approx((loss(light + step) - loss(light - step)) / 2e-6, rel=1e-6, abs=1e-10)
+
+
+def test_exact_loss_is_the_mean_of_sampled_losses():
+    light, head, labels = problem(1)
+    p = click_probability(light, READ_NOISE)
+    wanted = float(exact(p, labels, head, cross_entropy, None))
+    clicks = sample_clicks(p.expand(20_000, N, D_F), torch.Generator().manual_seed(5))
+    losses = cross_entropy(head(clicks), labels.unsqueeze(0)).mean(dim=1)
+    assert abs(float(losses.mean()) - wanted) < 5 * float(losses.std()) / np.sqrt(len(losses))
+
+
+def test_exact_loss_of_pictures_is_the_sum_over_words():
+    light, head, _ = problem(2)
+    pictures = torch.rand(N, CLASSES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    p = click_probability(light, READ_NOISE)
+    found = float(exact(p, pictures, head, squared_error, None))
+    chance = word_probabilities(p)
+    wanted = np.mean(
+        [
+            sum(float(chance[i, w]) * float((head.scores[w] - pictures[i]).square().mean()) for w in range(1 << D_F))
+            for i in range(N)
+        ]
+    )
+    assert found == pytest.approx(wanted)
+
+
+def test_similarity_loss_weighs_ssim_of_what_is_shown_against_the_error_of_the_scores():
+    random = torch.Generator().manual_seed(7)
+    scores = torch.rand(3, 7 * 9, generator=random, dtype=torch.float64) * 1.6 - 0.3  # some beyond black and white
+    wanted = torch.rand(3, 7 * 9, generator=random, dtype=torch.float64)
+    found = similarity_loss(0.25, (7, 9))(scores, wanted)
+    for i in range(3):
+        shown = np.clip(scores[i].numpy(), 0, 1).reshape(7, 9)
+        alike = np.mean(naive_ssim.ssim_map(shown.tolist(), wanted[i].reshape(7, 9).tolist()))
+        error = np.square(scores[i].numpy() - wanted[i].numpy()).mean()
+        assert float(found[i]) == pytest.approx(0.75 * error + 0.25 * (1 - alike), rel=1e-9)
+    assert torch.equal(similarity_loss(0.0, (7, 9))(scores, wanted), squared_error(scores, wanted))
+    every = similarity_loss(0.25, (7, 9))(scores.unsqueeze(0), wanted.unsqueeze(1))  # as `exact` asks for it
+    assert every.shape == (3, 3)
+    assert torch.allclose(every.diagonal(), found)
+
+
+@pytest.mark.parametrize("name", ["local", "disarm", "loo"])
+def test_unbiased_estimators_meet_the_exact_gradient(name):
+    light, head, labels = problem(3)
+    wanted, _ = gradient("exact", light, head, labels, None)
+    found, error = gradient(name, light, head, labels, torch.Generator().manual_seed(1), repeats=3000)
+    assert np.all(np.abs(found - wanted) < 5 * error + 1e-12)
+    assert np.max(np.abs(wanted) / (error + 1e-12)) > 20  # the test could see a bias
+
+
+def test_straight_through_is_biased_by_more_than_chance():
+    light, head, labels = problem(3)
+    head = MlpHead(D_F, 8, CLASSES, torch.Generator().manual_seed(0)).double()
+    with torch.no_grad():
+        head.hidden.weight.mul_(8)  # a loss far from affine in every click
+        head.norm.running_mean.copy_(click_probability(light, READ_NOISE).mean(dim=0))
+    head.eval()
+    fixed = _FixedMean(head)
+    wanted, _ = gradient("exact", light, fixed, labels, None)
+    found, error = gradient("ste", light, fixed, labels, torch.Generator().manual_seed(1), repeats=2000)
+    assert np.max(np.abs(found - wanted) / error) > 10
+
+
+class _FixedMean:
+    """A head whose normalisation stays, so that estimators differ in nothing but the gradient."""
+
+    def __init__(self, head):
+        self.head = head
+
+    def __call__(self, clicks, mean=None):
+        return self.head(clicks.to(self.head.hidden.weight.dtype))
+
+    def flipped(self, clicks, mean):
+        return self.head.flipped(clicks, self.head.norm.running_mean)
+
+
+def test_local_expectation_has_less_variance_than_the_score_function():
+    light, _, labels = problem(4)
+    weights = torch.randn(D_F, CLASSES, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    head = TableHead(click_words(D_F).double() @ weights)  # clicks that hardly interact, as behind a trained front end
+    spread = {
+        name: float(np.square(gradient(name, light, head, labels, torch.Generator().manual_seed(2), 400)[1]).sum())
+        for name in ("local", "disarm", "loo")
+    }
+    assert spread["local"] < 0.5 * spread["disarm"]
+    assert spread["local"] < 0.5 * spread["loo"]
+
+
+def test_gradient_through_the_mean_is_part_of_the_estimate():
+    random = torch.Generator().manual_seed(6)
+    head = MlpHead(D_F, 8, CLASSES, torch.Generator().manual_seed(0)).double()
+    light, _, labels = problem(5)
+    wanted, _ = gradient("exact", light, _Wide(head), labels, None)
+    found, error = gradient("local", light, _Wide(head), labels, random, repeats=3000)
+    assert np.all(np.abs(found - wanted) < 5 * error + 1e-12)
+
+
+class _Wide:
+    """A head in float64, normalised by the mean it is given."""
+
+    def __init__(self, head):
+        self.head = head
+
+    def __call__(self, clicks, mean=None):
+        return self.head(clicks.double(), mean)
+
+    def flipped(self, clicks, mean):
+        return self.head.flipped(clicks, mean)
+
+
+def test_flipped_scores_are_those_of_the_flipped_words():
+    head = MlpHead(5, 16, 3, torch.Generator().manual_seed(0)).double()
+    clicks = click_words(5).double()
+    mean = torch.full((5,), 0.3, dtype=torch.float64)
+    with torch.no_grad():
+        head.norm.gain.copy_(torch.linspace(0.5, 2, 5))
+        head.norm.bias.copy_(torch.linspace(-1, 1, 5))
+        found = head.flipped(clicks, mean)
+        for i in range(5):
+            other = clicks.clone()
+            other[:, i] = 1 - other[:, i]
+            assert torch.allclose(found[:, i], head(other, mean), atol=1e-12)

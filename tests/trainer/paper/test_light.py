@@ -1,0 +1,163 @@
+"""Equal photons, sweeps and information: measured on small tasks, kept, put into pages that say where we are behind, and drawn."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.trainer.options import Options
+from pans.trainer.paper import equal, information, sweeps
+from pans.trainer.paper.page import Asked
+from pans.trainer.paper.passive_recipes import basis_of, recipe
+from pans.trainer.paper.passive_table import markdown as passive_page
+from pans.trainer.paper_tables import UNPRINTED
+from pans.trainer.tasks.registry import Objects, Task
+
+
+def columns(n, side, n_classes, seed=0, light="transmission"):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, n_classes, n)
+    images = rng.integers(0, 30, (n, side, side), dtype=np.uint8)
+    images[np.arange(n), :, labels * (side // n_classes)] = 250
+    half = n // 2
+    train, test = Objects(images[:half], labels[:half]), Objects(images[half:], labels[half:])
+    return Task("columns", tuple("abcdefghij"[:n_classes]), train, test, "0" * 64, "", light=light)
+
+
+def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(equal, "TASKS", ("columns",))
+    monkeypatch.setattr(equal, "PHOTONS", (3.0,))
+    monkeypatch.setattr(equal, "NETWORK_EPOCHS_ELSE", 1)
+    loaded = []
+    monkeypatch.setattr(equal, "load_task", lambda *_: loaded.append(1) or columns(900, 6, 3))
+    small = Options(features=3, alpha=0.0, photons=2.9, epochs=12, hidden=16, batch=50, front_rate=3e-2, head_rate=1e-2)
+    monkeypatch.setattr(equal, "recipe", lambda *_: small)
+    assert equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"] == []
+    found = equal.equal_table(Asked("equal-photons", tmp_path, report=lambda _line: None))
+    rows = {row["way"]: row for row in found["rows"]}
+    assert set(rows) == {"PANS", "posterior", "network"}  # light is made for an active task
+    for way in ("posterior", "network"):
+        assert rows[way]["photons"] == pytest.approx(3.0, rel=1e-5)
+    assert rows["PANS"]["value"] > 45  # by chance a third
+    assert rows["posterior"]["value"] > 45
+    assert rows["PANS"]["illumination"] > 0
+    assert {row["objects"] for row in rows.values()} == {450}  # all that were held out
+    assert len(loaded) == 2
+    again = equal.equal_table(Asked("equal-photons", tmp_path))
+    assert json.dumps(again["rows"]) == json.dumps(found["rows"])
+    assert len(loaded) == 2
+    for way, key in (("posterior", "frames"), ("posterior", "floor"), ("network", "epochs")):
+        path = tmp_path / f"equal-columns-{way}-3.json"
+        kept = path.read_text()
+        path.write_text(json.dumps(json.loads(kept) | {key: "another"}))
+        left = {row["way"] for row in equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"]}
+        assert left == set(rows) - {way}  # made in another way, it counts as not made
+        path.write_text(kept)
+
+
+def test_the_page_says_where_we_are_not_ahead():
+    def row(way, value, photons=3.0):
+        return {
+            "task": "fiber",
+            "way": way,
+            "asked": 3.0,
+            "value": value,
+            "first_200": value,
+            "photons": photons,
+        } | dict.fromkeys(("spread_trials", "error_objects", "clicks", "illumination", "cpu_seconds"), 1.0)
+
+    assert "ahead at every level measured (no network at 3)" in equal.markdown([row("PANS", 80), row("posterior", 70)])
+    behind = equal.markdown([row("PANS", 80), row("posterior", 70), row("network", 81)])
+    assert "**not ahead at 3 photons (80.0 % at 3.00, network 81.0 %)**" in behind
+    light = equal.markdown([row("equal light", 60, photons=1.0), row("posterior", 70)])
+    assert "- fiber, equal light: **not ahead at 3 photons (60.0 % at 1.00, posterior 70.0 %)**" in light
+    near = equal.markdown([row("PANS", 71.3), row("posterior", 70)])  # both with an error of 1 point: 1.41 together
+    assert "ahead at every level measured, at 3 by less than the standard error" in near
+    assert "by less than" not in equal.markdown([row("PANS", 71.5), row("posterior", 70)])
+    assert "not ahead" in equal.markdown([row("PANS", 80, photons=3.1), row("posterior", 70)])  # bought with photons
+
+
+def test_at_equal_light_no_light_is_made(monkeypatch):
+    small = Options(
+        features=3, alpha=0.0, photons=9.0, epochs=3, hidden=8, batch=50, head_rate=1e-2, encoder="coherent"
+    )
+    monkeypatch.setattr(equal, "recipe", lambda *_: small)
+    monkeypatch.setattr(equal, "LIGHT_SIZE", 8)
+    found = equal._pans(columns(600, 12, 2, light="field"), "equal light", 20.0)
+    assert found["options"]["conserving"] is True
+    assert found["options"]["input_photons"] == 20.0
+    assert 0.1 < found["photons"] <= 20.5
+    assert found["value"] > 60  # by chance a half
+
+
+def test_light_shots_and_dark_counts_are_swept_each_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "load_task", lambda *_: columns(600, 28, 10))
+    monkeypatch.setattr(sweeps, "SHOTS", (1, 2))
+    monkeypatch.setattr(sweeps, "ETAS", (0.01, 1.0, 100.0))
+    monkeypatch.setattr(sweeps, "DARKS", (1e-3, 1.0))
+    monkeypatch.setattr(sweeps, "TRIALS_OF_ALL", 2)
+    monkeypatch.setattr(sweeps, "TRIALS", {})
+    found = sweeps.sweep_table(Asked("sweeps", tmp_path, report=lambda _line: None))
+    of = {(row["sweep"], row["setting"]): row["all"] for row in found["rows"]}
+    one = of["eta", 1.0]
+    assert of["K", 1.0] == one
+    assert of["K", 2.0]["photons_mean"] == pytest.approx(2 * one["photons_mean"])
+    assert of["eta", 0.01]["illumination"] == pytest.approx(0.01 * one["illumination"])
+    assert of["eta", 0.01]["clicks_mean"] < 0.5 < 9 < of["eta", 100.0]["clicks_mean"]
+    assert of["dark", 1e-3]["clicks_mean"] < of["dark", 1.0]["clicks_mean"] - 1
+    assert of["dark", 1.0]["photons_mean"] == pytest.approx(one["photons_mean"])  # dark counts are no light
+    assert "## shots (K)" in found["markdown"]
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    from pans.trainer.paper.figures_light import sweeps as draw
+
+    draw(tmp_path / "s.png", found["rows"])
+    assert (tmp_path / "s.png").stat().st_size > 5000
+
+
+def test_information_of_frames_and_words_stands_at_the_same_photons(tmp_path, monkeypatch):
+    monkeypatch.setattr(information, "load_task", lambda *_: columns(800, 28, 10))
+    monkeypatch.setattr(information, "PHOTONS", (1.0, 30.0, 300.0))
+    monkeypatch.setattr(information, "POSTERIOR_MAX", 30.0)
+    monkeypatch.setattr(information, "FRAMES", 300)
+    found = information.information_table(Asked("fig-2c", tmp_path, report=lambda _line: None))
+    of = {(row["way"], row["photons"]): row for row in found["rows"]}
+    assert of["frames", 30.0]["bits"] > of["frames", 1.0]["bits"] > 0.05
+    assert 0.1 < of["click words", 1.0]["bits"] < np.log2(10)
+    assert of["click words", 1.0]["clicks"] < of["click words", 30.0]["clicks"] < 10
+    assert "bits" not in of["frames", 300.0]
+    assert of["frames", 300.0]["fisher"]["trace"] > of["frames", 1.0]["fisher"]["trace"]
+    assert of["click words", 1.0]["clicks"] < 1
+    assert "what is proven at 30 photons" in found["markdown"]
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    from pans.trainer.paper.figures_light import information as draw
+
+    draw(tmp_path / "i.png", found["rows"])
+    assert (tmp_path / "i.png").stat().st_size > 5000
+
+
+def test_tasks_without_printed_figures_have_pages_without_a_verdict():
+    row = UNPRINTED["nebula"].rows[0]
+    figures = {
+        "dark": 0.01,
+        "value": 81.0,
+        "first_200": 80.0,
+        "spread_trials": 0.3,
+        "error_objects": 0.5,
+        "clicks": 0.9,
+    }
+    page = passive_page("nebula", [(row, figures | {"photons": 3.0, "illumination": 0.0, "cpu_seconds": 30.0})])
+    assert "| 2 | 0.01 | - | 81.00 | - | 80.00 |" in page
+    assert "at or above the paper" not in page
+
+
+def test_only_scenes_with_a_bright_background_start_in_a_basis():
+    task = columns(200, 12, 2, light="field")
+    row = UNPRINTED["nebula"].rows[0]
+    options = recipe("nebula", row, 0.01)
+    assert basis_of("nebula", task, options).shape[0] == 144
+    assert basis_of("mmf-mnist", task, options) is None
+    assert basis_of("nebula", task, dataclasses.replace(options, conserving=True)) is None

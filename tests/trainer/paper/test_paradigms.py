@@ -1,0 +1,339 @@
+"""Pages on the alternatives and on training: parts kept, curves read, courses followed, pages that say what is missing and what is weak."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import argparse
+import dataclasses
+import json
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+pytest.importorskip("matplotlib", reason="needs the plot extra")
+
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.baselines.common import measure
+from pans.trainer.baselines.compressive import clean_mlp, patterns
+from pans.trainer.commands import baseline as cmd_baseline
+from pans.trainer.options import Options, check_options
+from pans.trainer.paper import alpha as reproduce_alpha
+from pans.trainer.paper import baseline_curves as curves
+from pans.trainer.paper import frames as reproduce_frames
+from pans.trainer.paper import paradigms as reproduce_paradigms
+from pans.trainer.paper import sensing as reproduce_sensing
+from pans.trainer.paper.cache import kept
+from pans.trainer.paper.page import Asked, write_page
+from pans.trainer.paper_tables import ACTIVE
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.train import head_fit
+from pans.trainer.train.course import follow
+from pans.trainer.train.loop import train
+
+PNG = b"\x89PNG"
+
+
+def bars(n, seed):
+    """A bright column of a faint picture tells the class."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 3, n)
+    images = rng.integers(0, 60, (n, 6, 6), dtype=np.uint8)
+    images[np.arange(n), :, 2 * labels] = 230
+    return Objects(images, labels)
+
+
+@pytest.fixture(scope="module")
+def task():
+    return Task("bars", ("a", "b", "c"), bars(600, 1), bars(240, 2), "0" * 64, "")
+
+
+def asked(tmp_path, **how):
+    tmp_path.mkdir(exist_ok=True)
+    said = []
+    return Asked("page", tmp_path, report=said.append, **how), said
+
+
+# ---- parts ----
+
+
+def test_a_part_is_made_once_and_again_when_asked_for_otherwise(tmp_path):
+    made = []
+
+    def make():
+        made.append(1)
+        return {"value": (1, 2)}
+
+    path = tmp_path / "part.json"
+    assert kept(path, {"n": 1}, make, collect=True) is None
+    first = kept(path, {"n": 1}, make, collect=False)
+    assert first["value"] == [1, 2]  # as JSON gives it back, from the start
+    assert kept(path, {"n": 1}, make, collect=True) == first
+    assert kept(path, {"n": 2}, make, collect=True) is None
+    assert len(made) == 1
+    kept(path, {"n": 2}, make, collect=False)
+    assert len(made) == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["part.json"]
+
+
+# ---- baselines over photons ----
+
+
+def test_every_curve_is_a_command_that_the_baselines_take():
+    parser = argparse.ArgumentParser()
+    cmd_baseline.BASELINE.configure(parser)
+    every = [*curves.CURVES, *(curves.e2e_curve(features) for features in curves.E2E_FEATURES)]
+    assert len({curve.way for curve in every}) == len(every)
+    for curve in every:
+        args = parser.parse_args(curve.command().split()[2:])
+        cmd_baseline._check(args)
+        assert list(args.photons) == sorted(args.photons)
+
+
+def test_a_curve_is_measured_once_told_and_refused_to_none_when_collecting(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    curve = curves._curve("end-to-end, d_f = 3", "e2e --features 3 --trials 2 --epochs 60", (5.0, 1e4))
+    page, said = asked(tmp_path)
+    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == []
+    assert curve.command() in said[0]
+    few, many = curves.curve_rows(page, curve)
+    assert few["photons_asked"] == 5
+    assert few["photons_mean"] == pytest.approx(5, rel=1e-5)
+    assert few["accuracy_mean"] < many["accuracy_mean"]
+    assert many["features"] == 3
+    assert len(said) == 3
+    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == [few, many]
+
+
+def row(way, photons, accuracy, features=10, **more):
+    one = {"accuracy_mean": accuracy, "accuracy_std": 0.01, "accuracy_se_objects": 0.004, "clicks_mean": photons / 2}
+    one |= {"photons_mean": photons, "illumination": 3 * photons, "objects": 10_000, "trials": 2}
+    return {"way": way, "features": features, "photons_asked": photons, **one, "first_200": one} | more
+
+
+def test_the_envelope_is_the_best_at_each_level():
+    rows = [row("a", 5.0, 0.3, 3), row("b", 5.0, 0.2, 32), row("a", 100.0, 0.6, 3), row("b", 100.0, 0.8, 32)]
+    best = curves.envelope(rows)
+    assert [(r["photons_asked"], r["accuracy_mean"], r["features"]) for r in best] == [(5.0, 0.3, 3), (100.0, 0.8, 32)]
+    assert {r["way"] for r in best} == {curves.ENVELOPE}
+
+
+def test_curves_are_read_between_their_ends_only():
+    rows = [row("a", 10.0, 0.4), row("a", 1000.0, 0.8)]
+    at = partial(curves.accuracy_at, rows, of=lambda r: r["photons_mean"])
+    assert at(100.0) == pytest.approx(0.6)
+    assert at(10.0) == pytest.approx(0.4)
+    assert at(9.0) is None
+    assert at(1001.0) is None
+    assert curves.accuracy_at([], 5.0, lambda r: r["photons_mean"]) is None
+
+
+def test_the_page_tells_clicks_from_photons_and_who_is_ahead(tmp_path):
+    posterior = curves.POSTERIOR.way
+    direct = [row(posterior, n, a, 784) for n, a in ((10.0, 0.5), (1000.0, 0.9))]
+    best = [row(curves.ENVELOPE, n, a, 6) for n, a in ((5.0, 0.3), (30.0, 0.45), (5000.0, 0.83))]
+    pans = [row("PANS", 20.0, 0.7, 4), row("PANS", 200.0, 0.72, 10)]
+    for each in pans:
+        del each["photons_asked"]
+    page = reproduce_paradigms.fig_2e_markdown(direct + best + pans)
+    assert (
+        "PANS is ahead of direct imaging decided by the exact posterior at d_f = 4 (70.0 against 56.0 % at 20)" in page
+    )
+    assert "behind at d_f = 10 (72.0 against 76.0 % at 200)" in page
+    assert "clicks: our ten patterns have 100.00 clicks" in page
+    assert "Ours: 30.0 % (d_f = 6), which is more: few patterns" in page
+    assert "Ours: 83.0 % there" in page
+    assert "PANS d_f = 3, 6, 16, 24, 32 (`pans reproduce fashion-mnist`)" in page  # what is missing, and how to make it
+    assert curves.CLEAN.command() in page
+    write_page(
+        tmp_path,
+        "fig-2e",
+        {
+            "rows": [],
+            "markdown": page,
+            "pictures": {
+                "": partial(
+                    reproduce_paradigms.figures_baselines.paradigms,
+                    rows=direct + best + pans,
+                    paper=ACTIVE["fashion-mnist"],
+                )
+            },
+        },
+    )
+    assert (tmp_path / "fig-2e.png").read_bytes().startswith(PNG)
+
+
+def test_pages_of_curves_are_put_together_from_what_is_finished(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "load_task", lambda *_: task)
+    monkeypatch.setattr(curves, "LEVELS", (5.0, 30.0, 5000.0))
+    page, _ = asked(tmp_path / "cache", rows=(3,))
+    made = reproduce_paradigms.end_to_end_page(page)
+    assert [r["way"] for r in made["rows"]] == ["end-to-end, d_f = 3"] * 3 + [curves.ENVELOPE] * 3
+    assert "--features 64" in made["markdown"].split("Not finished yet")[1].split("\n")[0]
+    write_page(tmp_path, "end-to-end", made)
+    assert (tmp_path / "end-to-end.png").read_bytes().startswith(PNG)
+    collected = reproduce_paradigms.fig_2e_page(dataclasses.replace(page, collect=True))
+    assert [r["way"] for r in collected["rows"]] == [curves.ENVELOPE] * 3
+    assert collected["rows"][0]["first_200"]["objects"] == 200
+
+
+# ---- compressive sensing ----
+
+
+def test_watching_a_training_changes_nothing(task):
+    measurement = measure(task, patterns("binary", 6, task.image_shape, 0))
+    seen = []
+    before = torch.random.get_rng_state()
+    watched = clean_mlp(measurement, seed=3, epochs=2, watch=lambda epoch, decide: seen.append((epoch, decide)))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    alone = clean_mlp(measurement, seed=3, epochs=2)
+    clean = measurement.photoelectrons(measurement.test, 50.0)
+    assert np.array_equal(watched(50.0, "counting")(clean), alone(50.0, "counting")(clean))
+    assert len(seen) == 2
+    assert seen[1][0].loss < seen[0][0].loss
+    assert 0 <= seen[1][0].accuracy <= 1
+
+
+def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce_sensing, "load_task", lambda *_: task)
+    monkeypatch.setattr(reproduce_sensing, "FEATURES", (4, 16))
+    monkeypatch.setattr(reproduce_sensing, "EPOCHS", 30)
+    page, said = asked(tmp_path / "cache")
+    made = reproduce_sensing.compressive_page(page)
+    sixteen = made["rows"][1]
+    assert sixteen["epochs"]["held_out"][-1] > 80  # by chance 33
+    assert len(sixteen["epochs"]["loss"]) == 30
+    accuracies = [cell["accuracy_mean"] for cell in sixteen["cells"]]
+    assert accuracies[0] < 0.6 < accuracies[-1]
+    assert sum(line.startswith("compressive") for line in said) == 2 * len(reproduce_sensing.PHOTONS)
+    again = reproduce_sensing.compressive_page(dataclasses.replace(page, collect=True))
+    assert again["rows"] == made["rows"]
+    write_page(tmp_path, "compressive", made)
+    assert {path.name for path in tmp_path.iterdir()} >= {
+        "compressive.png",
+        "compressive-training.png",
+        "compressive.json",
+    }
+    partly = reproduce_sensing.compressive_page(dataclasses.replace(page, rows=(4,)))
+    assert "Not finished yet (`pans reproduce compressive`): d_f = 16." in partly["markdown"]
+
+
+# ---- frames ----
+
+
+def test_neighbours_agree_where_classes_lie_apart():
+    rng = np.random.default_rng(0)
+    labels = np.repeat([0, 1], 40)
+    mixed = rng.normal(size=(80, 2))
+    assert reproduce_frames.neighbours_agree(mixed + 100 * labels[:, None], labels) == 1.0
+    assert 0.2 < reproduce_frames.neighbours_agree(mixed, labels) < 0.8
+
+
+def test_frames_are_drawn_mapped_and_judged(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce_frames, "load_task", lambda *_: task)
+    monkeypatch.setattr(reproduce_frames, "OBJECTS", 120)
+    page, _ = asked(tmp_path / "cache")
+    made = reproduce_frames.frames_page(page)
+    many, *_, few = made["rows"]
+    assert many["neighbours"] > 0.9
+    assert few["on_the_map"]["photons_mean"] < 20
+    assert few["on_the_map"]["objects"] == 120
+    assert few["on_the_map"]["accuracy_mean"] > 0.5  # the posterior sees what the map does not
+    frames = reproduce_frames.drawn_frames(task)
+    assert [drawn.shape for drawn in frames.values()] == [(3, draws, 6, 6) for draws in reproduce_frames.SHOWN.values()]
+    assert frames[1e3].sum() / 9 == pytest.approx(
+        1000, rel=0.3
+    )  # three objects, three draws; some are brighter than others
+    write_page(tmp_path, "direct-frames", made)
+    assert (tmp_path / "direct-frames-map.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "direct-frames.png").read_bytes().startswith(PNG)
+
+
+# ---- training dynamics ----
+
+
+@pytest.fixture
+def short_fits(monkeypatch):
+    """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
+    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+
+
+SMALL = Options(features=3, estimator="ste", alpha=1e-3, epochs=6, hidden=8, batch=25, front_rate=5e-2, head_rate=2e-2)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_a_followed_training_ends_where_an_ordinary_one_does(task):
+    profile = load_profile("ideal")
+    course = follow(task, profile, SMALL, patterns_after=(1, 6))
+    plain = train(task, profile, SMALL)
+    assert np.array_equal(course.trained.quantised.levels, plain.quantised.levels)
+    assert course.trained.validation_loss == plain.validation_loss
+    columns = course.columns()
+    assert {len(values) for values in columns.values()} == {6}
+    assert columns["loss"][-1] < columns["loss"][0]
+    assert columns["held_out"][-1] > 50  # by chance 33
+    assert list(course.patterns) == [1, 6]
+    last = course.patterns[6]
+    assert columns["peak"][-1] == pytest.approx(last.max() / last.mean(), rel=1e-4)
+    with pytest.raises(UsageError, match="--encoder coherent"):
+        follow(task, profile, dataclasses.replace(SMALL, encoder="coherent"))
+
+
+def test_the_recipes_of_the_courses_can_be_trained():
+    for features in reproduce_alpha.FEATURES:
+        for alpha in reproduce_alpha.ALPHAS:
+            check_options(reproduce_alpha.recipe(features, alpha), load_profile("ideal"))
+    assert reproduce_alpha.STAGES[-1] == reproduce_alpha.EPOCHS
+    assert all(a < b for a, b in pairwise(reproduce_alpha.STAGES))
+
+
+def test_a_stage_tells_how_uneven_patterns_are():
+    epochs = {key: [1.0, 2.0] for key in ("held_out", "held_out_first_200", "clicks", "photons", "illumination")}
+    even = reproduce_alpha.stage_row({"epochs": epochs}, 1, np.ones((2, 10)))
+    assert even["peak"] == 1
+    assert even["pixels_with_half_the_light"] == pytest.approx(0.5)
+    assert even["pixels_below_a_tenth_of_the_mean"] == 0
+    spot = np.zeros((2, 10))
+    spot[0, 3] = 20.0
+    uneven = reproduce_alpha.stage_row({"epochs": epochs}, 2, spot)
+    assert uneven["peak"] == 20
+    assert uneven["means"] == [2.0, 0.0]
+    assert uneven["pixels_with_half_the_light"] == pytest.approx(1 / 20)
+    assert uneven["pixels_below_a_tenth_of_the_mean"] == pytest.approx(19 / 20)
+    assert uneven["held_out"] == 2.0
+
+
+def test_growth_is_over_the_last_epochs():
+    light = [1.0] * 5 + [100.0] + [110.0] * reproduce_alpha.LATE
+    assert reproduce_alpha.growth({"epochs": {"illumination": light}}) == pytest.approx(10)
+    assert reproduce_alpha.growth({"epochs": {"illumination": [4.0, 5.0]}}) == pytest.approx(25)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_pages_of_courses_are_made_once_and_collected(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce_alpha, "load_task", lambda *_: task)
+    monkeypatch.setattr(reproduce_alpha, "FEATURES", (3,))
+    monkeypatch.setattr(reproduce_alpha, "ALPHAS", (0.0, 0.1))
+    monkeypatch.setattr(reproduce_alpha, "SHOWN", (3, 0.1))
+    monkeypatch.setattr(reproduce_alpha, "STAGES", (1, 6))
+    monkeypatch.setattr(reproduce_alpha, "recipe", lambda _, alpha: dataclasses.replace(SMALL, alpha=alpha))
+    page, _ = asked(tmp_path / "cache")
+    empty = reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))
+    assert empty["rows"] == []
+    assert "Not trained yet" in empty["markdown"]
+    made = reproduce_alpha.alpha_page(page)
+    free, held = made["rows"]
+    assert held["final"]["illumination"] < free["final"]["illumination"]
+    assert free["final"]["objects"] == 240
+    write_page(tmp_path, "alpha", made)
+    assert (tmp_path / "alpha-3.png").read_bytes().startswith(PNG)
+    assert json.loads((tmp_path / "alpha.json").read_text())["rows"] == made["rows"]
+    evolution = reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))
+    assert [stage["epoch"] for stage in evolution["rows"]] == [1, 6]
+    assert np.mean(evolution["rows"][0]["means"]) == pytest.approx(1)
+    evolution["pictures"][""] = partial(evolution["pictures"][""], shape=task.image_shape)
+    write_page(tmp_path, "evolution", evolution)
+    assert (tmp_path / "evolution.png").read_bytes().startswith(PNG)
+    (tmp_path / "cache" / "alpha-3-0.1.npz").unlink()  # half a part is none
+    assert reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))["rows"] == []

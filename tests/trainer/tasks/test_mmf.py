@@ -1,0 +1,75 @@
+"""The fibre of MMF-MNIST: a fixed, unitary, linear mixing; the release's input beside it with its leak."""
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.incident import incident_field, incident_intensity
+from pans.runtime.errors import UsageError
+from pans.trainer.tasks import mmf as task_mmf
+from pans.trainer.tasks.registry import FIBRE_TASKS, load_task
+
+IMAGES = np.random.default_rng(1).integers(0, 256, (5, 28, 28), dtype=np.uint8)
+
+
+def test_the_mask_is_pinned():
+    mask = task_mmf.phase_mask()
+    assert mask.shape == (28, 28)
+    assert mask.ravel()[:3] == pytest.approx(
+        [2.353312, 5.973520, 4.599257], abs=1e-5
+    )  # RandomState(42): .3745 .9507 .7320
+    assert 0 <= mask.min() < mask.max() < 2 * np.pi
+
+
+def test_the_fibre_is_unitary_and_loses_no_light():
+    matrix = task_mmf.scattering_matrix()
+    assert np.abs(matrix @ matrix.conj().T - np.eye(784)).max() < 1e-12
+    field = task_mmf.scatter(IMAGES)
+    wanted = (IMAGES.reshape(5, -1) / 255.0) @ matrix.T
+    assert np.abs(field.reshape(5, -1) - wanted).max() < 1e-5
+    assert (np.abs(field) ** 2).sum(axis=(1, 2)) == pytest.approx(((IMAGES / 255) ** 2).sum(axis=(1, 2)), rel=1e-5)
+
+
+def test_the_speckle_by_the_definition_of_the_fourier_transform():
+    n = np.arange(28)
+    fourier = np.exp(-2j * np.pi * np.outer(n, n) / 28)
+    spectrum = fourier @ (IMAGES[0] / 255) @ fourier * np.exp(1j * task_mmf.phase_mask())
+    wanted = fourier.conj() @ spectrum @ fourier.conj() / 784
+    assert np.abs(task_mmf.scatter(IMAGES[:1])[0] - wanted).max() < 1e-5
+
+
+def test_no_object_depends_on_another_except_in_the_release():
+    assert np.array_equal(task_mmf.scatter(IMAGES)[:2], task_mmf.scatter(IMAGES[:2]))
+    whole, part = task_mmf.release_intensity(IMAGES), task_mmf.release_intensity(IMAGES[:2])
+    assert (whole.min(), whole.max()) == (0, 1)
+    assert (part.min(), part.max()) == (0, 1)
+    assert not np.allclose(whole[:2], part)  # the leak, kept for comparison
+
+
+def test_the_release_normalises_every_batch_by_itself():
+    batched = task_mmf.release_intensity(IMAGES, batch=2)
+    for start in (0, 2, 4):
+        assert np.allclose(batched[start : start + 2], task_mmf.release_intensity(IMAGES[start : start + 2]))
+
+
+def test_other_sizes_are_refused():
+    with pytest.raises(UsageError, match="28, 28"):
+        task_mmf.scatter(IMAGES[:, :27])
+
+
+def test_incident_light():
+    grey = np.array([[[0, 51, 255]]], np.uint8)
+    assert incident_field(grey, "field").ravel() == pytest.approx([0, 0.2, 1])
+    assert incident_field(grey, "intensity").ravel() == pytest.approx([0, 0.2**0.5, 1])
+    assert incident_intensity(grey, "field").ravel() == pytest.approx([0, 0.04, 1])
+    assert incident_intensity(grey, "transmission").ravel() == pytest.approx([0, 0.2, 1])
+    behind = incident_field(IMAGES, "field", "mmf")
+    assert behind.dtype == np.complex64
+    assert incident_intensity(IMAGES, "field", "mmf") == pytest.approx(np.abs(behind) ** 2, rel=1e-5, abs=1e-7)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", FIBRE_TASKS)
+def test_mmf_mnist_is_mnist_behind_the_fibre(name, data_dir):
+    task, digits = load_task(name, data_dir), load_task("mnist", data_dir)
+    assert (task.name, task.light, task.optics, task.target) == (name, "field", "mmf", FIBRE_TASKS[name])
+    assert np.array_equal(task.test.images, digits.test.images)

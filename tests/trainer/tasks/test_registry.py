@@ -1,0 +1,269 @@
+"""Tasks: pinned public files, a user's own data, and what is refused before it is unpacked."""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+
+from pans.runtime.cli import main
+from pans.runtime.errors import DamagedFileError, PansError, UsageError
+from pans.trainer.tasks import registry as tasks
+from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
+from pans.trainer.tasks.registry import load_task
+
+RNG = np.random.default_rng(0)
+
+
+def idx_bytes(array):
+    header = bytes([0, 0, 8, array.ndim]) + b"".join(size.to_bytes(4, "big") for size in array.shape)
+    return header + array.tobytes()
+
+
+def write_idx(path, array):
+    path.write_bytes(gzip.compress(idx_bytes(array), mtime=0))
+    return path
+
+
+def own_npz(path, n=20, **more):
+    images = RNG.integers(0, 256, (n, 3, 4), dtype=np.uint8)
+    np.savez(path, images=images, labels=np.arange(n) % 3, **more)
+    return images
+
+
+def test_idx_round_trip(tmp_path):
+    wanted = RNG.integers(0, 256, (5, 2, 3), dtype=np.uint8)
+    assert np.array_equal(read_idx(write_idx(tmp_path / "a.gz", wanted), (5, 2, 3)), wanted)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: gzip.compress(data[:-1]),
+        lambda data: gzip.compress(data + b"\0"),
+        lambda data: gzip.compress(b"\1" + data[1:]),
+        lambda data: gzip.compress(data)[:-9],
+        lambda data: b"not gzip",
+    ],
+    ids=["short", "long", "other magic", "cut", "not gzip"],
+)
+def test_a_damaged_idx_file_is_refused(tmp_path, damage):
+    path = tmp_path / "a.gz"
+    path.write_bytes(damage(idx_bytes(np.zeros((5, 2, 3), np.uint8))))
+    with pytest.raises(DamagedFileError, match=r"a\.gz"):
+        read_idx(path, (5, 2, 3))
+
+
+def test_a_gzip_bomb_is_not_unpacked(tmp_path):
+    path = tmp_path / "bomb.gz"
+    with gzip.open(path, "wb") as file:
+        for _ in range(64):
+            file.write(bytes(1 << 20))
+    with pytest.raises(DamagedFileError):
+        read_idx(path, (5,))
+
+
+def test_an_altered_file_is_named_with_both_hashes(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"abcd")
+    pinned = PinnedFile("a.bin", 4, "0" * 64, (4,))
+    with pytest.raises(DamagedFileError, match="0" * 64) as caught:
+        check_pinned(path, pinned)
+    assert file_sha256(path) in str(caught.value)
+    with pytest.raises(DamagedFileError, match="5"):
+        check_pinned(path, PinnedFile("a.bin", 5, "0" * 64, (5,)))
+
+
+def test_fetch_keeps_only_what_is_pinned(tmp_path):
+    source = tmp_path / "source.bin"
+    source.write_bytes(b"right")
+    pinned = PinnedFile("got.bin", 5, file_sha256(source), (5,))
+    target = tmp_path / "deep" / "got.bin"
+    assert fetch(source.as_uri(), target, pinned) is True
+    assert target.read_bytes() == b"right"
+    assert fetch("file:///nowhere", target, pinned) is False  # it is there already
+    target.unlink()
+    source.write_bytes(b"wrong")
+    with pytest.raises(DamagedFileError):
+        fetch(source.as_uri(), target, pinned)
+    with pytest.raises(UsageError, match="cannot be fetched"):
+        fetch((tmp_path / "absent").as_uri(), target, pinned)
+    assert list(target.parent.iterdir()) == []
+
+
+def test_own_file_holds_out_every_fifth(tmp_path):
+    images = own_npz(tmp_path / "own.npz", classes=np.array(["a", "b", "c"]))
+    task = load_task(str(tmp_path / "own.npz"))
+    assert task.classes == ("a", "b", "c")
+    assert np.array_equal(task.test.images, images[4::5])
+    assert len(task.train) == 16
+    assert task.split_here
+    assert np.array_equal(task.everything().images, images)
+
+
+def test_own_file_with_a_test_part(tmp_path):
+    images = RNG.integers(0, 256, (9, 2, 2), dtype=np.uint8)
+    labels = np.arange(9) % 2
+    parts = {
+        "train_images": images[:6],
+        "train_labels": labels[:6],
+        "test_images": images[6:],
+        "test_labels": labels[6:],
+    }
+    np.savez(tmp_path / "own.npz", **parts)
+    task = load_task(str(tmp_path / "own.npz"))
+    assert np.array_equal(task.test.images, images[6:])
+    assert task.classes == ("0", "1")
+    assert np.array_equal(task.everything().images, images)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"images": np.full((20, 3, 4), 1.5), "labels": np.arange(20) % 2},
+        {"images": np.full((20, 3, 4), np.nan), "labels": np.arange(20) % 2},
+        {"images": np.zeros((20, 3, 4), np.int64), "labels": np.arange(20) % 2},
+        {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.zeros(19, int)},
+        {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.full(20, -1)},
+        {"images": np.zeros((20, 3, 4), np.uint8), "labels": np.zeros(20)},
+        {"images": np.zeros((20, 12), np.uint8), "labels": np.zeros(20, int)},
+        {"images": np.zeros((3, 3, 4), np.uint8), "labels": np.arange(3)},
+        {"pictures": np.zeros(3)},
+    ],
+    ids=["beyond full scale", "nan", "signed", "lengths", "negative label", "float label", "flat", "too few", "names"],
+)
+def test_unfit_own_files_are_refused(tmp_path, arrays):
+    np.savez(tmp_path / "own.npz", **arrays)
+    with pytest.raises(UsageError, match=r"own\.npz"):
+        load_task(str(tmp_path / "own.npz"))
+
+
+def test_objects_that_would_run_code_are_refused(tmp_path):
+    np.savez(tmp_path / "own.npz", images=np.array([{}], dtype=object), labels=np.zeros(1, int))
+    with pytest.raises(DamagedFileError):
+        load_task(str(tmp_path / "own.npz"))
+
+
+def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "own.npz", images=np.zeros((100, 100, 100), np.uint8), labels=np.zeros(100, int))
+    monkeypatch.setattr(tasks, "IMAGES_MAX_BYTES", 100_000)
+    with pytest.raises(UsageError, match="unpacks to"):
+        load_task(str(tmp_path / "own.npz"))
+
+
+def test_folder_of_class_folders(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    for name, level in (("bright", 200), ("dark", 20)):
+        (tmp_path / "set" / name).mkdir(parents=True)
+        for i in range(10):
+            image.fromarray(np.full((4, 5), level + i, np.uint8)).save(tmp_path / "set" / name / f"{i}.png")
+    task = load_task(str(tmp_path / "set"))
+    assert (task.name, task.classes, task.image_shape) == ("set", ("bright", "dark"), (4, 5))
+    assert len(task.train) == 16
+    assert task.test.images[0, 0, 0] == 204
+    image.fromarray(np.zeros((9, 9), np.uint8)).save(tmp_path / "set" / "dark" / "zz.png")
+    with pytest.raises(UsageError, match=r"zz\.png: 9 x 9"):
+        load_task(str(tmp_path / "set"))
+    (tmp_path / "set" / "dark" / "zz.png").write_text("no image")
+    with pytest.raises(DamagedFileError, match=r"zz\.png"):
+        load_task(str(tmp_path / "set"))
+
+
+@pytest.mark.parametrize("kind", ["uint16", "float32", "float64", "bool"])
+def test_images_of_other_types_keep_their_full_scale(tmp_path, kind):
+    grey = RNG.integers(0, 256, (20, 3, 4), dtype=np.uint8)
+    given = {"uint16": grey.astype(np.uint16) * 257, "bool": grey > 99}.get(kind, (grey / 255).astype(kind))
+    np.savez(tmp_path / "own.npz", images=given, labels=np.arange(20) % 2)
+    task = load_task(str(tmp_path / "own.npz"))
+    wanted = np.where(grey > 99, 255, 0) if kind == "bool" else grey
+    assert np.array_equal(task.everything().images, wanted)
+    assert "full scale" in task.source
+    dim = (given // 2) if kind == "uint16" else given  # a dim camera stays dim: nothing is stretched
+    np.savez(tmp_path / "dim.npz", images=dim, labels=np.arange(20) % 2)
+    assert load_task(str(tmp_path / "dim.npz")).everything().images.max() <= 255 // (2 if kind == "uint16" else 1) + 1
+
+
+def class_folders(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for i in range(10):
+            image.fromarray(np.full((4, 5), 20 * i, np.uint8)).save(tmp_path / name / f"{i}.png")
+    return image
+
+
+def test_what_systems_leave_behind_is_passed_over(tmp_path):
+    class_folders(tmp_path)
+    wanted = load_task(str(tmp_path)).sha256
+    for litter in ("Thumbs.db", ".DS_Store", "desktop.ini"):
+        (tmp_path / litter).write_bytes(b"litter")
+        (tmp_path / "a" / litter).write_bytes(b"litter")
+    (tmp_path / "__MACOSX").mkdir()
+    (tmp_path / "README.txt").write_text("about these images")
+    assert load_task(str(tmp_path)).sha256 == wanted
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("empty", "a class folder without pictures"),
+        ("nested", "a folder within the class folder"),
+        ("beside", "beside the class"),
+    ],
+)
+def test_folders_that_cannot_be_meant(tmp_path, what, said):
+    image = class_folders(tmp_path)
+    if what == "empty":
+        (tmp_path / "c").mkdir()
+        (tmp_path / "c" / ".DS_Store").write_bytes(b"litter")
+    elif what == "nested":
+        (tmp_path / "a" / "more").mkdir()
+    else:
+        image.fromarray(np.zeros((4, 5), np.uint8)).save(tmp_path / "lost.PNG", format="PNG")
+    with pytest.raises(UsageError, match=said) as caught:
+        load_task(str(tmp_path))
+    assert caught.value.remedy
+
+
+def test_the_list_names_every_task_and_what_is_there(tmp_path, capsys):
+    assert main(["data", "list", "--data-dir", str(tmp_path), "--json"]) == 0
+    rows = {row["task"]: row for row in json.loads(capsys.readouterr().out)["tasks"]}
+    assert set(rows) == set(tasks.task_names())
+    assert (rows["mmf-mnist"]["state"], rows["mmf-mnist"]["encoder"]) == ("not there", "coherent")
+    assert (rows["tissue"]["state"], rows["tissue"]["encoder"]) == ("drawn on demand", "incoherent")
+
+
+def test_a_drawn_task_follows_its_data_seed():
+    first, second = (load_task("barcode", data_seed=seed) for seed in (0, 5))
+    assert first.sha256 != second.sha256
+    assert "seed 5" in second.source
+
+
+def test_unknown_task_and_missing_folder_have_a_remedy(tmp_path, monkeypatch):
+    monkeypatch.delenv("PANS_DATA", raising=False)
+    for name, folder in (("no-such-task", None), ("mnist", None), ("mnist", tmp_path)):
+        with pytest.raises(PansError) as caught:
+            load_task(name, folder)
+        assert caught.value.remedy
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", PUBLIC_SETS)
+def test_public_sets_are_the_pinned_ones(name, data_dir):
+    task = load_task(name, data_dir)
+    assert task.train.images.shape == (60000, 28, 28)
+    assert task.test.images.shape == (10000, 28, 28)
+    assert np.bincount(task.train.labels).shape == (10,)
+    assert not task.split_here
+
+
+@pytest.mark.data
+def test_the_shipped_scene_is_the_first_200_test_images(data_dir):
+    from importlib import resources
+
+    task = load_task("fashion-mnist", data_dir)
+    scene = resources.files("pans.firmware_sim").joinpath("scenes/fashion200.npz")
+    with resources.as_file(scene) as path, np.load(path, allow_pickle=False) as arrays:
+        assert np.array_equal(arrays["images"], task.test.images[:200])
+        assert np.array_equal(arrays["labels"], task.test.labels[:200])
+        assert tuple(arrays["classes"].tolist()) == task.classes

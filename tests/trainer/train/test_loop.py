@@ -1,0 +1,375 @@
+"""Training: a tiny synthetic task end to end, budgets, repeatability, checkpoints, and what is refused."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+from pans.runtime.errors import DamagedFileError, PlanError, UsageError
+from pans.runtime.instrument.click_law import click_probability, object_transmission
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.device import computing_on
+from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
+from pans.trainer.model.detection import click_probability as torch_probability
+from pans.trainer.model.detection import click_words, sample_clicks, word_probabilities
+from pans.trainer.model.estimators import cross_entropy, decision_loss, similarity_loss
+from pans.trainer.model.heads import MlpHead
+from pans.trainer.options import Options, check_options
+from pans.trainer.tasks.registry import load_task
+from pans.trainer.train import schedule
+from pans.trainer.train.data import TrainingData, encoder_input
+from pans.trainer.train.head_fit import fit_head_exactly, joint_distribution
+from pans.trainer.train.loop import Run, train
+
+PROFILE = load_profile("oled-qcmos")
+SMALL = Options(features=4, alpha=1e-3, epochs=10, hidden=32, batch=64, front_rate=3e-2, head_rate=1e-2)
+
+
+def bars(n=600, seed=0):
+    """Four classes on 6 x 6 pixels: the bright bar stands in one of four columns, over noise."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 4, n)
+    images = rng.integers(0, 50, (n, 6, 6), dtype=np.uint8)
+    images[np.arange(n), :, labels + 1] = rng.integers(150, 256, (n, 6), dtype=np.uint8)
+    return images, labels
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bars") / "bars.npz"
+    images, labels = bars()
+    np.savez(path, images=images, labels=labels)
+    return load_task(str(path))
+
+
+def test_head_fits_a_joint_distribution_to_its_entropy():
+    rng = np.random.default_rng(0)
+    p, labels = torch.from_numpy(rng.uniform(0.1, 0.9, (500, 3))), torch.from_numpy(rng.integers(0, 3, 500))
+    p[labels == 1, 0] = 0.95
+    p[labels == 2, 1] = 0.05
+    joint = joint_distribution(p, labels, 3)
+    assert float(joint.sum()) == pytest.approx(1.0)
+    entropy = -float((joint * torch.log(joint / joint.sum(dim=1, keepdim=True))).sum())
+    head = MlpHead(3, 32, 3, torch.Generator().manual_seed(0))
+    head.norm.running_mean.copy_(p.mean(dim=0))
+    fit_head_exactly(head, joint, steps=300, rate=1e-2)
+    words = torch.tensor([[float(w >> i & 1) for i in range(3)] for w in range(8)])
+    loss = -float((joint * torch.log_softmax(head(words).detach().double(), 1)).sum())
+    assert entropy <= loss <= entropy + 1e-3
+
+
+@pytest.mark.parametrize("estimator", ["ste", "exact", "local", "disarm", "loo"])
+def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
+    options = Options(**(vars_of(SMALL) | {"estimator": estimator}))
+    reports = []
+    trained = train(task, PROFILE, options, report=reports.append)
+    light = trained.quantised.patterns() @ object_transmission(PROFILE, task.test.images.reshape(-1, 36)).T
+    p = torch.from_numpy(click_probability(trained.law, light.T))
+    words = torch.tensor([[float(w >> i & 1) for i in range(4)] for w in range(16)])
+    decided = trained.head(words).argmax(dim=1)
+    right = joint_distribution(p, torch.from_numpy(task.test.labels), 4)[torch.arange(16), decided].sum()
+    assert float(right) > 0.5  # by chance 0.25
+    assert trained.quantised.levels.max() < PROFILE.projector.levels
+    assert [report.epoch for report in reports] == list(range(1, 11))
+    assert reports[-1].loss < reports[0].loss
+    again = train(task, PROFILE, options)
+    assert np.array_equal(again.quantised.levels, trained.quantised.levels)
+    assert all(torch.equal(a, b) for a, b in zip(again.head.state_dict().values(), trained.head.state_dict().values()))
+
+
+def test_another_seed_gives_other_patterns(task):
+    first, other = (train(task, PROFILE, Options(features=3, epochs=1, hidden=8, seed=seed)) for seed in (0, 1))
+    assert not np.array_equal(first.quantised.levels, other.quantised.levels)
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [("clicks", 0.8, 1.4), ("photons", 1.4, 3.0)])
+def test_budgets_pull_towards_their_target(task, name, low, high):
+    free, held = [], []
+    options = vars_of(SMALL) | {"epochs": 40, "alpha": 0.0, "batch": 32}
+    train(task, PROFILE, Options(**options), report=free.append)
+    train(task, PROFILE, Options(**(options | {name: 1.1 if name == "clicks" else 2.2})), report=held.append)
+    assert getattr(free[-1], name) > 1.3 * getattr(held[-1], name)
+    assert low < getattr(held[-1], name) < high
+
+
+def test_restarts_keep_the_best(task):
+    options = vars_of(SMALL) | {"epochs": 3}
+    single = [train(task, PROFILE, Options(**(options | {"seed": seed}))) for seed in (0, 1, 2)]
+    best = train(task, PROFILE, Options(**(options | {"restarts": 3})))
+    losses = [one.validation_loss for one in single]
+    assert best.validation_losses == pytest.approx(losses)
+    assert np.array_equal(best.quantised.levels, single[int(np.argmin(losses))].quantised.levels)
+
+
+def test_with_several_shots_in_the_loss_restarts_are_judged_by_them_too(task):
+    data = TrainingData(task, PROFILE, SMALL)
+    run = Run(data, PROFILE, SMALL, 0)
+    for _ in range(5):
+        run.one_epoch()
+
+    def judged(mix):
+        run.options = replace(SMALL, mix=mix, shots=2)
+        return run.validation_loss()
+
+    zero, half, whole = judged(0.0), judged(0.5), judged(1.0)
+    assert half == pytest.approx((zero + whole) / 2)
+    # two shots by all pairs of words
+    p, target = run.probabilities(data.n_fit, len(data.labels)), data.target[data.n_fit :]
+    words, chances = click_words(4), word_probabilities(p)
+    with torch.no_grad():
+        scores = run.head((words.unsqueeze(0) + words.unsqueeze(1)).flatten(0, 1) / 2)
+        losses = cross_entropy(scores.unsqueeze(0), target.unsqueeze(1))  # (n, pairs)
+    pairs = (chances.unsqueeze(1) * chances.unsqueeze(2)).flatten(1)
+    assert whole == pytest.approx(float((pairs * losses).sum() / len(p)), rel=0.03)
+    assert whole < 0.97 * zero
+
+
+def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
+    options = Options(**(vars_of(SMALL) | {"epochs": 5, "restarts": 2}))
+    whole = train(task, PROFILE, options)
+
+    def interrupt(report):
+        if (report.restart, report.epoch) == (1, 3):
+            raise KeyboardInterrupt
+
+    checkpoint = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        train(task, PROFILE, options, checkpoint=checkpoint, report=interrupt)
+    seen = []
+    resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True, report=seen.append)
+    assert (seen[0].restart, seen[0].epoch) == (1, 3)  # the last whole epoch on disk is the one before
+    assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
+    assert resumed.validation_losses == whole.validation_losses
+
+
+def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_path):
+    options = Options(**(vars_of(SMALL) | {"epochs": 6, "starts": 3, "warm": 0.34, "polish": 0.5, "shots": 3}))
+    reports = []
+    whole = train(task, PROFILE, options, report=reports.append)
+    assert [(r.restart, r.epoch) for r in reports[:6]] == [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)]
+    assert [r.epoch for r in reports[6:]] == [3, 4, 5, 6]  # stage 2 once, from the best start
+    assert {r.stage for r in reports[6:8]} == {"exact"}
+    checkpoint = tmp_path / "state"
+    for stop in ((1, 2), (2, 5)):
+
+        def interrupt(report, stop=stop):
+            if (report.restart, report.epoch) == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            train(task, PROFILE, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=interrupt)
+    resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True)
+    assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
+    assert all(torch.equal(a, b) for a, b in zip(resumed.head.state_dict().values(), whole.head.state_dict().values()))
+
+
+def test_a_checkpoint_is_plain_arrays(task, tmp_path):
+    options = Options(**(vars_of(SMALL) | {"epochs": 1}))
+    train(task, PROFILE, options, checkpoint=tmp_path / "state")
+    with np.load(tmp_path / "state", allow_pickle=False) as arrays:
+        assert all(arrays[name].dtype != object for name in arrays.files)
+        tree = json.loads(arrays["tree"].tobytes())
+    assert tree["identity"]["features"] == "4"
+    assert os.listdir(tmp_path) == ["state"]  # nothing stays beside it
+
+
+@pytest.mark.parametrize(("encoder", "given"), [("coherent", 40.0), ("incoherent", 60.0)])
+def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given):
+    changed = {"encoder": encoder, "conserving": True, "input_photons": given, "alpha": 0.0, "dark": 0.01, "epochs": 15}
+    reports = []
+    trained = train(task, PROFILE, Options(**(vars_of(SMALL) | changed)), report=reports.append)
+    assert trained.quantised is None
+    assert trained.law.dark_per_exposure == 0.01
+    shown = encoder_input(task, task.train, PROFILE, trained.options)
+    arriving = shown.square().sum(dim=1).mean() if encoder == "coherent" else shown.sum(dim=1).mean()
+    assert float(arriving) == pytest.approx(given, rel=0.02)
+    assert reports[-1].photons <= given * 1.05
+    shown = encoder_input(task, task.test, PROFILE, trained.options)
+    with torch.no_grad():
+        p = sample_clicks(
+            torch_probability(trained.encoder(shown).double(), trained.law), torch.Generator().manual_seed(0)
+        )
+        right = (trained.head(p.float()).argmax(dim=1).numpy() == task.test.labels).mean()
+    assert right > 0.5  # by chance 0.25
+
+
+def test_pictures_can_be_given_back(task):
+    pictures = replace(task, target="image")
+    options = Options(**(vars_of(SMALL) | {"estimator": "local", "encoder": "coherent", "epochs": 8, "alpha": 0.0}))
+    reports = []
+    trained = train(pictures, PROFILE, options, report=reports.append)
+    assert reports[-1].loss < reports[0].loss
+    assert trained.head(torch.zeros(1, 4)).shape == (1, 36)
+
+
+def test_a_decision_loss_lowers_errors_at_the_cost_of_entropy():
+    scores = torch.tensor([[0.4, 0.5, -1.0]])
+    right, wrong = torch.tensor([1]), torch.tensor([0])
+    entropy, decided = decision_loss(0.0), decision_loss(1.0)
+    assert float(entropy(scores, right)) == pytest.approx(float(cross_entropy(scores, right)))
+    confident = 4 * scores  # the same decision, surer of it
+    assert float(decided(confident, right)) < float(decided(scores, right))
+    far = torch.tensor([[-20.0, 1.0, 0.0]])  # being utterly wrong costs cross-entropy without end, a decision only once
+    assert float(entropy(far, wrong)) > 20
+    assert float(decided(far, wrong)) < 0.4 * float(entropy(far, wrong))
+
+
+def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_path):
+    checkpoint = tmp_path / "state"
+    with pytest.raises(UsageError, match="not there"):
+        train(task, PROFILE, SMALL, checkpoint=checkpoint, resume=True)
+    train(task, PROFILE, Options(features=2, epochs=1, hidden=4), checkpoint=checkpoint)
+    with pytest.raises(UsageError, match="features 2 \\(now 3\\)"):
+        train(task, PROFILE, Options(features=3, epochs=1, hidden=4), checkpoint=checkpoint, resume=True)
+    checkpoint.write_bytes(b"damaged")
+    with pytest.raises(DamagedFileError, match="not a checkpoint"):
+        train(task, PROFILE, SMALL, checkpoint=checkpoint, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"features": 0}, "--features is 0"),
+        ({"features": 13}, "exact"),
+        ({"epochs": 0}, "--epochs"),
+        ({"batch": 1}, "--batch"),
+        ({"alpha": -1.0}, "--alpha"),
+        ({"photons": 0.0}, "--photons"),
+        ({"clicks": float("nan")}, "--clicks"),
+        ({"clicks": 4.0}, "below 4"),
+        ({"estimator": "magic"}, "ste, exact"),
+        ({"encoder": "magic"}, "active, coherent"),
+        ({"head": "magic"}, "mlp, conv"),
+        ({"dark": -1.0}, "--dark"),
+        ({"mix": 0.5}, "--shots"),
+        ({"polish": 1.5}, "--polish"),
+        ({"similarity": -0.1}, "--similarity"),
+        ({"seed": -1}, "--seed"),
+    ],
+)
+def test_impossible_options_are_refused(changed, said):
+    with pytest.raises(UsageError, match=said):
+        check_options(Options(**(vars_of(SMALL) | changed)), PROFILE)
+
+
+def test_more_patterns_than_the_hardware_holds_are_refused():
+    with pytest.raises(PlanError, match="pattern memory"):
+        check_options(Options(features=2000, estimator="ste"), PROFILE)
+    parallel = load_profile("wdm-snspd")
+    too_many = parallel.detector.channels + 1
+    with pytest.raises(PlanError, match="detector channels"):
+        check_options(Options(features=too_many, estimator="ste"), parallel)
+
+
+def test_train_and_evaluate_commands_agree(tmp_path, capsys):
+    images, labels = bars(400)
+    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
+    out = str(tmp_path / "bars.pans")
+    words = [
+        "train",
+        str(tmp_path / "bars.npz"),
+        "--features",
+        "4",
+        "--epochs",
+        "6",
+        "--hidden",
+        "16",
+        "-o",
+        out,
+        "--json",
+    ]
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {"bundle", "accuracy_mean", "clicks_mean", "photons_mean", "seconds"} <= set(said)
+    assert said["score_difference"] <= 1e-5
+    assert sorted(os.listdir(tmp_path)) == ["bars.npz", "bars.pans"]  # no checkpoint stays
+    assert main(["evaluate", out, "--task", str(tmp_path / "bars.npz"), "--exact", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["objects"] == 80  # trained on this very file: only what was held out
+    assert found["accuracy_mean"] == pytest.approx(said["accuracy_mean"])
+    keys = "accuracy_mean accuracy_std clicks_mean photons_mean illumination objects trials"
+    assert set(keys.split()) <= set(found)
+    bundle, _ = load_bundle(out)
+    test = load_task(str(tmp_path / "bars.npz")).test
+    assert evaluate_exactly(bundle, light_of(bundle, PROFILE, test.images), test.labels).accuracy_mean == pytest.approx(
+        found["accuracy_mean"]
+    )
+    images, labels = bars(100, seed=1)
+    np.savez(tmp_path / "others.npz", images=images, labels=labels)
+    other = ["evaluate", out, "--task", str(tmp_path / "others.npz"), "--trials", "3", "--shots", "2", "--json"]
+    assert main(other) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["objects"], found["trials"], found["shots"]) == (100, 3, 2)  # none of these were trained on
+
+
+def test_commands_say_what_is_wrong(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("PANS_DATA", raising=False)
+    out = str(tmp_path / "x.pans")
+    assert main(["train", "mnist", "--features", "4", "-o", out]) == 2
+    assert "PANS_DATA" in capsys.readouterr().err
+    assert main(["train", "mnist", "--features", "4", "-o", str(tmp_path / "no" / "x.pans")]) == 2
+    assert "is not a folder" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path / "absent.pans")]) == 2
+    assert main(["data", "list", "--data-dir", str(tmp_path), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert {row["state"] for row in rows} == {"missing"}
+    assert main(["data", "fetch", "nonsense", "--data-dir", str(tmp_path)]) == 2
+
+
+def test_a_device_that_is_not_there_is_refused_by_name(task, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    images, labels = bars(60)
+    np.savez(tmp_path / "bars.npz", images=images, labels=labels)
+    words = ["train", str(tmp_path / "bars.npz"), "--features", "4", "-o", str(tmp_path / "x.pans"), "--device", "cuda"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "no CUDA device" in said
+    assert "--device cpu" in said
+    assert not (tmp_path / "x.pans").exists()
+
+
+@pytest.mark.parametrize("name", ["cpu", *(["cuda"] if torch.cuda.is_available() else [])])
+def test_the_same_seed_gives_the_same_patterns_on_one_device(task, name):
+    options = replace(SMALL, epochs=2)
+    with computing_on(name):
+        first, second = (train(task, PROFILE, options) for _ in range(2))
+    assert np.array_equal(first.quantised.levels, second.quantised.levels)
+    assert torch.equal(first.head.hidden.weight, second.head.hidden.weight)
+    assert first.head.hidden.weight.device.type == "cpu"
+    assert torch.get_default_device().type == "cpu"
+
+
+def vars_of(options):
+    return {name: getattr(options, name) for name in Options.__dataclass_fields__}
+
+
+@pytest.mark.data
+def test_shipped_bundle_meets_its_bar(data_dir):
+    from importlib import resources
+
+    shipped = resources.files("pans.runtime").joinpath("shipped/fashion10.pans")
+    with resources.as_file(shipped) as path:
+        bundle, _ = load_bundle(path)
+    test = load_task("fashion-mnist", data_dir).test
+    found = evaluate_exactly(bundle, light_of(bundle, PROFILE, test.images[:200]), test.labels[:200])
+    assert found.accuracy_mean >= 0.75
+    assert found.clicks_mean <= 5.5
+    assert bundle.provenance["profile_sha256"] == PROFILE.sha256
+    assert evaluate_exactly(bundle, light_of(bundle, PROFILE, test.images), test.labels).accuracy_mean >= 0.72
+
+
+def test_similarity_waits_for_the_second_stage_where_there_is_one():
+    shown, wanted = torch.rand(2, 64), torch.rand(2, 64)
+    error, both = (similarity_loss(weight, (8, 8))(shown, wanted) for weight in (0.0, 0.9))
+    assert not torch.allclose(error, both)
+    two = Options(features=4, epochs=10, warm=0.5, similarity=0.9, estimator="disarm")
+    one = replace(two, estimator="ste")
+    for options, now, expected in ((two, 4.9, error), (two, 5.0, both), (two, 10.0, both), (one, 0.0, both)):
+        assert torch.equal(schedule.loss_at(options, now, (8, 8))(shown, wanted), expected)

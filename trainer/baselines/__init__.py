@@ -1,0 +1,1 @@
+"""The alternatives at equal photons."""

@@ -1,0 +1,210 @@
+"""Baselines, the common ground: light, detection and the score.
+
+Owns what every alternative to PANS shares: how N photons are dealt out, how they are detected, and how a result is counted.
+Never decides (baseline_bayes.py, baseline_nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a
+frame, or m = d_f patterns.
+
+Two conventions of "N photons" (`brightness`), both SIMULATED:
+
+- **source**: one source for all objects; N is the mean over the test objects, bright objects give more (the paper's
+  appendix on direct imaging, and `photons` everywhere in this project). How bright an object is then tells about it.
+- **object**: the source follows the object, so that every object gives N photons in expectation.
+
+Two detectors: `counting` (Poisson counts: ideal shot noise) and `binary` (a click when at least one photon came).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.incident import incident_intensity
+from pans.runtime.errors import UsageError
+from pans.trainer.evaluate.accuracy import Measured
+from pans.trainer.tasks.registry import Task
+
+BRIGHTNESS = ("source", "object")
+DETECTORS = ("counting", "binary")
+_BLOCK = 4096  # objects per piece of work, fewer if they are large
+_BLOCK_NUMBERS = 1 << 23  # pixels of all objects of a block: 32 MiB of float32
+_GRAY_MAX = np.float32(255)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Decide = Callable[[F32], I64]  # readouts (n, m) -> labels (n,)
+Report = Callable[[str, float], None]  # what is being done, and which part of it is done (0 to 1)
+
+
+def silent(_what: str, _done: float) -> None:
+    """A `Report` for nobody."""
+
+
+def named(what: str, report: Report) -> Report:
+    """Return a `Report` that passes on what it is told with `what` before it."""
+    return lambda words, done: report(f"{what}, {words}", done)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """Linear measurements of all objects of a task at unit light: rows (objects, m), times `unit`, are sums of transmission.
+
+    `full` (m,) is what an object of transmission 1 everywhere would give: the sum of each pattern.
+    """
+
+    train: NDArray[Any]
+    train_labels: I64
+    test: NDArray[Any]
+    test_labels: I64
+    n_classes: int
+    full: F32
+    unit: float
+    brightness: str
+    image_shape: tuple[int, int] | None  # of a frame; None when the m values are no picture
+
+    def photoelectrons(self, rows: NDArray[Any], photons: float, floor: float = 0.0) -> F32:
+        """Return expected photoelectrons, float32 (n, m), of `rows` at `photons` per object; `floor` lifts every transmission.
+
+        Dark objects stay dark: they give no light in either convention.
+        """
+        light = rows.astype(np.float32)
+        light *= np.float32(self.unit)
+        if floor:
+            light += np.float32(floor) * self.full
+        light *= np.float32(self._scale(light, photons))
+        return light
+
+    def illumination(self, photons: float) -> float:
+        """Return the sum of all pattern intensities, in photoelectrons per unit transmission, averaged over the test objects."""
+        light = self.test.astype(np.float32) * np.float32(self.unit)
+        return float(np.mean(self._scale(light, photons))) * float(self.full.sum(dtype=np.float64))
+
+    def _scale(self, light: F32, photons: float) -> Any:
+        if self.brightness == "source":
+            return photons / (float(self.test.sum(dtype=np.float64)) * self.unit / len(self.test))
+        sums = light.sum(axis=1, keepdims=True, dtype=np.float64)
+        return np.divide(photons, sums, out=np.zeros_like(sums), where=sums > 0)
+
+
+def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
+    """Measure all objects of `task` by `patterns` (d_f, pixels, at least 0), or pixel by pixel without them (direct imaging)."""
+    if brightness not in BRIGHTNESS:
+        raise UsageError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
+    n_pixels = math.prod(task.image_shape)
+    if not task.test.images.any():
+        raise UsageError(f"the test objects of {task.name} are black: no light can reach the detector")
+    shared = (task.train.labels, task.test.labels, len(task.classes))
+    if task.light != "transmission" or task.optics != "none":
+        return _incident_frames(task, patterns, brightness)
+    train, test = (part.images.reshape(len(part), n_pixels) for part in (task.train, task.test))
+    if patterns is None:
+        ones = np.ones(n_pixels, np.float32)
+        return Measurement(train, shared[0], test, shared[1], shared[2], ones, 1 / 255, brightness, task.image_shape)
+    if patterns.ndim != 2 or patterns.shape[1] != n_pixels or not (patterns >= 0).all() or not patterns.any():
+        raise UsageError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
+    weights = patterns.astype(np.float32).T
+    features = [_features(images, weights) for images in (train, test)]
+    full = weights.sum(axis=0)
+    return Measurement(features[0], shared[0], features[1], shared[1], shared[2], full, 1.0, brightness, None)
+
+
+def _incident_frames(task: Task, patterns: NDArray[np.floating] | None, brightness: str) -> Measurement:
+    """Frames of light that reaches us: a camera sees the intensity of a field, not its amplitude."""
+    if patterns is not None:
+        raise UsageError(
+            f"{task.name} is light that reaches us: no patterns can be thrown on it", remedy="direct imaging"
+        )
+    n_pixels = math.prod(task.image_shape)
+    train, test = (
+        incident_intensity(part.images, task.light, task.optics).reshape(-1, n_pixels)
+        for part in (task.train, task.test)
+    )
+    full = np.full(n_pixels, float(test.mean()), np.float32)  # so that a floor is a part of the mean light
+    labels, n_classes = (task.train.labels, task.test.labels), len(task.classes)
+    return Measurement(train, labels[0], test, labels[1], n_classes, full, 1.0, brightness, task.image_shape)
+
+
+def _features(images: NDArray[np.uint8], weights: F32) -> F32:
+    out = np.empty((len(images), weights.shape[1]), np.float32)
+    for rows in blocks(len(images), images.shape[1]):
+        out[rows] = (images[rows].astype(np.float32) / _GRAY_MAX) @ weights
+    return out
+
+
+def blocks(n: int, m: int) -> Iterator[slice]:
+    """Pieces of `n` rows of `m` numbers that fit into memory."""
+    step = max(1, min(_BLOCK, _BLOCK_NUMBERS // m))
+    return (slice(start, start + step) for start in range(0, n, step))
+
+
+# ---- detection ----
+
+
+def detect(photoelectrons: F32, detector: str, rng: np.random.Generator, dark: float = 0.0) -> F32:
+    """Return one readout per value: Poisson counts, or whether there was any; `dark` photoelectrons are added to each."""
+    readouts = np.empty(photoelectrons.shape, np.float32)
+    for rows in blocks(len(readouts), math.prod(readouts.shape[1:])):
+        counts = rng.poisson(photoelectrons[rows].astype(np.float64) + dark)
+        readouts[rows] = counts > 0 if detector == "binary" else counts
+    return readouts
+
+
+# ---- the score ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trials:
+    """What was decided: `right` (trials, objects), the readouts' clicks (objects,), expected photons (objects,)."""
+
+    right: NDArray[np.bool_]
+    clicks: F64
+    photons: F64
+    illumination: float
+
+    def measured(self, first: int | None = None) -> Measured:
+        """Return means over the first `first` objects (default: all), with the spread over trials and over objects apart.
+
+        `clicks_mean` counts readouts with at least one photon, for a counting detector too: what a binary one would report.
+        """
+        right = self.right[:, :first].astype(np.float64)
+        of_object, n = right.mean(axis=0), right.shape[1]
+        return Measured(
+            accuracy_mean=float(right.mean()),
+            accuracy_std=float(right.mean(axis=1).std(ddof=1)) if len(right) > 1 else 0.0,
+            accuracy_se_objects=float(of_object.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+            clicks_mean=float(self.clicks[:first].mean()),
+            photons_mean=float(self.photons[:first].mean()),
+            illumination=self.illumination,
+            objects=n,
+            trials=len(right),
+            shots=1,
+        )
+
+
+def run_trials(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    decide: Decide,
+    *,
+    trials: int,
+    seed: int,
+    dark: float = 0.0,
+) -> Trials:
+    """Detect every test object `trials` times at `photons` per object and let `decide` (readouts -> labels) judge."""
+    if not (trials >= 1 and 0 < photons < math.inf and 0 <= dark < math.inf):
+        raise UsageError(f"{trials} trials, {photons:g} photons, dark {dark:g}; allowed: from 1, above 0, from 0")
+    light = measurement.photoelectrons(measurement.test, photons)
+    rng = np.random.default_rng([seed, 1])
+    right = np.empty((trials, len(light)), bool)
+    clicks = np.zeros(len(light))
+    for trial in range(trials):
+        readouts = detect(light, detector, rng, dark)
+        clicks += (readouts > 0).sum(axis=1)
+        right[trial] = decide(readouts) == measurement.test_labels
+    return Trials(right, clicks / trials, light.sum(axis=1, dtype=np.float64), measurement.illumination(photons))

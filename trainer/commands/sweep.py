@@ -1,0 +1,145 @@
+"""`pans sweep`: a search over training options with optuna, shared by several processes or machines.
+
+Owns the search space, the storage and the walk over trials; each trial is an ordinary training. A trial is judged by the loss on the
+validation part of the training objects: the held-out objects stay unseen, whatever the sweep tries. Killed processes cost their
+trial in work and nothing else; the same command goes on, and several may run at once on one storage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.errors import UsageError
+from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
+
+NEEDS = "pip install 'pans-runtime[train,sweep]'"
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task", metavar="TASK", help="as of `pans train`")
+    parser.add_argument("--features", type=int, required=True, metavar="D", help="number of patterns")
+    parser.add_argument(
+        "--storage", required=True, metavar="FILE or URL", help="a journal file, or a database URL that machines share"
+    )
+    parser.add_argument("--study", metavar="NAME", help="default: from task, profile and patterns")
+    parser.add_argument(
+        "--trials", type=int, default=20, metavar="N", help="finished trials of the whole study (default 20)"
+    )
+    parser.add_argument("--profile", default="oled-qcmos", metavar="P", help="default: oled-qcmos")
+    parser.add_argument("--clicks", type=float, metavar="C", help="clicks per decision to aim for")
+    parser.add_argument("--photons", type=float, metavar="B", help="photoelectrons per decision to aim for")
+    parser.add_argument("--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local")
+    parser.add_argument("--epochs", type=int, default=30, metavar="E", help="of a trial (default 30)")
+    parser.add_argument("--hidden", type=int, default=128, metavar="H", help="hidden units of the head (default 128)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trainings (default 0)")
+    parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
+    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+
+
+def _run(args: argparse.Namespace) -> int:
+    try:
+        import optuna
+        import torch
+    except ModuleNotFoundError as error:
+        raise UsageError(f"a sweep needs the package {error.name}, which is not installed", remedy=NEEDS) from error
+    from pans.runtime.instrument.profile import load_profile
+    from pans.trainer.tasks.registry import load_task
+    from pans.trainer.train.loop import train
+
+    torch.set_num_threads(args.threads)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    profile = load_profile(args.profile)
+    base = _base(args)
+    check_options(base, profile)
+    task = load_task(args.task, args.data_dir)
+    name = args.study or f"{task.name}-{profile.name}-{args.features}"
+    started = time.perf_counter()
+    storage = open_storage(args.storage)
+    sampler = optuna.samplers.TPESampler(multivariate=True)  # unseeded: workers on one study must not repeat each other
+    study = optuna.create_study(
+        storage=storage, study_name=name, direction="minimize", sampler=sampler, load_if_exists=True
+    )
+    _check_same(study, base, task.sha256)
+
+    def objective(trial: Any) -> float:
+        trained = train(task, profile, suggest(trial, base))
+        say(f"trial {trial.number}: validation loss {trained.validation_loss:.4f}  {trial.params}")
+        return trained.validation_loss
+
+    finished = optuna.trial.TrialState.COMPLETE
+    try:
+        if sum(trial.state == finished for trial in study.trials) < args.trials:
+            study.optimize(objective, callbacks=[optuna.study.MaxTrialsCallback(args.trials, states=(finished,))])
+    except KeyboardInterrupt:
+        say(f"interrupted; finished trials are in {args.storage}\n  go on: the same command")
+        return EXIT_INTERRUPTED
+    done = [trial for trial in study.trials if trial.state == finished]
+    payload = {
+        "study": name,
+        "trials": len(done),
+        "best_loss": study.best_value,
+        "best": study.best_params,
+        "seconds": time.perf_counter() - started,
+        "simulated": True,
+    }
+    emit(
+        args, payload, f"{name}: {len(done)} trials, best validation loss {study.best_value:.4f}\n  {study.best_params}"
+    )
+    return EXIT_FINE
+
+
+def suggest(trial: Any, base: Options) -> Options:
+    """Return the options of one trial: rates, length of the first stage, batch, initial light, weight of the illumination."""
+    return replace(
+        base,
+        front_rate=trial.suggest_float("front_rate", 2e-3, 5e-2, log=True),
+        head_rate=trial.suggest_float("head_rate", 5e-4, 1e-2, log=True),
+        warm=trial.suggest_float("warm", 0.1, 0.6),
+        batch=trial.suggest_categorical("batch", [256, 512, 1024]),
+        light=trial.suggest_float("light", 0.1, 10.0, log=True),
+        alpha=trial.suggest_float("alpha", 1e-5, 1e-3, log=True),
+    )
+
+
+def open_storage(where: str) -> Any:
+    """Return the storage: a URL (`sqlite:///...`, `postgresql://...`) as it is, any other text as a journal file."""
+    if "://" in where:
+        return where
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+
+    path = Path(where)
+    if not path.resolve().parent.is_dir():
+        raise UsageError(f"{path.parent} is not a folder", remedy="make it first")
+    return JournalStorage(JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path))))
+
+
+def _base(args: argparse.Namespace) -> Options:
+    estimator = args.estimator or ("exact" if args.features <= EXACT_FEATURES_MAX else "local")
+    same = {name: getattr(args, name) for name in ("features", "clicks", "photons", "epochs", "hidden", "seed")}
+    return Options(estimator=estimator, alpha=DEFAULT_ALPHA, **same)
+
+
+def _check_same(study: Any, base: Options, data_sha256: str) -> None:
+    """A study holds trials of one question; UsageError when this one is another."""
+    wanted = {
+        "data": data_sha256,
+        **{key: str(getattr(base, key)) for key in ("clicks", "photons", "estimator", "epochs", "hidden")},
+    }
+    found = study.user_attrs
+    differing = [f"{key} {found[key]} (now {value})" for key, value in wanted.items() if found.get(key, value) != value]
+    if differing:
+        raise UsageError(
+            f"the study {study.study_name} is another: {', '.join(differing)}", remedy="give it a name by --study"
+        )
+    for key, value in wanted.items():
+        if key not in found:
+            study.set_user_attr(key, value)
+
+
+SWEEP = Command("search training options with optuna, in several processes or machines", _configure, _run)

@@ -1,0 +1,1 @@
+"""Accuracy against photons, information, pictures of a bundle."""

@@ -1,0 +1,229 @@
+"""Accuracy against photons: what a bundle decides on held-out objects through a profile's optics and detector.
+
+Owns the sampled and the exact evaluation; numpy and the runtime only, no torch. Both return a `Measured` that always holds
+clicks, photons and illumination together. SIMULATED figures: the click law of the profile, no instrument.
+
+The spread over repeated trials (shot noise) and the spread over objects (a different test set) are kept apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.decide.backends import PictureDecider, make_decider
+from pans.runtime.errors import UsageError
+from pans.runtime.image_quality import likeness
+from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.model.quantise import exposure_us_of
+
+EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
+_CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Means per decision. `accuracy_std` is the spread over trials, `accuracy_se_objects` the error from having few objects."""
+
+    accuracy_mean: float
+    accuracy_std: float
+    accuracy_se_objects: float
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    objects: int
+    trials: int  # 0: exact, no trials were needed
+    shots: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Light:
+    """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks."""
+
+    photoelectrons: F64
+    probability: F64
+    law: ClickLaw
+    illumination: float  # of one shot
+
+
+def light_of(
+    bundle: Bundle, profile: Profile, images: NDArray[np.uint8], *, eta: float = 1.0, dark: float | None = None
+) -> Light:
+    """Show the patterns of `bundle` on `images` (n, height, width) through `profile`, or look at them through its passive optics.
+
+    `eta` scales the light.
+
+    `dark` replaces the profile's dark photoelectrons per exposure.
+    """
+    if images.shape[1:] != bundle.image_shape:
+        raise UsageError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
+    if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
+        raise UsageError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
+    if bundle.analyser is None:
+        exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
+    else:
+        exposure_us = bundle.analyser.exposure_us
+    law = click_law(profile, exposure_us)
+    if dark is not None:
+        law = ClickLaw(dark, law.read_noise_e, law.threshold_e)
+    if bundle.analyser is not None:
+        light = bundle.analyser.photoelectrons(images) * eta
+        return Light(light, click_probability(law, light), law, 0.0)
+    patterns = bundle.patterns() * eta
+    light = np.empty((len(images), bundle.n_features))
+    step = max(1, _CHUNK_NUMBERS // bundle.n_pixels)
+    for start in range(0, len(images), step):
+        part = images[start : start + step]
+        light[start : start + step] = object_transmission(profile, part.reshape(len(part), -1)) @ patterns.T
+    return Light(light, click_probability(law, light), law, bundle.illumination() * eta)
+
+
+def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:
+    """Enumerate all (shots + 1)**d_f count vectors: the expected accuracy without trials.
+
+    `accuracy_std` is then the exact spread that trials over these objects would show.
+    """
+    right = decision_shares(bundle, light, shots=shots)[np.arange(len(labels)), labels]
+    n = len(labels)
+    over_trials = math.sqrt(float((right * (1 - right)).sum())) / n
+    return _measured(light, right, over_trials, trials=0, shots=shots)
+
+
+def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
+    """Return P(decided class | object), float64 (n, classes), by enumeration of all (shots + 1)**d_f count vectors."""
+    outcomes = (shots + 1) ** bundle.n_features
+    if outcomes > EXACT_OUTCOMES_MAX:
+        raise UsageError(
+            f"{shots} shots of {bundle.n_features} patterns have {outcomes} outcomes, allowed: {EXACT_OUTCOMES_MAX}",
+            remedy="use --trials instead of --exact",
+        )
+    digits = (shots + 1) ** np.arange(bundle.n_features)
+    counts = (np.arange(outcomes)[:, None] // digits) % (shots + 1)
+    decided = make_decider(bundle, shots=shots).decide_batch(counts, shots)
+    of_class = np.eye(bundle.n_classes)[decided]
+    shares = np.empty((len(light.probability), bundle.n_classes))
+    step = max(1, _CHUNK_NUMBERS // outcomes)
+    for start in range(0, len(shares), step):
+        shares[start : start + step] = outcome_probabilities(light.probability[start : start + step], shots) @ of_class
+    return np.clip(shares, 0.0, 1.0)
+
+
+def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int, seed: int) -> F64:
+    """Return the share of `trials` decisions per object and class, float64 (n, classes)."""
+    decider, rng = make_decider(bundle, shots=shots), np.random.default_rng(seed)
+    objects = np.arange(len(light.probability))
+    decided = np.zeros((len(objects), bundle.n_classes), np.int64)
+    for _ in range(trials):
+        decided[objects, decider.decide_batch(rng.binomial(shots, light.probability), shots)] += 1
+    return decided / trials
+
+
+def outcome_probabilities(probability: F64, shots: int) -> F64:
+    """Return P(count vector | object), (n, (shots + 1)**d_f), from click probabilities (n, d_f); pattern 0 varies fastest."""
+    n, d_f = probability.shape
+    chance = np.ones((n, 1))
+    for i in range(d_f):
+        p = probability[:, i : i + 1]
+        k = np.arange(shots + 1)
+        ways = np.array([math.comb(shots, int(j)) for j in k], dtype=np.float64)
+        of_pattern = ways * p**k * (1 - p) ** (shots - k)
+        chance = (of_pattern[:, :, None] * chance[:, None, :]).reshape(n, -1)
+    return chance
+
+
+def evaluate_sampled(
+    bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1, trials: int = 30, seed: int = 0
+) -> Measured:
+    """Sample `trials` independent decisions per object, each from `shots` shots."""
+    if trials < 1:
+        raise UsageError(f"--trials is {trials}, allowed: 1 or more")
+    decider = make_decider(bundle, shots=shots)
+    rng = np.random.default_rng(seed)
+    right = np.zeros(len(labels))
+    of_trial = np.empty(trials)
+    clicks = 0
+    for trial in range(trials):
+        counts = rng.binomial(shots, light.probability)
+        clicks += int(counts.sum())
+        hit = decider.decide_batch(counts, shots) == labels
+        right += hit
+        of_trial[trial] = hit.mean()
+    spread = float(of_trial.std(ddof=1)) if trials > 1 else 0.0
+    return _measured(light, right / trials, spread, trials=trials, shots=shots, clicks=clicks / (trials * len(labels)))
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredPictures:
+    """Means per picture given back. `ssim_std` is the spread over trials, `ssim_se_objects` the error from having few objects."""
+
+    ssim_mean: float
+    ssim_std: float
+    ssim_se_objects: float
+    mse_mean: float
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    objects: int
+    trials: int
+    shots: int
+
+
+def evaluate_pictures(
+    bundle: Bundle, light: Light, images: NDArray[np.uint8], *, shots: int = 1, trials: int = 1, seed: int = 0
+) -> MeasuredPictures:
+    """Give back `trials` pictures of every object from `shots` shots and compare them with its image, uint8 (n, height, width)."""
+    if trials < 1:
+        raise UsageError(f"--trials is {trials}, allowed: 1 or more")
+    decider = PictureDecider(bundle)
+    rng = np.random.default_rng(seed)
+    likes, of_trial, squares, clicks = np.zeros(len(images)), np.empty(trials), 0.0, 0
+    step = max(1, _CHUNK_NUMBERS // (64 * bundle.n_outputs))
+    for trial in range(trials):
+        found = np.empty(len(images))
+        for start in range(0, len(images), step):
+            counts = rng.binomial(shots, light.probability[start : start + step])
+            clicks += int(counts.sum())
+            alike = likeness(decider.pictures(counts, shots), images[start : start + step])
+            found[start : start + step] = alike.ssim
+            squares += float(alike.mse.sum())
+        likes += found
+        of_trial[trial] = found.mean()
+    n = len(images)
+    return MeasuredPictures(
+        ssim_mean=float(likes.mean()) / trials,
+        ssim_std=float(of_trial.std(ddof=1)) if trials > 1 else 0.0,
+        ssim_se_objects=float((likes / trials).std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+        mse_mean=squares / (n * trials),
+        clicks_mean=clicks / (n * trials),
+        photons_mean=shots * float(light.photoelectrons.sum()) / n,
+        illumination=light.illumination * shots,
+        objects=n,
+        trials=trials,
+        shots=shots,
+    )
+
+
+def _measured(
+    light: Light, right: F64, spread: float, *, trials: int, shots: int, clicks: float | None = None
+) -> Measured:
+    n = len(right)
+    scale = shots * float(light.photoelectrons.sum()) / n
+    expected = shots * float(light.probability.sum()) / n
+    return Measured(
+        accuracy_mean=float(right.mean()),
+        accuracy_std=spread,
+        accuracy_se_objects=float(right.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0,
+        clicks_mean=expected if clicks is None else clicks,
+        photons_mean=scale,
+        illumination=light.illumination * shots,
+        objects=n,
+        trials=trials,
+        shots=shots,
+    )

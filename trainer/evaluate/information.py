@@ -1,0 +1,230 @@
+"""How much the readouts know of the label: exact for click words, bounded for frames, and Fisher's ratio (paper, Fig. 2C).
+
+Owns mutual information, the Bayes error and Fisher discriminant ratios against photons; never trains an encoder. numpy
+only, float64. Entropies are in bits.
+
+- **Click words** (`word_information`): all (shots + 1)**d_f count vectors are enumerated, so that I(label; clicks) of a set of
+  objects is a sum, not an estimate. On the training objects it is optimistic about new ones: the held-out figures (posterior
+  table from the training objects, judged on held-out ones) are the ones to quote.
+- **Frames** (`posterior_information`): nothing can be enumerated. A posterior q gives I >= H(label) - E[-log2 q(label)],
+  whatever q is; the gap is how wrong q is. The mixture over the training objects knows the noise exactly and the world only as
+  far as those objects go: at few photons the bound is tight, at many it is not (a network may know more).
+- **Fisher ratio** (`fisher`): exact from the mean and variance of every readout; shot noise is part of the within-class spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.click_law import ClickLaw, click_probability
+
+from .accuracy import outcome_probabilities
+
+OUTCOMES_MAX = 1 << 16  # 16 patterns at one shot
+SMOOTHING = 1e-9  # of a word's probability, given to every class: words that no training object shows say nothing
+DISCRIMINANT_MAX = 2048
+_CHUNK_NUMBERS = 1 << 22
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """What click words know. `heldout_bits` is a lower bound for new objects; `bits` is exact for the training objects."""
+
+    photons: float
+    clicks: float
+    label_bits: float  # entropy of the label: the most that could be known
+    bits: float
+    bayes_accuracy: float
+    heldout_bits: float
+    heldout_bayes_accuracy: float
+
+
+def word_joint(probability: F64, labels: I64, n_classes: int, shots: int = 1) -> F64:
+    """Return P(count vector, label), float64 ((shots + 1)**d_f, classes), over objects with click probabilities (n, d_f).
+
+    Row index: pattern 0 is the lowest digit, as in a bundle's table. UsageError beyond `OUTCOMES_MAX` outcomes.
+    """
+    outcomes = (shots + 1) ** probability.shape[1]
+    if outcomes > OUTCOMES_MAX:
+        raise UsageError(
+            f"{probability.shape[1]} patterns at {shots} shots: {outcomes} outcomes, allowed: {OUTCOMES_MAX}"
+        )
+    joint = np.zeros((outcomes, n_classes))
+    for rows, chance in _chunks(probability, shots):
+        joint += chance.T @ (labels[rows, None] == np.arange(n_classes)).astype(np.float64)
+    return joint / len(labels)
+
+
+def _chunks(probability: F64, shots: int) -> Iterator[tuple[slice, F64]]:
+    """Pieces of the objects, and P(count vector | object) of each."""
+    step = max(1, _CHUNK_NUMBERS // (shots + 1) ** probability.shape[1])
+    for start in range(0, len(probability), step):
+        rows = slice(start, start + step)
+        yield rows, outcome_probabilities(probability[rows], shots)
+
+
+def mutual_information_bits(joint: F64) -> float:
+    """Return I(row; column) of a joint distribution, in bits: at least 0, at most the smaller entropy."""
+    rows, columns = joint.sum(axis=1, keepdims=True), joint.sum(axis=0, keepdims=True)
+    there = joint > 0
+    ratio = np.divide(joint, rows * columns, out=np.ones_like(joint), where=there)
+    return max(0.0, float((joint[there] * np.log2(ratio[there])).sum()))
+
+
+def entropy_bits(distribution: F64) -> float:
+    """Return the entropy of a distribution, in bits."""
+    there = distribution[distribution > 0]
+    return float(-(there * np.log2(there)).sum())
+
+
+def word_information(
+    train: F64,
+    train_labels: I64,
+    test: F64,
+    test_labels: I64,
+    n_classes: int,
+    *,
+    law: ClickLaw = ClickLaw(),  # noqa: B008  frozen
+    shots: int = 1,
+) -> Information:
+    """Return what the click words of an encoder know, exactly; `train` and `test` are photoelectrons per exposure (n, d_f).
+
+    `photons` and `clicks` are means over the test objects and all shots. Enumeration: (shots + 1)**d_f up to 65536.
+    """
+    p_train, p_test = click_probability(law, train), click_probability(law, test)
+    joint = word_joint(p_train, train_labels, n_classes, shots)
+    smooth = joint + SMOOTHING * joint.sum(axis=0)
+    log_posterior = np.log2(smooth / smooth.sum(axis=1, keepdims=True))
+    decided = log_posterior.argmax(axis=1)
+    heldout = word_joint(p_test, test_labels, n_classes, shots)
+    label_bits = entropy_bits(heldout.sum(axis=0))
+    return Information(
+        photons=shots * float(test.sum()) / len(test),
+        clicks=shots * float(p_test.sum()) / len(test),
+        label_bits=label_bits,
+        bits=mutual_information_bits(joint),
+        bayes_accuracy=float(joint.max(axis=1).sum()),
+        heldout_bits=label_bits + float((heldout * log_posterior).sum()),
+        heldout_bayes_accuracy=float(heldout[np.arange(len(decided)), decided].sum()),
+    )
+
+
+# ---- frames ----
+
+
+@dataclass(frozen=True, slots=True)
+class PosteriorInformation:
+    """Of a sampled posterior. `lower_bits` bounds I(label; readout) from below, up to its standard error `lower_bits_se`.
+
+    `believed_bits` is H(label) minus the mean entropy of the posterior: what the posterior thinks it knows. It is exact if
+    the posterior is right (objects drawn from the mixture itself), and too high for new objects by over-confidence: the
+    difference of the two shows the bias. `temperature` divided the log posterior to make the bound tight.
+    """
+
+    label_bits: float
+    lower_bits: float
+    lower_bits_se: float
+    believed_bits: float
+    temperature: float
+
+
+def posterior_information(log_joint: F64, labels: I64) -> PosteriorInformation:
+    """Return bounds from log P(readout, class) (n, classes), as `baseline_bayes.log_joint` gives, and the true labels (n,).
+
+    One half of the readouts chooses the temperature for the other half, so that the bound stays a bound.
+    """
+    log_posterior = _log_softmax(log_joint)
+    n, n_classes = log_joint.shape
+    half = np.arange(n) % 2 == 0
+    temperatures = [_best_temperature(log_posterior[part], labels[part]) for part in (~half, half)]
+    of_row = np.where(half, *temperatures)[:, None]
+    tempered = _log_softmax(log_posterior / of_row)
+    surprise = -tempered[np.arange(n), labels] / np.log(2)
+    label_bits = entropy_bits(np.bincount(labels, minlength=n_classes) / n)
+    plain = np.exp(log_posterior)
+    entropy = -(plain * np.maximum(log_posterior, -1e4)).sum(axis=1) / np.log(2)
+    return PosteriorInformation(
+        label_bits=label_bits,
+        lower_bits=label_bits - float(surprise.mean()),
+        lower_bits_se=float(surprise.std(ddof=1)) / float(np.sqrt(n)),
+        believed_bits=label_bits - float(entropy.mean()),
+        temperature=float(np.mean(temperatures)),
+    )
+
+
+def _log_softmax(rows: F64) -> F64:
+    finite = np.maximum(rows, rows.max(axis=1, keepdims=True) - 1e6)  # a class that is ruled out stays a number
+    return finite - np.logaddexp.reduce(finite, axis=1, keepdims=True)
+
+
+def _best_temperature(log_posterior: F64, labels: I64) -> float:
+    candidates = np.geomspace(0.5, 1e8, 140)  # a mixture is over-confident in proportion to the photons
+    at = np.arange(len(labels))
+    surprise = [-_log_softmax(log_posterior / t)[at, labels].mean() for t in candidates]
+    return float(candidates[int(np.argmin(surprise))])
+
+
+# ---- Fisher ----
+
+
+@dataclass(frozen=True, slots=True)
+class FisherRatio:
+    """`trace` = tr(S_between) / tr(S_within); `discriminant` = tr(S_within^-1 S_between), over the best linear combinations.
+
+    The discriminant is None beyond `DISCRIMINANT_MAX` readouts, whose scatter matrix would fill the memory.
+    """
+
+    trace: float
+    discriminant: float | None
+
+
+def fisher(mean: F64, variance: F64, labels: I64) -> FisherRatio:
+    """Return Fisher's ratios of readouts that are independent given the object: `mean`, `variance` (objects, m) of each.
+
+    Within-class scatter is that of the objects' means plus the noise; classes weigh by their objects. Counting: mean =
+    variance = lambda. Clicks: p and p(1-p). Exact: nothing is sampled.
+    """
+    if mean.shape != variance.shape or len(mean) != len(labels):
+        raise UsageError(
+            f"means are {mean.shape}, variances {variance.shape}, labels {labels.shape}; allowed: (n, m), (n,)"
+        )
+    return _Scatter(mean, labels).ratio(variance.mean(axis=0))
+
+
+def fisher_of_frames(light: F64, labels: I64, photons: Sequence[float]) -> list[FisherRatio]:
+    """Return Fisher's ratios of counted readouts at every photon level; `light` (objects, m) is relative, one source for all.
+
+    The scatter is computed once: light at eta has eta**2 times the scatter and eta times the noise.
+    """
+    per_object, scatter = float(light.sum()) / len(light), _Scatter(light, labels)
+    return [scatter.ratio(light.mean(axis=0) * (per_object / level)) for level in photons]
+
+
+class _Scatter:
+    """Between-class and within-class scatter of the objects' means, without noise."""
+
+    def __init__(self, mean: F64, labels: I64) -> None:
+        classes, members = np.unique(labels, return_inverse=True)
+        weight = np.bincount(members) / len(mean)
+        of_class = np.stack([mean[members == c].mean(axis=0) for c in range(len(classes))])
+        self.offsets = (of_class - mean.mean(axis=0)) * np.sqrt(weight)[:, None]
+        apart = mean - of_class[members]
+        self.within_trace = float((apart**2).sum()) / len(mean)
+        self.within = apart.T @ apart / len(mean) if mean.shape[1] <= DISCRIMINANT_MAX else None
+
+    def ratio(self, noise: F64) -> FisherRatio:
+        """The ratios when every readout has the variance `noise` (m,) beside the scatter."""
+        trace = float((self.offsets**2).sum()) / (self.within_trace + float(noise.sum()))
+        if self.within is None:
+            return FisherRatio(trace, None)
+        seen = noise > 0  # readouts without noise are constant in every object: no light ever reaches them
+        total, offsets = self.within[np.ix_(seen, seen)] + np.diag(noise[seen]), self.offsets[:, seen]
+        return FisherRatio(trace, float((offsets * np.linalg.solve(total, offsets.T).T).sum()))

@@ -1,0 +1,112 @@
+"""Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns.
+
+Owns which pictures there are and what is on them; the measuring is evaluate.py's. All are SIMULATED, and say so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.decide.backends import PictureDecider, make_decider
+from pans.runtime.image_quality import likeness
+from pans.runtime.report import figures as page_figures
+from pans.trainer.figures import new_figure, save_figure
+from pans.trainer.tasks.registry import Objects
+
+from .accuracy import Light
+from .tsne import tsne
+
+MAPPED_OBJECTS = 600
+SHOWN_PICTURES = 8
+
+
+def write_pictures(
+    folder: Path, bundle: Bundle, light: Light, objects: Objects, *, shots: int, seed: int
+) -> list[Path]:
+    """Write the pictures that this bundle has into `folder` and return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    matrix = np.abs(bundle.analyser.matrix) if bundle.analyser is not None else bundle.patterns()
+    unit = "photoelectrons per exposure\nand unit transmission" if bundle.analyser is None else "modulus of W"
+    written = [folder / "patterns.png"]
+    written[0].write_bytes(page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit))
+    rng = np.random.default_rng(seed)
+    counts = rng.binomial(shots, light.probability)
+    if bundle.picture_shape is not None:
+        return [*written, _given_back(folder / "pictures.png", bundle, counts, objects.images, shots)]
+    written.append(_confusion(folder / "confusion.png", bundle, counts, objects.labels, shots))
+    if len(objects) > 100:
+        written.append(_map(folder / "tsne.png", bundle, light, counts / shots, objects.labels))
+    return written
+
+
+def _confusion(path: Path, bundle: Bundle, counts: NDArray[np.int64], labels: NDArray[np.int64], shots: int) -> Path:
+    """One sampled decision per object, truth against decision."""
+    table = np.zeros((bundle.n_classes, bundle.n_classes), np.int64)
+    np.add.at(table, (labels, make_decider(bundle, shots=shots).decide_batch(counts, shots)), 1)
+    size = min(9.0, 3.0 + 0.42 * bundle.n_classes)
+    figure, axis = new_figure(width=size + 1.2, height=size, panels=1)
+    share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
+    shown = axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    if bundle.n_classes <= 20:
+        for (row, column), value in np.ndenumerate(share):
+            if value >= 0.005:
+                ink = "white" if value > 0.55 else "black"
+                axis.text(column, row, f"{100 * value:.0f}", ha="center", va="center", fontsize=8, color=ink)
+    places = range(bundle.n_classes)
+    axis.set_xticks(places, bundle.classes, rotation=60, ha="right")
+    axis.set_yticks(places, bundle.classes)
+    right = float(np.trace(table) / max(table.sum(), 1))
+    axis.set(
+        xlabel="decision", ylabel="truth", title=f"{bundle.name}: {100 * right:.1f} % right, K = {shots} (SIMULATED)"
+    )
+    figure.colorbar(shown, ax=axis, label="share of the truth's decisions (numbers: %)", shrink=0.8)
+    save_figure(figure, path)
+    return path
+
+
+def _map(path: Path, bundle: Bundle, light: Light, means: NDArray[np.float64], labels: NDArray[np.int64]) -> Path:
+    """t-SNE of what the detector would see on average, and of the clicks that it did see."""
+    n = min(MAPPED_OBJECTS, len(labels))
+    perplexity = min(30.0, (n - 1) / 4)
+    figure, axes = new_figure(width=11.0, height=5.0)
+    for axis, features, title in (
+        (axes[0], light.probability[:n], "click probabilities"),
+        (axes[1], means[:n], "clicks, one decision per object"),
+    ):
+        place = tsne(features, perplexity=perplexity)
+        for label in range(bundle.n_classes):
+            chosen = labels[:n] == label
+            name = bundle.classes[label] if bundle.n_classes <= 20 else None
+            axis.scatter(place[chosen, 0], place[chosen, 1], s=9, color=f"C{label}" if label < 10 else None, label=name)
+        axis.set(title=title, xticks=[], yticks=[])
+    if bundle.n_classes <= 20:
+        axes[1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    said = f"{bundle.name}: t-SNE of {n} objects, {bundle.n_features} features (SIMULATED)"
+    figure.suptitle(f"{said}; distances mean no more than near or far", fontsize=9)
+    save_figure(figure, path)
+    return path
+
+
+def _given_back(path: Path, bundle: Bundle, counts: NDArray[np.int64], images: NDArray[np.uint8], shots: int) -> Path:
+    """The first objects above, what came back below."""
+    chosen = slice(0, min(SHOWN_PICTURES, len(images)))
+    pictures = PictureDecider(bundle).pictures(counts[chosen], shots)
+    alike = likeness(pictures, images[chosen])
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(
+        2, len(pictures), figsize=(1.35 * len(pictures), 3.3), layout="constrained", squeeze=False
+    )
+    for column, (truth, picture) in enumerate(zip(images[chosen], pictures)):
+        axes[0, column].imshow(truth, cmap="gray", vmin=0, vmax=255)
+        axes[1, column].imshow(picture, cmap="gray", vmin=0, vmax=1)
+        axes[1, column].set_title(f"SSIM {alike.ssim[column]:.2f}\n{int(counts[column].sum())} clicks", fontsize=8)
+        for axis in axes[:, column]:
+            axis.set_axis_off()
+    figure.suptitle(f"{bundle.name}: true above, given back below, K = {shots} (SIMULATED)", fontsize=9)
+    save_figure(figure, path)
+    return path

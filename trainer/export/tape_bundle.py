@@ -1,0 +1,124 @@
+"""`python -m pans.trainer.export.tape_bundle`: a bundle for a tape of bars, one bar per pattern, with guard bands and an exact table.
+
+Owns the layout of the patterns and the exact decision; nothing is trained: a window has 1024 strings, so that the Bayes table and
+its accuracy are sums. Light falls on the middle of each bar alone: a tape that stands a little beside its place, or moves during the
+exposure, changes nothing as long as it is off by less than the guard band. A table is made for one dark rate; make another for another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle, make_bundle, write_bundle
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.tasks.barcode import CLASSES, N_BARS, all_strings
+
+F64 = NDArray[np.float64]
+FLOOR = 1e-6  # of a posterior in the table
+
+
+def bar_patterns(pixels_per_bar: int, lit_px: int) -> NDArray[np.uint8]:
+    """Return one pattern per bar, 1 on the `lit_px` pixels in its middle: uint8 (10, 10 * pixels_per_bar)."""
+    if not 1 <= lit_px <= pixels_per_bar or (pixels_per_bar - lit_px) % 2:
+        raise UsageError(
+            f"{lit_px} lit pixels of {pixels_per_bar}: allowed are 1 to {pixels_per_bar}, with equal guard bands"
+        )
+    guard = (pixels_per_bar - lit_px) // 2
+    lit = np.zeros((N_BARS, N_BARS, pixels_per_bar), np.uint8)
+    lit[np.arange(N_BARS), np.arange(N_BARS), guard : guard + lit_px] = 1
+    return lit.reshape(N_BARS, -1)
+
+
+def word_probabilities(photons: float, dark: float) -> F64:
+    """Return P(word | string), float64 (strings, words): bit i of a word is the click of bar i, `photons` of a bright bar."""
+    bars, _ = all_strings()
+    p = -np.expm1(-(photons * bars.astype(np.float64) + dark))
+    words = (np.arange(1 << N_BARS)[:, None] >> np.arange(N_BARS)) & 1
+    result = np.ones((len(bars), len(words)))
+    for bar in range(N_BARS):
+        result *= np.where(words[:, bar] == 1, p[:, bar : bar + 1], 1 - p[:, bar : bar + 1])
+    return result
+
+
+def exact_table(photons: float, dark: float) -> tuple[NDArray[np.float32], float, float]:
+    """Return log posteriors float32 (words, 2) for uniform strings, and the exact accuracy and mean clicks of deciding by them."""
+    _, labels = all_strings()
+    given = word_probabilities(photons, dark) / len(labels)
+    joint = np.stack([given[labels == label].sum(axis=0) for label in range(len(CLASSES))], axis=1)
+    clicks = float((given.sum(axis=0) * np.array([int(word).bit_count() for word in range(len(joint))])).sum())
+    posterior = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1e-300)
+    return np.log(np.maximum(posterior, FLOOR)).astype(np.float32), float(joint.max(axis=1).sum()), clicks
+
+
+def tape_bundle(
+    profile: Profile, *, photons: float, dark: float, pixels_per_bar: int, lit_px: int, exposure_us: float
+) -> tuple[Bundle, dict[str, Any]]:
+    """Return the bundle, for exposures of `exposure_us`, and its exact figures; UsageError where the projector is not bright enough."""
+    levels = profile.projector.levels
+    top = profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6
+    level = round(photons / lit_px / top * (levels - 1))
+    if not 1 <= level < levels:
+        raise UsageError(
+            f"{photons:g} photoelectrons on {lit_px} pixels need level {level} of {levels - 1} in {exposure_us:g} us",
+            remedy="another exposure, or more lit pixels",
+        )
+    shown = level / (levels - 1) * top * lit_px
+    table, accuracy, clicks = exact_table(shown, dark)
+    figures = {
+        "exact_accuracy": accuracy,
+        "clicks_mean": clicks,
+        "photons_mean": shown * N_BARS / 2,
+        "photons_per_bright_bar": shown,
+        "dark": dark,
+    }
+    bundle = make_bundle(
+        name=f"tape, one bar per pattern, dark {dark:g}",
+        task="barcode",
+        classes=CLASSES,
+        image_shape=(1, N_BARS * pixels_per_bar),
+        levels=levels,
+        pattern_levels=bar_patterns(pixels_per_bar, lit_px).astype(np.uint16) * level,
+        photons_per_level=top / (levels - 1),
+        table=table,
+        provenance={
+            "made_by": "pans.trainer.export.tape_bundle",
+            "profile": profile.name,
+            "exposure_us": exposure_us,
+            **figures,
+        },
+    )
+    return bundle, figures
+
+
+def main() -> None:
+    """Write the bundle and print its exact figures as JSON."""
+    parser = argparse.ArgumentParser(description="a bundle for a tape of bars: one bar per pattern, exact table")
+    parser.add_argument("--profile", default="flow-snspd", help="hardware profile (default flow-snspd)")
+    parser.add_argument("--photons", type=float, default=8.0, help="photoelectrons of a bright bar (default 8)")
+    parser.add_argument("--dark", type=float, default=0.0, help="dark photoelectrons per exposure (default 0)")
+    parser.add_argument("--pixels-per-bar", type=int, default=8, help="default 8")
+    parser.add_argument("--lit-px", type=int, default=2, help="lit pixels in the middle of a bar (default 2)")
+    parser.add_argument("--exposure-us", type=float, default=5.0, help="default 5")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="the bundle to write")
+    args = parser.parse_args()
+    bundle, figures = tape_bundle(
+        load_profile(args.profile),
+        photons=args.photons,
+        dark=args.dark,
+        pixels_per_bar=args.pixels_per_bar,
+        lit_px=args.lit_px,
+        exposure_us=args.exposure_us,
+    )
+    write_bundle(bundle, args.out)
+    print(json.dumps({"bundle": str(args.out), **figures}))
+
+
+if __name__ == "__main__":
+    main()

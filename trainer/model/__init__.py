@@ -1,0 +1,1 @@
+"""Differentiable parts: detection, encoders, heads, estimators, quantisation, SSIM."""

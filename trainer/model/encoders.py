@@ -1,0 +1,196 @@
+"""Encoders: from what an object shows to the photoelectrons of every exposure or detector.
+
+Owns the trainable optics and their physical limits (no negative light, a brightest pixel, whole levels, no more light out than
+in); never detects. Called with `(x, floor)` an encoder gives photoelectrons (n, d_f) of objects x (n, inputs).
+
+- `ActiveIllumination`: the paper's active scheme. Patterns are squared weights; x is transmission.
+- `CoherentField`: the paper's passive scheme. x is a field, real or complex; light = |W x|**2, W real as in the paper, or complex.
+- `IncoherentIntensity`: x is an intensity; light = W x with W at least 0.
+
+The paper's passive W is unconstrained: it may create photons. With `conserving`, W's largest singular value (coherent) or its column
+sums (incoherent) are at most 1, so that the detectors together receive no more than the object gave.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.options import Options
+
+from .quantise import top_limits
+
+KAIMING_A = 1.2  # paper, appendix on the training procedure
+
+
+class ActiveIllumination(nn.Module):
+    """Patterns (d_f, pixels) = weight**2, in photoelectrons per exposure and unit transmission.
+
+    `top_limits` are the least and most photoelectrons that the brightest level may give: the projector's peak times the
+    exposures that the profile allows. With `levels` set, the forward pass shows whole levels, and the gradient passes the
+    rounding straight through; the photoelectrons of the top level are then trained too.
+    """
+
+    def __init__(
+        self,
+        n_features: int,
+        n_pixels: int,
+        top_limits: tuple[float, float],
+        generator: torch.Generator,
+        light: float = 1.0,
+    ) -> None:
+        super().__init__()
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_pixels))  # Kaiming uniform, times the wanted light
+        self.weight = nn.Parameter((torch.rand(n_features, n_pixels, generator=generator) * 2 - 1) * bound)
+        self.log_top = nn.Parameter(torch.tensor(math.log(top_limits[1])))
+        self.top_limits = top_limits
+        self.levels: int | None = None
+
+    def start_quantising(self, levels: int) -> None:
+        """Show whole levels from now on; the top level starts at the brightest pixel, within its limits."""
+        with torch.no_grad():
+            brightest = (self.weight**2).max().clamp(*self.top_limits)
+            self.log_top.copy_(brightest.log())
+        self.levels = levels
+
+    def top(self) -> Tensor:
+        """Photoelectrons of the brightest level, inside its limits."""
+        low, high = self.top_limits
+        return self.log_top.exp().clamp(low, high)
+
+    def dim_to_top(self) -> None:
+        """Take brighter pixels back to the brightest level: beyond it no gradient would ever make them darker again."""
+        with torch.no_grad():
+            bound = math.sqrt(self.top_limits[1] if self.levels is None else float(self.top()))
+            self.weight.clamp_(-bound, bound)
+
+    def lower_top(self) -> None:
+        """Bring the top level down to the brightest pixel where it stands above: a longer exposure than needed wastes time."""
+        with torch.no_grad():
+            brightest = (self.weight**2).max().clamp(*self.top_limits)
+            if self.levels is not None and brightest < self.top() * (1 - 0.5 / (self.levels - 1)):
+                self.log_top.copy_(brightest.log())
+
+    def patterns(self) -> Tensor:
+        """Return the patterns as they are shown, (d_f, pixels)."""
+        light = self.weight**2
+        if self.levels is None:
+            return light.clamp(max=self.top_limits[1])
+        step = self.top() / (self.levels - 1)
+        level = (light / step).clamp(max=self.levels - 1)
+        return (level + (level.round() - level).detach()) * step
+
+    def forward(self, transmission: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""
+        patterns = self.patterns()
+        photoelectrons: Tensor = (1 - floor) * (transmission @ patterns.T) + floor * patterns.sum(dim=1)
+        return photoelectrons
+
+    def illumination(self) -> Tensor:
+        """Return the sum of all pattern intensities."""
+        return self.patterns().sum()
+
+    def brightest(self) -> float:
+        """Return the photoelectrons of the brightest pixel, or of the top level once there are levels."""
+        with torch.no_grad():
+            return float(self.patterns().max() if self.levels is None else self.top())
+
+
+class CoherentField(nn.Module):
+    """Transmission matrix W (d_f, inputs) for fields: light = |W x|**2. `complex_field` makes W complex."""
+
+    levels = None  # nothing to quantise: no projector
+
+    def __init__(
+        self,
+        n_features: int,
+        n_inputs: int,
+        generator: torch.Generator,
+        *,
+        light: float = 1.0,
+        complex_field: bool = False,
+        conserving: bool = False,
+    ) -> None:
+        super().__init__()
+        self.conserving = conserving
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
+        parts = 2 if complex_field else 1
+        self.weight = nn.Parameter((torch.rand(parts, n_features, n_inputs, generator=generator) * 2 - 1) * bound)
+
+    def matrix(self) -> Tensor:
+        """Return W, complex64 or float32; scaled down to a largest singular value of 1 where light is conserved."""
+        matrix = self.weight[0] if len(self.weight) == 1 else torch.complex(self.weight[0], self.weight[1])
+        if self.conserving:
+            matrix = matrix / torch.linalg.matrix_norm(matrix, ord=2).clamp(min=1.0)
+        return matrix
+
+    def forward(self, field: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of fields (n, inputs), float32 or complex64; there is no floor."""
+        matrix = self.matrix()
+        if field.is_complex() or matrix.is_complex():
+            dtype = torch.promote_types(field.dtype, matrix.dtype)
+            out = field.to(dtype) @ matrix.to(dtype).T
+            return out.real.square() + out.imag.square()
+        return (field @ matrix.T).square()
+
+    def illumination(self) -> Tensor:
+        """Return 0: a passive encoder sends no light."""
+        return torch.zeros(())
+
+
+class IncoherentIntensity(nn.Module):
+    """Transmission matrix W >= 0 (d_f, inputs) for intensities, W = weight**2."""
+
+    levels = None
+
+    def __init__(
+        self,
+        n_features: int,
+        n_inputs: int,
+        generator: torch.Generator,
+        *,
+        light: float = 1.0,
+        conserving: bool = False,
+    ) -> None:
+        super().__init__()
+        self.conserving = conserving
+        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
+        self.weight = nn.Parameter((torch.rand(n_features, n_inputs, generator=generator) * 2 - 1) * bound)
+
+    def matrix(self) -> Tensor:
+        """Return W; where light is conserved, columns that sum to more than 1 are scaled down to 1."""
+        matrix = self.weight**2
+        return matrix / matrix.sum(dim=0).clamp(min=1.0) if self.conserving else matrix
+
+    def forward(self, intensity: Tensor, floor: float = 0.0) -> Tensor:
+        """Return photoelectrons (n, d_f) of intensities (n, inputs); there is no floor."""
+        photoelectrons: Tensor = intensity @ self.matrix().T
+        return photoelectrons
+
+    def illumination(self) -> Tensor:
+        """Return 0: a passive encoder sends no light."""
+        return torch.zeros(())
+
+
+Encoder = ActiveIllumination | CoherentField | IncoherentIntensity
+
+
+def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch.Generator) -> Encoder:
+    """Return the untrained encoder that `options` ask for."""
+    if options.encoder == "active":
+        return ActiveIllumination(options.features, n_inputs, top_limits(profile), random, options.light)
+    if options.encoder == "incoherent":
+        return IncoherentIntensity(
+            options.features, n_inputs, random, light=options.light, conserving=options.conserving
+        )
+    return CoherentField(
+        options.features,
+        n_inputs,
+        random,
+        light=options.light,
+        complex_field=options.complex_field,
+        conserving=options.conserving,
+    )

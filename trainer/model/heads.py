@@ -1,0 +1,194 @@
+"""Heads: from clicks to scores, with batch normalisation right after the detection.
+
+Owns the digital back end in torch; never samples. A head takes click means (n, d_f) in [0, 1] and returns scores
+(n, classes), or pixels (n, height * width); `flipped` gives them for every word that differs in one click.
+
+- `MlpHead`: one hidden layer, the paper's (512 units).
+- `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
+- `PictureHead`: an image decoder, from clicks to a coarse picture and by transposed convolutions to the full one.
+- `DecoderHead`: an image decoder of two hidden layers, the paper's (512 and 512 units); a seventh of the other's time per picture.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from pans.trainer.options import PICTURE_HEADS, Options
+
+KERNEL = 15
+CHANNELS = (32, 64)
+MOMENTUM = 0.05
+EPSILON = 1e-5
+
+
+class ClickNorm(nn.Module):
+    """Batch normalisation of binary features: their population variance is p(1-p), so that only the mean is kept."""
+
+    running_mean: Tensor
+
+    def __init__(self, n_features: int) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(n_features))
+        self.bias = nn.Parameter(torch.zeros(n_features))
+        self.register_buffer("running_mean", torch.full((n_features,), 0.5))
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Normalise `clicks` (n, d_f) by `mean` (d_f,), by default that of the batch in training, else the running one."""
+        if mean is None:
+            mean = clicks.mean(dim=0) if self.training else self.running_mean
+        if self.training:
+            with torch.no_grad():
+                self.running_mean.lerp_(mean, MOMENTUM)
+        normal: Tensor = (clicks - mean) / torch.sqrt(mean * (1 - mean) + EPSILON) * self.gain + self.bias
+        return normal
+
+
+class MlpHead(nn.Module):
+    """Normalisation, one hidden layer with ReLU, scores (paper: 512 hidden units)."""
+
+    def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        self.hidden = nn.Linear(n_features, n_hidden)
+        self.output = nn.Linear(n_hidden, n_classes)
+        _start(generator, self.hidden, self.output)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
+        scores: Tensor = self.output(torch.relu(self.hidden(self.norm(clicks, mean))))
+        return scores
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return scores (n, d_f, classes): in column i click i is inverted."""
+        scores: Tensor = self.output(_flipped_hidden(self.norm, self.hidden, clicks, mean))
+        return scores
+
+
+class ConvHead(nn.Module):
+    """Normalisation, two convolutions along the patterns that halve the length, one hidden layer, scores."""
+
+    def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        half = KERNEL // 2
+        self.convolutions = nn.ModuleList(
+            nn.Conv1d(before, after, KERNEL, stride=2, padding=half) for before, after in pairwise((1, *CHANNELS))
+        )
+        self.length = -(-n_features // 4)  # each convolution rounds half the length up
+        self.hidden = nn.Linear(CHANNELS[-1] * self.length, n_hidden)
+        self.output = nn.Linear(n_hidden, n_classes)
+        _start(generator, *self.convolutions, self.hidden, self.output)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
+        maps = self.norm(clicks, mean).unsqueeze(1)
+        for convolution in self.convolutions:
+            maps = torch.relu(convolution(maps))
+        scores: Tensor = self.output(torch.relu(self.hidden(maps.flatten(1))))
+        return scores
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return scores (n, d_f, classes): in column i click i is inverted."""
+        return _flipped_one_by_one(self, clicks, mean)
+
+
+class PictureHead(nn.Module):
+    """Normalisation, a hidden layer, a coarse picture of a quarter of the size, two transposed convolutions."""
+
+    def __init__(
+        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        self.image_shape = image_shape
+        self.coarse = (-(-image_shape[0] // 4), -(-image_shape[1] // 4))
+        self.hidden = nn.Linear(n_features, n_hidden)
+        self.spread = nn.Linear(n_hidden, CHANNELS[-1] * self.coarse[0] * self.coarse[1])
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(before, after, 4, stride=2, padding=1)
+            for before, after in pairwise((CHANNELS[-1], CHANNELS[0], 1))
+        )
+        _start(generator, self.hidden, self.spread, *self.up)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f)."""
+        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
+        maps = torch.relu(self.spread(hidden)).unflatten(1, (CHANNELS[-1], *self.coarse))
+        picture = self.up[1](torch.relu(self.up[0](maps)))[:, 0, : self.image_shape[0], : self.image_shape[1]]
+        pixels: Tensor = picture.flatten(1)
+        return pixels
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
+        return _flipped_one_by_one(self, clicks, mean)
+
+
+class DecoderHead(nn.Module):
+    """Normalisation, two hidden layers with ReLU, pixels (paper: d_f, 512, 512, 784)."""
+
+    def __init__(
+        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.norm = ClickNorm(n_features)
+        self.image_shape = image_shape
+        self.hidden = nn.Linear(n_features, n_hidden)
+        self.second = nn.Linear(n_hidden, n_hidden)
+        self.output = nn.Linear(n_hidden, image_shape[0] * image_shape[1])
+        _start(generator, self.hidden, self.second, self.output)
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f); `mean` as in `ClickNorm`."""
+        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
+        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
+        return pixels
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
+        hidden = _flipped_hidden(self.norm, self.hidden, clicks, mean)
+        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
+        return pixels
+
+
+Decoders = PictureHead | DecoderHead  # what gives back pictures
+Heads = MlpHead | ConvHead | Decoders
+
+
+def new_head(options: Options, n_outputs: int, image_shape: tuple[int, int], random: torch.Generator) -> Heads:
+    """Return the untrained head that `options` ask for; `image_shape` is that of the picture to give back."""
+    if options.head in PICTURE_HEADS:
+        decoder = PictureHead if options.head == "picture" else DecoderHead
+        return decoder(options.features, options.hidden, image_shape, random)
+    kind = ConvHead if options.head == "conv" else MlpHead
+    return kind(options.features, options.hidden, n_outputs, random)
+
+
+def _flipped_hidden(norm: ClickNorm, layer: nn.Linear, clicks: Tensor, mean: Tensor) -> Tensor:
+    """Return the first hidden layer (n, d_f, hidden) with one click inverted each: its sums are made once and corrected."""
+    scale = norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
+    sums = layer((clicks - mean) * scale + norm.bias)
+    columns = (layer.weight * scale).T  # (d_f, hidden)
+    return torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0)).relu_()
+
+
+def _flipped_one_by_one(head: nn.Module, clicks: Tensor, mean: Tensor) -> Tensor:
+    scores = []
+    for i in range(clicks.shape[1]):
+        other = clicks.clone()
+        other[:, i] = 1 - other[:, i]
+        scores.append(head(other, mean))
+    return torch.stack(scores, dim=1)
+
+
+def _start(generator: torch.Generator, *layers: nn.Module) -> None:
+    """Torch's own initial range, from our generator."""
+    with torch.no_grad():
+        for layer in layers:
+            weight = layer.weight
+            assert isinstance(weight, Tensor)
+            inputs = weight[:, 0].numel() if isinstance(layer, nn.ConvTranspose2d) else weight[0].numel()
+            for parameter in layer.parameters():
+                parameter.copy_((torch.rand(parameter.shape, generator=generator) * 2 - 1) * inputs**-0.5)

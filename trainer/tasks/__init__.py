@@ -1,0 +1,1 @@
+"""Labelled images: public sets, generators, a user's own, distortions."""

@@ -1,0 +1,52 @@
+"""The optics of the tasks `mmf-mnist` and `mmf-mnist-image`: MNIST digits behind a multimode fibre.
+
+Owns what the fibre does to an image; never reads MNIST (see tasks.py). The scene: a digit is the field amplitude (grey / 255)
+at the entrance; the fibre mixes the modes; a passive encoder sees the speckle at its end and must name the digit, or give
+back the image.
+
+The fibre itself (`scatter`, `phase_mask`) is in `pans.runtime.incident`: the simulated instrument looks through the same one. Masks of
+other generators are statistically alike; figures move by about the spread over seeds.
+
+Two inputs for the encoder:
+
+- `scatter`: the complex field at a fixed scale (full scale is 1 at the entrance): the physical default;
+- `release_intensity`: the release's way, for comparison: squared modulus, min-max normalised over a batch, taken as a *real
+  vector* by a coherent encoder. Two things are unphysical in it: an intensity is no field, and the normalisation lets every image
+  depend on the brightest grain of its batch. The release's batch is not known; ours is 128.
+
+What makes it hard: every input pixel reaches every output pixel. With complex encoders the fibre is merely a change of basis;
+with real ones a feature is (a.x)^2 + (b.x)^2, a and b the two quadratures.
+
+The paper (appendix "MNIST through multimode fiber") calls the matrix random unitary, speaks of grey speckle images as input,
+60 000 training and 10 000 test images, and reports SSIM for the images (science.md says how it is computed).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.incident import FIBRE_SIDE_PX as SIDE_PX
+from pans.runtime.bundle.incident import MASK_SEED, phase_mask, scatter
+
+RELEASE_BATCH = 128
+
+
+def scattering_matrix(seed: int = MASK_SEED) -> NDArray[np.complex128]:
+    """Return the fibre as a unitary matrix U, complex128 (784, 784): field at the end = U @ amplitudes at the entrance."""
+    basis = np.eye(SIDE_PX * SIDE_PX).reshape(-1, SIDE_PX, SIDE_PX)
+    ends = np.fft.ifft2(np.fft.fft2(basis) * np.exp(1j * phase_mask(seed)))
+    return ends.reshape(len(basis), -1).T
+
+
+def release_intensity(
+    images: NDArray[np.uint8], batch: int = RELEASE_BATCH, seed: int = MASK_SEED
+) -> NDArray[np.float32]:
+    """Return speckle intensities min-max normalised over batches of `batch` images, float32 (n, 28, 28) in [0, 1]."""
+    intensity = np.abs(scatter(images, seed)) ** 2
+    for start in range(0, len(intensity), batch):
+        part = intensity[start : start + batch]
+        low, high = part.min(), part.max()
+        part -= low
+        part /= max(float(high - low), 1e-12)
+    return intensity.astype(np.float32, copy=False)

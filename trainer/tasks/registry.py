@@ -1,0 +1,242 @@
+"""Tasks: labelled 8-bit images, from pinned public files, from generators or from a user's own.
+
+Owns the reading of .npz files and class folders, with limits, and the split into training and held-out objects; never
+trains and never shows an image. The public sets are in public_sets.py, the drawn ones in generators.py. `load_task` returns a
+`Task` whose images are uint8 (n, height, width): 0 is black.
+
+A user's file or folder without a test part is split by position: every fifth object is held out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.incident import Light, Optics
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.images import read_class_folder, to_8_bits
+
+from .generators import GENERATORS, generate
+from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
+
+FILE_MAX_BYTES = 1 << 30
+IMAGES_MAX_BYTES = 1 << 30
+HOLD_OUT_EVERY = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objects:
+    """Labelled images: uint8 (n, height, width) and int64 (n,); `behind`: what gave rise to them, where it is asked for."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.int64]
+    behind: NDArray[np.uint8] | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def pictures(self) -> NDArray[np.uint8]:
+        """What a task of pictures wants back: the images, or what lies behind them."""
+        return self.images if self.behind is None else self.behind
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """Objects to train on and objects held out; `sha256` names the data, `split` says how the held-out ones were chosen."""
+
+    name: str
+    classes: tuple[str, ...]
+    train: Objects
+    test: Objects
+    sha256: str
+    split: str
+    light: Light = "transmission"  # what grey is: of an object that we light, or a field amplitude that reaches us
+    optics: Optics = "none"  # between the scene and a passive encoder
+    target: str = "class"  # what is asked for: the class, or the `image`
+    source: str = ""  # of drawn images: whose generator, which seed
+    imaged: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None  # makes images of what is behind them
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        height, width = self.train.images.shape[1:]
+        return int(height), int(width)
+
+    @property
+    def split_here(self) -> bool:
+        """Whether the data had no test part of its own, and every fifth object was held out here."""
+        return self.split == _SPLIT_BY_POSITION
+
+    def everything(self) -> Objects:
+        """All objects, in the order of their file where the split was made here."""
+        if not self.split_here:
+            images = np.concatenate([self.train.images, self.test.images])
+            return Objects(images, np.concatenate([self.train.labels, self.test.labels]))
+        n = len(self.train) + len(self.test)
+        held_out = _held_out(n)
+        images = np.empty((n, *self.image_shape), dtype=np.uint8)
+        labels = np.empty(n, dtype=np.int64)
+        images[~held_out], labels[~held_out] = self.train.images, self.train.labels
+        images[held_out], labels[held_out] = self.test.images, self.test.labels
+        return Objects(images, labels)
+
+
+# what white is, by type of the array: nothing is stretched, so that the same grey means the same light in every file
+_FULL_SCALES = {"uint8": 255.0, "uint16": 65535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0, "bool": 1.0}
+_SPLIT_BY_POSITION = f"every {HOLD_OUT_EVERY}th object held out"
+_SPLIT_OF_FILE = "the test part of the data"
+_SPLIT_OF_SEED = "drawn from other random streams"
+FIBRE_TASKS = {"mmf-mnist": "class", "mmf-mnist-image": "image"}  # MNIST behind a multimode fibre: what is asked for
+
+
+def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_seed: int = 0) -> Task:
+    """Return the public set or drawn task of that name, or the .npz file or folder of class folders at that path.
+
+    `data_dir` (default: the environment variable PANS_DATA) holds the folders of the public sets; `data_seed` is that of drawn
+    tasks, and says nothing to others. UsageError says what
+    is missing or unfit, DamagedFileError which file is not the pinned one.
+    """
+    if name_or_path in PUBLIC_SETS:
+        return _load_public(name_or_path, data_folder(data_dir))
+    if name_or_path in FIBRE_TASKS:
+        digits = _load_public("mnist", data_folder(data_dir))
+        return replace(digits, name=name_or_path, light="field", optics="mmf", target=FIBRE_TASKS[name_or_path])
+    if name_or_path in GENERATORS:
+        return draw_task(name_or_path, data_seed)
+    path = Path(name_or_path)
+    if path.is_dir():
+        return _load_folder(path)
+    if path.is_file() and path.suffix == ".npz":
+        return _load_npz(path)
+    raise UsageError(
+        f"task {name_or_path!r} is neither one of {', '.join(task_names())}, nor a .npz file, nor a folder",
+        remedy="a .npz file holds `images` uint8 (n, height, width) and `labels`; a folder holds one folder per class",
+    )
+
+
+def physical_encoder(task: Task) -> str:
+    """Return the encoder that the physics of `task` asks for: what `pans train` takes unless told otherwise."""
+    if task.name in GENERATORS and task.source:
+        return GENERATORS[task.name].encoder
+    return "active" if task.light == "transmission" else "coherent"
+
+
+def task_names() -> tuple[str, ...]:
+    """Return the names that `load_task` knows."""
+    return (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)
+
+
+def draw_task(name: str, seed: int = 0, n_train: int | None = None, n_test: int | None = None) -> Task:
+    """Return a drawn task (see generators.py) with its recipe's or other numbers of objects; UsageError as `generate`."""
+    drawn = generate(name, seed, n_train, n_test)
+    recipe = drawn.recipe
+    train, test = Objects(drawn.train_images, drawn.train_labels), Objects(drawn.test_images, drawn.test_labels)
+    source = f"{recipe.source}, seed {seed}"
+    return Task(name, recipe.classes, train, test, drawn.sha256, _SPLIT_OF_SEED, light=recipe.light, source=source)
+
+
+def _load_public(name: str, folder: Path) -> Task:
+    public = PUBLIC_SETS[name]
+    arrays = []
+    for pinned in public.files:
+        path = folder / public.folder / pinned.name
+        check_pinned(path, pinned)
+        arrays.append(read_idx(path, pinned.shape))
+    digest = hashlib.sha256("".join(pinned.sha256 for pinned in public.files).encode()).hexdigest()
+    train = Objects(arrays[0], arrays[1].astype(np.int64))
+    test = Objects(arrays[2], arrays[3].astype(np.int64))
+    return Task(name, public.classes, train, test, digest, _SPLIT_OF_FILE)
+
+
+def _load_npz(path: Path) -> Task:
+    """`images` and `labels`, or `train_images`, `train_labels`, `test_images`, `test_labels`; `classes` if there are names."""
+    arrays = _read_npz(path)
+    parts = [f"{part}_{kind}" for part in ("train", "test") for kind in ("images", "labels")]
+    if all(part in arrays for part in parts):
+        train = _objects(path, arrays["train_images"], arrays["train_labels"])
+        test = _objects(path, arrays["test_images"], arrays["test_labels"])
+        split = _SPLIT_OF_FILE
+    elif "images" in arrays and "labels" in arrays:
+        train, test = _split(path, _objects(path, arrays["images"], arrays["labels"]))
+        split = _SPLIT_BY_POSITION
+    else:
+        raise UsageError(
+            f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}",
+            remedy=f"name the arrays `images` and `labels`, or {', '.join(parts)}",
+        )
+    n_classes = int(max(train.labels.max(), test.labels.max())) + 1
+    classes = tuple(str(name) for name in arrays.get("classes", np.arange(n_classes)).ravel())
+    given = arrays["images" if "images" in arrays else "train_images"].dtype
+    source = (
+        ""
+        if given == np.uint8
+        else f"{given.name} images, full scale {_FULL_SCALES[given.name]:g}, rounded to 256 grey levels"
+    )
+    return _checked(Task(path.stem, classes, train, test, file_sha256(path), split, source=source), path)
+
+
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    if path.stat().st_size > FILE_MAX_BYTES:
+        raise UsageError(f"{path}: {path.stat().st_size} bytes, allowed at most {FILE_MAX_BYTES}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(item.file_size for item in archive.infolist())
+        if unpacked > IMAGES_MAX_BYTES:
+            raise UsageError(f"{path}: unpacks to {unpacked} bytes, allowed at most {IMAGES_MAX_BYTES}")
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise DamagedFileError(f"{path}: cannot be read: {error}") from error
+
+
+def _load_folder(folder: Path) -> Task:
+    """One folder per class, images of one size inside (see runtime/grey.py)."""
+    pictures = read_class_folder(folder, IMAGES_MAX_BYTES)
+    train, test = _split(folder, _objects(folder, pictures.images, pictures.labels))
+    name = folder.resolve().name
+    return _checked(Task(name, pictures.classes, train, test, pictures.sha256, _SPLIT_BY_POSITION), folder)
+
+
+def _objects(where: Path, images: NDArray[Any], labels: NDArray[Any]) -> Objects:
+    full_scale = _FULL_SCALES.get(images.dtype.name)
+    if full_scale is None or images.ndim != 3 or 0 in images.shape:
+        raise UsageError(
+            f"{where}: images are {images.dtype} {images.shape}, allowed: (n, height, width) of uint8, uint16 (full scale 65535), "
+            "float16, float32, float64 (full scale 1) or bool",
+            remedy="convert them; several colours or frames per image are not taken apart here",
+        )
+    if images.dtype != np.uint8:
+        images = to_8_bits(where, images, full_scale)
+    if labels.shape != (len(images),) or not np.issubdtype(labels.dtype, np.integer):
+        raise UsageError(f"{where}: labels are {labels.dtype} {labels.shape}, allowed: integers ({len(images)},)")
+    return Objects(images, labels.astype(np.int64))
+
+
+def _split(where: Path, objects: Objects) -> tuple[Objects, Objects]:
+    if len(objects) < 2 * HOLD_OUT_EVERY:
+        raise UsageError(f"{where}: {len(objects)} objects, needed are {2 * HOLD_OUT_EVERY} or more")
+    held_out = _held_out(len(objects))
+    train = Objects(objects.images[~held_out], objects.labels[~held_out])
+    return train, Objects(objects.images[held_out], objects.labels[held_out])
+
+
+def _held_out(n: int) -> NDArray[np.bool_]:
+    return np.arange(n) % HOLD_OUT_EVERY == HOLD_OUT_EVERY - 1
+
+
+def _checked(task: Task, where: Path) -> Task:
+    labels = np.concatenate([task.train.labels, task.test.labels])
+    n_classes = len(task.classes)
+    if task.test.images.shape[1:] != task.train.images.shape[1:]:
+        raise UsageError(f"{where}: training and test images differ in size")
+    if n_classes < 2 or labels.min() < 0 or labels.max() >= n_classes:
+        raise UsageError(f"{where}: labels from {labels.min()} to {labels.max()} for {n_classes} classes")
+    return task

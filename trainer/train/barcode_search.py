@@ -1,0 +1,172 @@
+"""The task `barcode` solved over all 1024 strings: which bars each pattern lights, then how brightly.
+
+Owns the search and the exact descent for this one task; nothing is sampled, no training string is drawn. `solve` returns what
+`train` would: patterns in whole levels and a head fitted to the exact joint distribution of click word and label.
+
+1. **Which bars** (`search_bars`). At much light and without dark counts a pattern clicks exactly when one of its bars is bright,
+   so that a click word is a function of the string: accuracy and clicks of a choice of bars are counts. Simulated annealing
+   flips, moves and restarts single patterns. Gradient descent from random light stops in poor valleys here (4 to 12 points lower).
+2. **How brightly** (`descend`). From there Adam on squared weights, with the exact rate of wrong Bayes decisions over all 2**d_f
+   words, at the wanted dark count. Clicks are held by a weight that grows with their excess; a photon costs `PHOTON_PRICE`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.model.detection import Law, click_probability, word_probabilities
+from pans.trainer.model.encoders import ActiveIllumination
+from pans.trainer.model.estimators import cross_entropy
+from pans.trainer.model.heads import new_head
+from pans.trainer.model.quantise import exposure_us_of, quantise, top_limits
+from pans.trainer.options import Options
+from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
+
+from .head_fit import fit_head
+from .loop import Trained
+
+ANNEALING_STEPS = 4000
+HOT, COLD = 0.02, 1e-5  # temperatures, in accuracy
+CLICK_PRICE = 0.3  # accuracy lost per click above the budget, in the search
+LIGHT = 8.0  # photoelectrons of a lit bar at the start of the descent: it is missed once in 3000 times
+GLOW = 0.01  # of the other bars: squared weights of zero would never move
+DESCENT_STEPS = 120
+RATE = 0.03
+PHOTON_PRICE = 5e-5  # accuracy per photon: without one the light would grow without end
+PRICE_GAIN = 10.0  # how fast the price of a click follows the relative excess, per step
+ENTROPY = 0.2  # weight of the label's entropy beside the wrong decisions: it also sees words that are nearly decided
+
+Bars = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Patterns, photoelectrons per bar (d_f, 10), and what they give over all strings: accuracy (0 to 1) and clicks."""
+
+    patterns: Tensor
+    accuracy: float
+    clicks: float
+
+
+def count(bars_lit: Bars, prior: str = "uniform") -> tuple[float, float]:
+    """Return accuracy (0 to 1) and mean clicks of patterns (d_f, 10) at much light and no dark counts."""
+    strings, labels = all_strings()
+    share = weights(prior)
+    clicks = (strings.astype(np.int64) @ bars_lit.T.astype(np.int64)) > 0
+    words = clicks @ (1 << np.arange(len(bars_lit)))
+    of_word = np.bincount(2 * words + labels, share, minlength=2 << len(bars_lit)).reshape(-1, 2)
+    return float(of_word.max(axis=1).sum()), float(clicks.sum(axis=1) @ share)
+
+
+def search_bars(
+    features: int, clicks_max: float, seed: int, prior: str = "uniform", steps: int = ANNEALING_STEPS
+) -> Bars:
+    """Return the best choice of bars that simulated annealing finds, bool (features, 10), at no more than `clicks_max` clicks."""
+    random = np.random.default_rng([seed, features])
+    lit = np.zeros((features, N_BARS), np.bool_)
+    lit[np.arange(features), random.integers(0, N_BARS, features)] = True
+    now = best_score = -math.inf
+    best = lit
+    for step in range(steps):
+        temperature = HOT * (1 - step / steps) ** 2 + COLD
+        tried = _neighbour(lit, random)
+        accuracy, clicks = count(tried, prior)
+        score = accuracy - CLICK_PRICE * max(0.0, clicks - clicks_max)
+        if score >= now or random.random() < math.exp((score - now) / temperature):
+            lit, now = tried, score
+        if score > best_score:
+            best, best_score = tried, score
+    return best
+
+
+def _neighbour(lit: Bars, random: np.random.Generator) -> Bars:
+    """One pattern changed: a bar flipped, the whole pattern moved by a bar, or begun again with one bar."""
+    changed = lit.copy()
+    pattern, kind = random.integers(len(lit)), random.random()
+    if kind < 0.6:
+        bar = random.integers(N_BARS)
+        changed[pattern, bar] ^= True
+    elif kind < 0.8:
+        changed[pattern] = np.roll(lit[pattern], 1 if random.random() < 0.5 else -1)
+    else:
+        changed[pattern] = False
+        changed[pattern, random.integers(N_BARS)] = True
+    return changed
+
+
+def descend(patterns: Tensor, law: Law, clicks_max: float, prior: str = "uniform", steps: int = DESCENT_STEPS) -> Found:
+    """Return the best patterns within `clicks_max` on the way of an exact descent from `patterns` (d_f, 10), photoelectrons."""
+    strings, labels = all_strings()
+    x, of_label = torch.from_numpy(strings).double(), torch.nn.functional.one_hot(torch.from_numpy(labels)).double()
+    share = torch.from_numpy(weights(prior))
+    weight = patterns.double().sqrt().requires_grad_()
+    optimiser = torch.optim.Adam([weight], lr=RATE)
+    price, best = 0.01, Found(patterns, -math.inf, math.inf)
+    for step in range(steps + 1):
+        light = x @ (weight**2).T
+        p = click_probability(light, law)
+        joint = word_probabilities(p).T @ (of_label * share.unsqueeze(1))
+        accuracy, clicks = joint.amax(dim=1).sum(), p.sum(dim=1) @ share
+        if clicks <= clicks_max and accuracy > best.accuracy:
+            best = Found((weight.detach() ** 2).clone(), float(accuracy.detach()), float(clicks.detach()))
+        of_word = joint.sum(dim=1, keepdim=True)
+        entropy = -torch.special.xlogy(joint, joint / of_word.clamp(min=1e-300)).sum()
+        loss = -accuracy + ENTROPY * entropy + price * clicks + PHOTON_PRICE * (light.sum(dim=1) @ share)
+        optimiser.param_groups[0]["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * step / steps))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        price = min(
+            1.0,
+            max(1e-4, price * math.exp(min(0.2, max(-0.2, PRICE_GAIN * (float(clicks.detach()) / clicks_max - 1))))),
+        )
+    return best
+
+
+def solve_patterns(options: Options, profile: Profile, prior: str = "uniform") -> tuple[list[Found], Law]:
+    """Return what `options.restarts` searches and descents found, the best first, and the click law they were found for."""
+    clicks_max = options.features if options.clicks is None else options.clicks
+    top = min(LIGHT, top_limits(profile)[1])
+    law = click_law(profile, max(profile.exposure.min_us, exposure_us_of(profile, top)))
+    if options.dark is not None:
+        law = replace(law, dark_per_exposure=options.dark)
+    found = []
+    for start in range(options.restarts):
+        lit = search_bars(options.features, clicks_max, options.seed + start, prior)
+        patterns = torch.where(torch.from_numpy(lit), top, GLOW).double()
+        found.append(descend(patterns, law, clicks_max, prior))
+    found.sort(key=lambda one: -one.accuracy)
+    if found[0].accuracy < 0:
+        raise UsageError(f"no patterns were found within {clicks_max:g} clicks", remedy="allow more, or more restarts")
+    return found, law
+
+
+def solve(options: Options, profile: Profile) -> Trained:
+    """Return the solved task, all strings equally likely: the best patterns in whole levels, and their head.
+
+    Of `options` count: features, clicks (the most, of one inference), dark, restarts, seed, hidden and shots.
+    """
+    found, law = solve_patterns(options, profile)
+    best, random = found[0], torch.Generator().manual_seed(options.seed)
+    low, high = top_limits(profile)
+    encoder = ActiveIllumination(options.features, N_BARS, (low, high), random)
+    with torch.no_grad():
+        encoder.weight.copy_(best.patterns.sqrt())
+    shown = quantise(best.patterns.numpy(), profile.projector.levels, min(high, max(low, float(best.patterns.max()))))
+    strings, labels = (torch.from_numpy(part) for part in all_strings())
+    p = click_probability(strings.double() @ torch.from_numpy(shown.patterns()).T, law)
+    head = new_head(options, 2, (1, N_BARS), random)
+    fit_head(head, p, labels, cross_entropy, random, exact=True, n_outputs=2, shots=options.shots)
+    losses = tuple(1 - one.accuracy for one in found)
+    return Trained(
+        shown, best.patterns.float().numpy(), encoder, head, p.mean(dim=0), law, min(losses), losses, options
+    )

@@ -1,0 +1,81 @@
+"""What a training sees: the objects of a task as tensors, in the form that the encoder takes.
+
+Owns the way from 8-bit images to transmissions, fields or intensities, and the part kept for validation; never trains and never
+touches the held-out objects.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pans.runtime.bundle.incident import incident_field, incident_intensity
+from pans.runtime.instrument.click_law import object_transmission
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.device import here
+from pans.trainer.options import Options
+from pans.trainer.tasks.distort import with_copies
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.shifts import shifted
+
+VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
+CHUNK = 2000  # objects per pass where no gradient is needed
+
+
+class TrainingData:
+    """Training objects as tensors: `shown` is what the encoder gets, (n, inputs); `target` a label, or an image in [0, 1].
+
+    Active: float32 transmission with a perfect black, `floor` being the real one. Passive: incident field or intensity;
+    with `basis` (inputs, size) of a field, its coordinates there (field_basis.py).
+    """
+
+    def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
+        self.floor = profile.min_transmission if options.encoder == "active" else 0.0
+        n_validation = max(1, len(task.train) // VALIDATION_PART)
+        objects = with_copies(task.train, n_validation, options.copies, options.seed, task.imaged)
+        placed = shifted(objects, options.shift_px, options.offset_px, options.seed)
+        self.shown = encoder_input(task, placed, profile, options)
+        if basis is not None:
+            self.shown = self.shown @ basis
+        self.labels = torch.from_numpy(placed.labels)
+        self.image_shape = task.image_shape
+        self.is_image = task.target == "image"
+        if self.is_image:
+            flat = placed.pictures.reshape(len(placed), -1)
+            self.target, self.n_outputs = torch.from_numpy(flat.astype("float32") / 255), flat.shape[1]
+        else:
+            self.target, self.n_outputs = self.labels, len(task.classes)
+        self.shown, self.labels, self.target = here(self.shown), here(self.labels), here(self.target)
+        self.picture_shape = self.image_shape if self.is_image else None  # of what is to be given back
+        self.n_fit = len(self.labels) - n_validation
+
+
+def encoder_input(task: Task, objects: Objects, profile: Profile, options: Options) -> Tensor:
+    """Return what the encoder of `options` gets from `objects`, (n, inputs): transmission, field or intensity.
+
+    With `input_photons`, fields and intensities are scaled so that the training objects bring that many on average.
+    """
+    flat = objects.images.reshape(len(objects), -1)
+    if options.encoder == "active":
+        black = profile.min_transmission
+        shown = (object_transmission(profile, flat, "float32") - black) / (1 - black)
+        return torch.from_numpy(shown)
+    coherent = options.encoder == "coherent"
+    incident = incident_field if coherent else incident_intensity
+    x = torch.from_numpy(incident(objects.images, task.light, task.optics)).flatten(1)
+    if options.input_photons is not None:
+        scale = full_scale_photoelectrons(task, options)
+        x = x * (scale**0.5 if coherent else scale)
+    return x
+
+
+def full_scale_photoelectrons(task: Task, options: Options) -> float:
+    """Return the photoelectrons that one pixel at full scale brings to a passive encoder: 1, or what `input_photons` asks for."""
+    if options.input_photons is None:
+        return 1.0
+    given = incident_intensity(task.train.images[:CHUNK], task.light, task.optics).reshape(
+        -1, math.prod(task.image_shape)
+    )
+    return options.input_photons / float(given.sum(axis=1).mean())

@@ -1,0 +1,314 @@
+"""Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
+
+Owns the schedule, the photon budget and the checkpoint; never writes a bundle (export.py) and never sees the held-out
+objects. `train` returns a `Trained` whose patterns are already what the projector will show.
+
+Stages (one epoch is one pass over the training objects):
+
+1. straight-through on sampled clicks (paper, algorithm for active PANS), on an object modulator with perfect black;
+2. with the exact estimator: the expectation over all 2**d_f click words, while black rises to what the modulator can do;
+3. the same with patterns rounded to levels; the photoelectrons of the top level are trained with them;
+4. the patterns stay, the head is fitted to them alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.device import new_generator
+from pans.trainer.model.detection import Law, click_probability, click_words, sample_clicks, word_probabilities
+from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
+from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
+from pans.trainer.model.field_basis import in_pixels
+from pans.trainer.model.heads import Heads, new_head
+from pans.trainer.model.quantise import Quantised, exposure_us_of, quantise
+from pans.trainer.options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
+from pans.trainer.tasks.registry import Task
+
+from . import schedule
+from .checkpoint import read_checkpoint, write_checkpoint
+from .data import CHUNK, TrainingData
+from .head_fit import fit_head
+
+VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
+DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
+DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
+DUAL_RATE_MAX = 0.06
+
+
+@dataclass(frozen=True, slots=True)
+class EpochReport:
+    """How one epoch went: means over its batches."""
+
+    restart: int
+    epoch: int
+    stage: str
+    loss: float
+    clicks: float
+    photons: float
+    illumination: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trained:
+    """A finished model: the shown patterns, the head in evaluation mode, the law it was trained for."""
+
+    quantised: Quantised | None  # of active sensing; None of a passive encoder
+    float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
+    encoder: Encoder
+    head: Heads
+    click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
+    law: Law
+    validation_loss: float
+    validation_losses: tuple[float, ...]  # of all restarts
+    options: Options
+
+
+def train(
+    task: Task,
+    profile: Profile,
+    options: Options,
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    report: Callable[[EpochReport], None] = lambda _: None,
+    law: Law | None = None,
+    basis: Tensor | None = None,
+) -> Trained:
+    """Train `task` through `profile`; the same options, machine and number of threads give the same result.
+
+    `law` replaces the click law of the profile (thermal light, or any differentiable function from photoelectrons to p); what
+    is exported is still judged by the profile's. A checkpoint does not know of it, nor of `basis` (inputs, size): a coherent encoder
+    is then trained as coefficients of these fields (field_basis.py), and the one returned is W = coefficients @ basis.T.
+
+    After every epoch the state goes to `checkpoint`; with `resume` a run goes on from there. KeyboardInterrupt passes
+    through, with the state of the last whole epoch on disk.
+    """
+    check_options(options, profile)
+    data = TrainingData(task, profile, options, basis)
+    saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
+    best: dict[str, Any] | None = saved.get("best")
+    losses: list[float] = saved.get("losses", [])
+    for restart in range(len(losses), options.restarts):
+        started: list[float] = saved.pop("started", [])  # losses of the starts of this restart
+        chosen: dict[str, Any] | None = saved.pop("chosen", None)  # and the best of them
+        for start in range(len(started), options.starts + 1):  # the last round goes on with the best start
+            seed = restart * options.starts + min(start, options.starts - 1)
+            run = Run(data, profile, options, seed, law)
+            if "run" in saved:
+                run.restore(saved.pop("run"))
+            elif start == options.starts and chosen is not None:
+                run.restore(chosen)
+            until = schedule.second_stage(options) if start < options.starts else options.epochs
+            while run.epoch < until:
+                report(run.one_epoch())
+                if checkpoint:
+                    now = {"run": run.state(), "best": best, "losses": losses, "started": started, "chosen": chosen}
+                    write_checkpoint(checkpoint, options, task.sha256, now)
+            if start < options.starts:
+                started.append(run.validation_loss())
+                chosen = run.state() if started[-1] <= min(started) else chosen
+        losses = [*losses, run.validation_loss()]
+        if losses[-1] <= min(losses):
+            best = run.state()
+    run = Run(data, profile, options, losses.index(min(losses)), law)
+    if best is not None:
+        run.restore(best)
+    trained = run.finish(tuple(losses))
+    return trained if basis is None else replace(trained, encoder=in_pixels(trained.encoder, basis))
+
+
+class Run:
+    """One restart: patterns, head, optimiser, random numbers, and how far it has come."""
+
+    def __init__(
+        self, data: TrainingData, profile: Profile, options: Options, restart: int, law: Law | None = None
+    ) -> None:
+        self.own_law = law
+        self.data, self.profile, self.options, self.restart = data, profile, options, restart
+        self.random = new_generator(options.seed + restart)
+        self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
+        self.head = new_head(options, data.n_outputs, data.image_shape, self.random)
+        self.epoch = 0
+        steps = options.epochs * math.ceil(data.n_fit / options.batch)
+        self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))
+        self.weights = {"photons": 1e-3, "clicks": 1e-3}  # of the budgets; they follow the excess
+        self.optimiser = self._new_optimiser()
+
+    # ---- the loop ----
+
+    def one_epoch(self) -> EpochReport:
+        """Pass once over the training objects, in random order."""
+        options, data = self.options, self.data
+        if self.epoch == schedule.second_stage(options):
+            self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
+        if self.epoch == schedule.whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
+            self.encoder.start_quantising(self.profile.projector.levels)
+        loss_of_clicks = ESTIMATORS[schedule.estimator(options, self.epoch)]
+        law = self.law()
+        order = torch.randperm(data.n_fit, generator=self.random)
+        batches = [part for part in order.split(options.batch) if len(part) > 1]
+        sums = torch.zeros(4, dtype=torch.float64)
+        self.head.train()
+        for i, batch in enumerate(batches):
+            now = self.epoch + i / len(batches)
+            light = self.encoder(data.shown[batch], schedule.black(options, now, data.floor))
+            photons = light.sum(dim=1).mean()
+            slope, clamp = schedule.slope_and_clamp(options, now)
+            p = click_probability(light.clamp(max=clamp), law, slope)
+            loss_of = schedule.loss_at(options, now, data.picture_shape)
+            loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
+            if options.mix > 0 and self.epoch >= schedule.second_stage(options):
+                loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
+            clicks = p.sum(dim=1).mean()
+            illumination = self.encoder.illumination()
+            total = loss + self._penalty(clicks, photons, illumination)
+            for group, rate in zip(self.optimiser.param_groups, schedule.rates(options, now)):
+                group["lr"] = rate
+            self.optimiser.zero_grad()
+            total.backward()
+            self.optimiser.step()
+            if isinstance(self.encoder, ActiveIllumination):
+                self.encoder.dim_to_top()
+            sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
+        stage = schedule.stage(options, self.epoch)
+        self.epoch += 1
+        return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
+
+    def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
+        """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
+        shots = 2 + int(torch.randint(self.options.shots - 1, (1,), generator=self.random))
+        clicks = torch.stack([sample_clicks(p, self.random) for _ in range(shots)]).mean(dim=0)
+        return loss_of(self.head(clicks, p.mean(dim=0)), target).mean()
+
+    def law(self) -> Law:
+        """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
+        if self.own_law is not None:
+            return self.own_law
+        exposure_us = self.profile.exposure.min_us
+        if isinstance(self.encoder, ActiveIllumination):
+            low, high = self.encoder.top_limits
+            exposure_us = exposure_us_of(self.profile, min(max(self.encoder.brightest(), low), high))
+        law = click_law(self.profile, exposure_us)
+        return law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
+
+    def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
+        """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
+        penalty = (self.options.alpha or 0.0) * illumination
+        for name, measured in (("photons", photons), ("clicks", clicks)):
+            target = getattr(self.options, name)
+            if target is not None:
+                penalty = penalty + self.weights[name] * measured
+                gain, weight_min = BUDGETS[self.options.budget]
+                excess = min(1.0, max(-1.0, gain * (float(measured.detach()) / target - 1)))
+                weight = self.weights[name] * math.exp(self.dual_rate * excess)
+                self.weights[name] = min(10.0, max(weight_min, weight))
+        return penalty
+
+    def _new_optimiser(self) -> torch.optim.Adam:
+        groups = [{"params": self.encoder.parameters()}, {"params": self.head.parameters()}]
+        return torch.optim.Adam(groups, lr=1e-3)
+
+    # ---- after the last epoch ----
+
+    def probabilities(self, start: int, stop: int) -> Tensor:
+        """Click probabilities, float64 (n, d_f), of the training objects start..stop through the whole instrument."""
+        law, parts = self.law(), []
+        with torch.no_grad():
+            for first in range(start, stop, CHUNK):
+                which = torch.arange(first, min(first + CHUNK, stop))
+                parts.append(click_probability(self.encoder(self.data.shown[which], self.data.floor).double(), law))
+        return torch.cat(parts)
+
+    def validation_loss(self) -> float:
+        """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples.
+
+        With `mix`, several shots have the same share of it as of the training loss.
+        """
+        p = self.probabilities(self.data.n_fit, len(self.data.labels))
+        target = self.data.target[self.data.n_fit :]
+        loss_of = schedule.loss_at(self.options, self.epoch, self.data.picture_shape)
+        random = new_generator(self.options.seed)
+        self.head.eval()
+        with torch.no_grad():
+            if self.options.features <= EXACT_FEATURES_MAX and not self.data.is_image:
+                scores = self.head(click_words(self.options.features)).double()
+                one = float((word_probabilities(p) * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
+            else:
+                one = self._mean_loss(p, loss_of, 1, random)
+            if self.options.mix == 0:
+                return one
+            numbers = range(2, self.options.shots + 1)
+            more = [self._mean_loss(p, loss_of, shots, random) for shots in numbers]
+            return (1 - self.options.mix) * one + self.options.mix * sum(more) / len(more)
+
+    def _mean_loss(self, p: Tensor, loss_of: LossOf, shots: int, random: torch.Generator) -> float:
+        """Return the mean loss of the validation objects over `VALIDATION_SAMPLES` draws of mean clicks of `shots` shots."""
+        target, losses = self.data.target[self.data.n_fit :], []
+        for _ in range(VALIDATION_SAMPLES):
+            clicks = torch.stack([sample_clicks(p, random) for _ in range(shots)]).mean(dim=0)
+            losses.append(loss_of(self.head(clicks.float()), target).mean())
+        return float(torch.stack(losses).mean())
+
+    def finish(self, losses: tuple[float, ...]) -> Trained:
+        """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
+        quantised, floats = None, None
+        if isinstance(self.encoder, ActiveIllumination):
+            self.encoder.lower_top()
+            with torch.no_grad():
+                floats = (self.encoder.weight**2).cpu().numpy().copy()
+            quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
+        p, shape = self.probabilities(0, len(self.data.labels)), self.data.picture_shape
+        fit_head(
+            self.head,
+            p,
+            self.data.target,
+            cross_entropy if shape is None else similarity_loss(self.options.similarity, shape),
+            self.random,
+            exact=self.options.features <= EXACT_FEATURES_MAX,
+            n_outputs=self.data.n_outputs,
+            shots=self.options.shots,
+            batch=self.options.batch,
+            rate=self.options.head_rate,
+        )
+        mean, law = p.mean(dim=0).cpu(), self.law()
+        self.encoder.cpu()  # what follows is export and judgement
+        self.head.cpu()
+        return Trained(quantised, floats, self.encoder, self.head, mean, law, min(losses), losses, self.options)
+
+    # ---- checkpoints ----
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next epoch depends on, as copies."""
+        copied = {
+            name: {key: value.clone() for key, value in module.state_dict().items()} for name, module in self._modules()
+        }
+        return copied | {
+            "optimiser": self.optimiser.state_dict(),
+            "random": self.random.get_state(),
+            "epoch": self.epoch,
+            "weights": dict(self.weights),
+            "levels": self.encoder.levels,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        for name, module in self._modules():
+            module.load_state_dict(state[name])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.random.set_state(state["random"])
+        self.epoch, self.weights = state["epoch"], dict(state["weights"])
+        if isinstance(self.encoder, ActiveIllumination):
+            self.encoder.levels = state["levels"]
+
+    def _modules(self) -> tuple[tuple[str, torch.nn.Module], ...]:
+        return ("encoder", self.encoder), ("head", self.head)
