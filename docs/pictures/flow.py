@@ -16,10 +16,10 @@ import numpy as np
 
 from pans.runtime.commands.replay import sent_plan
 from pans.runtime.commands.run_flow import replayed_core
+from pans.runtime.core.decision import NO_LABEL
+from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.flow.matching import abort_reason
-from pans.runtime.link.connection import plan_from_chunks
-from pans.runtime.record.format import NO_LABEL
 from pans.runtime.record.recorder import read_recording
 from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
 

@@ -26,8 +26,9 @@ from pans.firmware_sim.ports.faulty import FaultyDevice, Schedule
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.bundle.model import Bundle, bundle_bytes, make_bundle
+from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.core.still import Core, Output
+from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link

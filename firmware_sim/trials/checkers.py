@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.sequential import Measurement, StreamMessage
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Output
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.still import NO_LABEL, Decision, Output
 from pans.runtime.live.run import LiveRun
-from pans.runtime.record.recorder import DecisionFlag
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_gate
 from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark

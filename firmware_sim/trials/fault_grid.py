@@ -28,8 +28,9 @@ from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.core.still import Core, Output
+from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.recovery import Recovery

@@ -33,7 +33,8 @@ from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.scene.still import load_scene
 from pans.runtime.bundle.model import bundle_bytes
-from pans.runtime.core.still import Core, Output
+from pans.runtime.core.decision import Output
+from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import open_link

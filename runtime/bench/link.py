@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan, build_plan
-from pans.runtime.core.still import Core, Output
+from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import load_profile

@@ -20,8 +20,9 @@ from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.cli import say
+from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import build_plan
-from pans.runtime.core.still import Core, Output
+from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile, parse_profile
 from pans.runtime.link.base import open_link

@@ -154,7 +154,7 @@ def _watched(
     job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder, recovery: Recovery | None, stop: Stop
 ) -> RunResult:
     """Run, with everybody looking on: the dark counts' guard, the live view, metrics and the state file."""
-    from pans.runtime.core.still import Output
+    from pans.runtime.core.decision import Output
     from pans.runtime.live.continuous import Attendants
     from pans.runtime.live.loop import LiveRun, Onlookers, run_live
     from pans.runtime.live.view import live_view

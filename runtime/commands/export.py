@@ -17,11 +17,11 @@ from typing import Any
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.cli import EXIT_FINE, Command, emit
 from pans.runtime.container import replace_file
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.record.exposures import ClickList, click_list, is_dark, recorded_plan
-from pans.runtime.record.format import NO_LABEL
-from pans.runtime.record.recorder import DecisionFlag, Recording, read_recording
+from pans.runtime.record.recorder import Recording, read_recording
 
 FORMATS = ("csv", "photon-hdf5")
 

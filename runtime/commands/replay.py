@@ -15,17 +15,18 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
-from pans.runtime.link.connection import plan_from_chunks
 from pans.runtime.record.log import log_hash
 from pans.runtime.record.parts import parts_in, place_of
-from pans.runtime.record.recorder import DECISION_DTYPE, Recording, read_recording
+from pans.runtime.record.recorder import Recording, read_recording
 from pans.runtime.report.pictures import PictureLog
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
 from pans.runtime.wire.messages import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command, unpack_body

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.calibration import (
     MAX_AGE_H,
@@ -27,12 +28,11 @@ from pans.runtime.instrument.calibration import (
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.record.format import DecisionFlag
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.dark_guard import DarkGuard
-    from pans.runtime.core.follower import Output
+    from pans.runtime.core.decision import Output
     from pans.runtime.core.plan import Plan
     from pans.runtime.live.run import LiveRun
 

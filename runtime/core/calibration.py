@@ -20,7 +20,8 @@ from pans.runtime.instrument.estimate import CountModel, Counts
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock
 
-from .follower import Follower, Output
+from .decision import Output
+from .follower import Follower
 from .plan import Plan, build_plan
 from .window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES, WRONG_PATTERNS
 

@@ -24,10 +24,10 @@ from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Findin
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch
 from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport, wilson_interval
 from pans.runtime.instrument.dead_channels import LitWatch, Silence
-from pans.runtime.record.format import DecisionFlag
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 from .dark_tables import Adapter, extra_probability, make_adapter
+from .decision import DecisionFlag
 from .plan import Plan
 
 POLICIES = ("warn", "tables", "mask", "abstain")

@@ -1,4 +1,4 @@
-"""What every core does with a stream: order, gaps, marks, the end; what a decision row is.
+"""What every core does with a stream: order, gaps, marks, the end.
 
 Owns one stream from ARM to its end and what is remembered of it; never decides: `core.Core` does so for objects that stand still and
 `flow.FlowCore` for those that pass by. `step` returns an `Output` for one frame, `begin` and `end` for what a stream leaves open.
@@ -7,7 +7,7 @@ Owns one stream from ARM to its end and what is remembered of it; never decides:
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from pans.runtime.wire.framing import Messages
 from pans.runtime.wire.messages import (
@@ -24,61 +24,11 @@ from pans.runtime.wire.messages import (
 )
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
+from .decision import Output, joined
 from .plan import Plan
 
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 PART_MARKS = 16  # of them that a part of a recording begins with
-
-
-class Decision(NamedTuple):
-    """One row of the decision log, in the order of record.DECISION_DTYPE; `probability` is the winning class's softmax."""
-
-    number: int
-    tick: int
-    exposure_index: int
-    object: int
-    shot: int
-    clicks: int
-    label: int
-    truth: int
-    flags: int
-    probability: float
-    counts_crc: int
-
-
-class Action(NamedTuple):
-    """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
-
-    number: int
-    tick: int
-    duration_ticks: int
-    channel: int
-
-
-class Passage(NamedTuple):
-    """An object that has passed by, one per decision: exposures `first`..`last` with its light, the end of the last in device ticks.
-
-    `centre` is the exposure at which it was centred, `clicks` are those of the whole passage.
-    """
-
-    first: int
-    last: int
-    centre: int
-    leave_tick: int
-    clicks: int
-
-
-class Output(NamedTuple):
-    """What one step produced; `block_end_tick` is the end of the last exposure seen, None if the frame held no exposures.
-
-    In flow `passages` says, for every decision in its place, what it was made from; `actions` is what is to be done.
-    """
-
-    decisions: list[Decision]
-    events: list[dict[str, Any]]
-    block_end_tick: int | None
-    passages: tuple[Passage, ...] = ()
-    actions: tuple[Action, ...] = ()
 
 
 class Follower:
@@ -267,17 +217,6 @@ class Follower:
         self.marks[mark.object_index] = mark
         if len(self.marks) > MAX_MARKS:
             del self.marks[next(iter(self.marks))]  # the one that was set longest ago
-
-
-def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Output:
-    """Return what two outputs say together, in their order."""
-    return Output(
-        first.decisions + then.decisions,
-        first.events + then.events,
-        block_end_tick,
-        first.passages + then.passages,
-        first.actions + then.actions,
-    )
 
 
 def _gap_event(gap: Gap) -> dict[str, Any]:

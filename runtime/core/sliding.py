@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.decide.table import CountTableDecider, TableDecider
 from pans.runtime.errors import UsageError
-from pans.runtime.record.format import NO_LABEL
 
 from . import sliding_kernels as kernels
+from .decision import NO_LABEL
 
 WORD_FEATURES_MAX = 16  # of windows that look words up
 LANE_SHOTS_MAX = 255  # a byte counts the clicks of a channel

@@ -13,15 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.decide.backends import Decider
-from pans.runtime.record.format import NO_LABEL as NO_LABEL
-from pans.runtime.record.format import DecisionFlag
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
 
 from .dark_guard import DarkGuard
-from .follower import MAX_MARKS as MAX_MARKS
-from .follower import Decision as Decision
+from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import Follower
-from .follower import Output as Output
 from .plan import Plan
 from .window import DecisionWindows, Window
 

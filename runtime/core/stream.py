@@ -15,14 +15,14 @@ import numpy.typing as npt
 
 from pans.runtime.decide.verdict import Decider, verdicts_of
 from pans.runtime.errors import UsageError
-from pans.runtime.record.format import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import Frame, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType
 
 from . import stream_kernels as kernels
+from .decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
 from .plan import Plan
-from .still import Core, Decision
+from .still import Core
 from .stream_kernels import DecisionTables, MarkArrays, WindowArrays
 
 ROWS_PER_BATCH = 8192

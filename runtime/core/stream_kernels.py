@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pans.runtime.record.format import NO_LABEL, DecisionFlag
 from pans.runtime.wire.block_kernels import (
     BLOCK_HEADER,
     BODY_HEADER,
@@ -26,6 +25,7 @@ from pans.runtime.wire.block_kernels import (
 from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH, MessageType
 
+from .decision import NO_LABEL, DecisionFlag
 from .window import DARK_CLICKS, DARK_EXPOSURES
 
 # state, int64 (N_STATE,): where the walk stands, and the facts of Core, StreamTracker and DecisionWindows that it continues

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.follower import Decision, Passage
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Passage
 from pans.runtime.instrument.dark_rate import wilson_interval
-from pans.runtime.record.format import NO_LABEL, DecisionFlag
 from pans.runtime.wire.messages import Mark
 
 MAX_REMEMBERED_PULSES = 1 << 16  # whose fate may still change

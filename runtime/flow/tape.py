@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.core.follower import Output, Passage
+from pans.runtime.core.decision import DecisionFlag, Output, Passage
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
-from pans.runtime.record.format import DecisionFlag
 
 from . import kernels
 from .core import NO_FLAGS, FlowCore, Rows

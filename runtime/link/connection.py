@@ -8,27 +8,23 @@ LinkError (it is silent or gone) or DeviceError (it refused).
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.timing.clock import ClockModel, ClockStep
 from pans.runtime.timing.evidence import Evidence, Stamped
 from pans.runtime.wire.commands import (
     MAX_PIXELS_PER_CHUNK,
-    MAX_SLOTS_PER_CHUNK,
-    MODES,
     PatternChunk,
-    PlanChunk,
     pack_pattern,
     pack_plan,
 )
 from pans.runtime.wire.framing import Messages
-from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, Frame, FrameDecoder, MalformedMessage, Opcode, Welcome
+from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome
 from pans.runtime.wire.session import HostSession
 
 from .base import Link
@@ -187,29 +183,6 @@ class Connection:
         self.reader.close()
 
 
-def plan_chunks(plan: Plan) -> list[PlanChunk]:
-    """Return the plan as LOAD_PLAN bodies."""
-    slots = np.zeros(plan.slots_per_cycle, SLOT_DTYPE)
-    slots["offset_ticks"] = plan.slot_offset_ticks
-    slots["pattern"] = plan.slot_pattern
-    slots["shot"] = plan.slot_shot
-    return [
-        PlanChunk(
-            MODES[plan.mode],
-            plan.n_patterns,
-            len(slots),
-            first,
-            plan.exposure_ticks,
-            plan.slot_period_ticks,
-            plan.cycle_ticks,
-            plan.block_exposures,
-            plan.cycles_per_object,
-            slots[first : first + MAX_SLOTS_PER_CHUNK],
-        )
-        for first in range(0, len(slots), MAX_SLOTS_PER_CHUNK)
-    ]
-
-
 def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
     """Raise DeviceError when what the device says of itself cannot carry out the plan."""
     limits = [
@@ -245,33 +218,4 @@ def _check_optics(facts: Any, bundle: Bundle) -> None:
     raise DeviceError(
         f"the device has {has}, {bundle.name} needs {needs}",
         remedy="a simulated instrument gets the optics of a bundle by optics=BUNDLE.pans in its URL",
-    )
-
-
-def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:
-    """Invert `plan_chunks`: the plan that a device was sent; MalformedMessage when slots are missing."""
-    if not chunks:
-        raise MalformedMessage("no plan was sent to the device")
-    slots = np.zeros(chunks[-1].n_slots, SLOT_DTYPE)
-    covered = 0
-    for chunk in chunks:
-        slots[chunk.first_slot : chunk.first_slot + len(chunk.slots)] = chunk.slots
-        covered += len(chunk.slots)
-    head = chunks[-1]
-    if covered < len(slots):
-        raise MalformedMessage(f"{covered} of {len(slots)} slots of the plan were sent")
-    lit = slots["pattern"] != DARK_PATTERN
-    return Plan(
-        mode={number: mode for mode, number in MODES.items()}[head.mode],
-        n_patterns=head.n_patterns,
-        slot_offset_ticks=slots["offset_ticks"].astype(np.int64),
-        slot_pattern=slots["pattern"].copy(),
-        slot_shot=slots["shot"].copy(),
-        exposure_ticks=head.exposure_ticks,
-        slot_period_ticks=head.slot_period_ticks,
-        cycle_ticks=head.cycle_ticks,
-        shots_per_cycle=int(slots["shot"][lit].max()) + 1,
-        cycles_per_object=head.cycles_per_object,
-        block_exposures=head.block_exposures,
-        exposure_us=head.exposure_ticks * 1e6 / tick_hz,
     )

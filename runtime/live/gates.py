@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import entry_points
 from typing import Any, Protocol
 
-from pans.runtime.core.follower import Action
+from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.record.parts_writer import AnyRecorder

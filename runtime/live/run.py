@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.still import Output
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record.parts_writer import AnyRecorder, PartedRecorder, repeated_setup

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pans.runtime.core.plan import NO_SHOT, Plan, ticks_of
+from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, open_link
-from pans.runtime.link.connection import ARM_LEAD_NS, NS_PER_S, Connection, plan_chunks
+from pans.runtime.link.connection import ARM_LEAD_NS, NS_PER_S, Connection
 from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_arm, pack_gate, pack_pattern, pack_plan
 from pans.runtime.wire.messages import DARK_PATTERN, DeviceState, Opcode
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.still import NO_LABEL, Decision
-from pans.runtime.record.recorder import DecisionFlag
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
 
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number

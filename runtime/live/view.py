@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from pans.runtime.cli import say
-from pans.runtime.core.still import NO_LABEL, Decision, Output
+from pans.runtime.core.decision import NO_LABEL, Decision, Output
 
 from .run import LiveRun, Watcher
 

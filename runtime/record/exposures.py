@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pans.runtime.commands.replay import sent_plan
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.errors import DamagedFileError
-from pans.runtime.link.connection import plan_from_chunks
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,

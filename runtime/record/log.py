@@ -15,9 +15,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError
 
-from .format import DECISION_DTYPE, LONG_VERDICT
+from .format import LONG_VERDICT
 
 BLOCK_ROWS = 1 << 14  # of one block of ours: 1.2 MB when nothing repeats
 ROWS_MAX = 1 << 18  # of one block that is read, so that a small file cannot ask for much memory

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import canonical_json, replace_file
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import PansError, UsageError
-from pans.runtime.link.connection import plan_chunks
 from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
 from pans.runtime.wire.framing import Messages
 from pans.runtime.wire.messages import Opcode, encode_command

@@ -20,28 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue, sync_folder
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.framing import Messages
 
-from .format import (
-    DECISION_DTYPE,
-    FORMAT_VERSION,
-    LIMITS,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_MAX_BYTES,
-    TIMING_DTYPE,
-    DecisionFlag,
-    Kind,
-)
+from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind
 from .log import BLOCK_ROWS, LogEncoder, decision_log_sha256
 from .recording import Recording, read_recording
 
 __all__ = [
-    "DECISION_DTYPE",
     "TIMING_DTYPE",
-    "DecisionFlag",
     "Kind",
     "Recorder",
     "Recording",

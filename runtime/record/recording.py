@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle, parse_bundle
 from pans.runtime.container import FILE_PROLOGUE, MIB, Block, check_prologue, parse_json_object, read_block
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
-from .format import DECISION_DTYPE, LIMITS, MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind
+from .format import LIMITS, MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind
 from .log import LogReader, log_reader
 
 

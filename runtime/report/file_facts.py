@@ -16,9 +16,10 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser
+from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.record.recorder import DecisionFlag, Recording, read_recording
+from pans.runtime.record.recorder import Recording, read_recording
 
 from .verify import file_kind
 

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
 from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, parse_bundle, word_means
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
-from pans.runtime.record.format import NO_LABEL
 from pans.runtime.record.parts import chain_violations, first_decision, parts_in
-from pans.runtime.record.recorder import DecisionFlag, Recording, read_recording
+from pans.runtime.record.recorder import Recording, read_recording
 
 _COMPARE_FEATURES_MAX = 16
 _ABSTAIN_CAUSES = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.core.follower import Output, joined
+from pans.runtime.core.decision import Output, joined
 from pans.runtime.core.plan import NO_SHOT, Plan
 from pans.runtime.decide.verdict import Verdict
 from pans.runtime.flow.core import FlowCore

@@ -16,13 +16,13 @@ from heads import head_bundle, random_layers
 from plans import parallel
 
 from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import softmax_winner, softmax_winners
 from pans.runtime.instrument.dark_rate import binomial_tail, wilson_interval
-from pans.runtime.record.format import DECISION_DTYPE
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder

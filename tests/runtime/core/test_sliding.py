@@ -15,6 +15,7 @@ from heads import head_bundle, random_layers
 from naive_window import sliding_counts
 
 from pans.runtime.core import sliding
+from pans.runtime.core.decision import NO_LABEL
 from pans.runtime.core.sliding import (
     SlidingCounts,
     SlidingObjects,
@@ -25,7 +26,6 @@ from pans.runtime.core.sliding import (
 )
 from pans.runtime.decide.table import CountTableDecider, TableDecider
 from pans.runtime.errors import UsageError
-from pans.runtime.record.format import NO_LABEL
 
 
 @cache

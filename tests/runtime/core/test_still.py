@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from plans import parallel, shot_major
 
-from pans.runtime.core.still import MAX_MARKS, NO_LABEL, Core
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
+from pans.runtime.core.follower import MAX_MARKS
+from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.backends import Verdict, softmax_winner
-from pans.runtime.record.recorder import DECISION_DTYPE, DecisionFlag
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameDecoder, Mark, StateReason, Status
 

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from plans import parallel, shot_major
 
 from pans.runtime.core import stream
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream import StreamCore, count_crc_tables
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
 from pans.runtime.errors import UsageError
-from pans.runtime.record.format import DECISION_DTYPE, NO_LABEL, DecisionFlag
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status

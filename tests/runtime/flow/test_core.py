@@ -21,11 +21,10 @@ from hypothesis import strategies as st
 from naive_flow import passages as naive_passages
 from numpy.typing import NDArray
 
-from pans.runtime.core.follower import Output, joined
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag, Output, joined
 from pans.runtime.errors import UsageError
 from pans.runtime.flow import kernels
 from pans.runtime.flow.settings import flow_limits
-from pans.runtime.record.format import NO_LABEL, DecisionFlag
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import NO_OBJECT, DeviceState, FrameBlock, StateReason, Status
 

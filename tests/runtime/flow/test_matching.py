@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pans.runtime.core.follower import Decision, Passage
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Passage
 from pans.runtime.flow.matching import PassageMatcher, abort_reason
 from pans.runtime.instrument.dark_rate import wilson_interval
-from pans.runtime.record.format import NO_LABEL, DecisionFlag
 from pans.runtime.wire.messages import Mark
 
 GATED = frozenset({1})

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.follower import Output, joined
+from pans.runtime.core.decision import Output, joined
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.link.connection import Connection

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pans.runtime.core.follower import Action
+from pans.runtime.core.decision import Action
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.live.gates import MAX_WAITING, GateDesk, open_actuator

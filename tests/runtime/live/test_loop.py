@@ -13,12 +13,12 @@ from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.bundle.model import Bundle, load_bundle, make_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.plan import build_plan
+from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
-from pans.runtime.link.connection import plan_chunks, plan_from_chunks
 from pans.runtime.live.loop import RunConfig, RunResult, run_live
 from pans.runtime.record.recorder import read_recording
 

@@ -14,7 +14,7 @@ import pytest
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
-from pans.runtime.core.follower import Action
+from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import open_link

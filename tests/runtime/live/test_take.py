@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pans.runtime.core.follower import Action, Output
+from pans.runtime.core.decision import Action, Output
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Arrived
 from pans.runtime.live.run import LiveRun

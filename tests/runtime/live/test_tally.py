@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pans.runtime.core.still import NO_LABEL, Decision
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
 from pans.runtime.live.tally import RunTally
-from pans.runtime.record.recorder import DecisionFlag
 
 NAN = float("nan")
 

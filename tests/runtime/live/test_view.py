@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pans.runtime.core.still import Decision, Output
+from pans.runtime.core.decision import Decision, Output
 from pans.runtime.live import view as live
 from pans.runtime.live.view import PANEL_DEADLINE_US, live_view
 from pans.runtime.timing.ledger import LatencyHistogram

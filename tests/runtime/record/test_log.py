@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record import log as record_log
-from pans.runtime.record.format import DECISION_DTYPE, LONG_VERDICT
+from pans.runtime.record.format import LONG_VERDICT
 from pans.runtime.record.log import RUN_DTYPE, VERDICT_DTYPE, CompactReader, LogEncoder, decision_log_sha256, log_hash
 from pans.runtime.record.recorder import Recorder, read_recording
 

@@ -16,17 +16,9 @@ import numpy as np
 import pytest
 
 from pans.runtime.bundle.model import bundle_bytes, make_bundle
+from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
-from pans.runtime.record.recorder import (
-    DECISION_DTYPE,
-    TIMING_DTYPE,
-    DecisionFlag,
-    Kind,
-    Recorder,
-    Recording,
-    decision_log_sha256,
-    read_recording,
-)
+from pans.runtime.record.recorder import TIMING_DTYPE, Kind, Recorder, Recording, decision_log_sha256, read_recording
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
 HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}

@@ -1,0 +1,106 @@
+"""What a core says: decisions with their flags, the passages and pulses that belong to them, and the output of one step.
+
+Owns the vocabulary that cores, recordings, reports and the live run share, and the row of the decision log; never decides.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Any, NamedTuple
+
+import numpy as np
+
+NO_LABEL = 0xFFFF  # the label of a decision that abstained
+
+
+class DecisionFlag(IntFlag):
+    """Why a decision is not to be trusted; lateness is a host's matter and stands in TIMINGS and EVENTS, not here."""
+
+    GAP = 1  # exposures of the window never arrived
+    WRONG_PATTERN = 2  # the device stamped another pattern than planned
+    INCOMPLETE = 4  # the run ended within the window
+    ABSTAINED = 8  # no label was given: label is 0xFFFF
+    DARK_ALARM = 16  # the dark counts had changed when the window was measured
+    STALE = 32  # the clicks were older than the decision may be
+    NOT_FINITE = 64  # the back end gave no finite score
+    COINCIDENCE = 128  # two objects passed at once: too long, or two maxima
+    AMBIGUOUS = 256  # no class was sure enough
+
+
+DECISION_DTYPE = np.dtype(
+    [
+        ("index", "<u8"),
+        ("tick", "<u8"),  # end of the last exposure, device ticks
+        ("exposure_index", "<u8"),  # the last exposure
+        ("object", "<u4"),
+        ("shot", "<u4"),  # the first shot of the window within the object's visit
+        ("clicks", "<u4"),
+        ("label", "<u2"),  # 0xFFFF: abstained
+        ("truth", "<i2"),  # -1: unknown
+        ("flags", "<u4"),  # DecisionFlag
+        ("probability", "<f4"),  # softmax of the winner
+        ("counts_crc", "<u4"),  # CRC-32 of the clicks per pattern as int64 little-endian
+    ]
+)
+
+
+class Decision(NamedTuple):
+    """One row of the decision log, in the order of DECISION_DTYPE; `probability` is the winning class's softmax."""
+
+    number: int
+    tick: int
+    exposure_index: int
+    object: int
+    shot: int
+    clicks: int
+    label: int
+    truth: int
+    flags: int
+    probability: float
+    counts_crc: int
+
+
+class Action(NamedTuple):
+    """A pulse that decision `number` asks for: output `channel` from `tick` on; worthless after `tick`. Absolute device ticks."""
+
+    number: int
+    tick: int
+    duration_ticks: int
+    channel: int
+
+
+class Passage(NamedTuple):
+    """An object that has passed by, one per decision: exposures `first`..`last` with its light, the end of the last in device ticks.
+
+    `centre` is the exposure at which it was centred, `clicks` are those of the whole passage.
+    """
+
+    first: int
+    last: int
+    centre: int
+    leave_tick: int
+    clicks: int
+
+
+class Output(NamedTuple):
+    """What one step produced; `block_end_tick` is the end of the last exposure seen, None if the frame held no exposures.
+
+    In flow `passages` says, for every decision in its place, what it was made from; `actions` is what is to be done.
+    """
+
+    decisions: list[Decision]
+    events: list[dict[str, Any]]
+    block_end_tick: int | None
+    passages: tuple[Passage, ...] = ()
+    actions: tuple[Action, ...] = ()
+
+
+def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Output:
+    """Return what two outputs say together, in their order."""
+    return Output(
+        first.decisions + then.decisions,
+        first.events + then.events,
+        block_end_tick,
+        first.passages + then.passages,
+        first.actions + then.actions,
+    )
