@@ -1,12 +1,18 @@
-"""Fixtures that several test files share; what needs data or torch says so when it is skipped."""
+"""What all tests share: fixtures, markers, and what is skipped here and why."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
+from tree import ROOT
+
+UNCOMPILED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+# `python -m pytest` puts the checkout on the path, and then `import runtime` would make a second copy of every class.
+sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -15,14 +21,24 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if os.environ.get("PANS_DATA"):
-        return
-    skip = pytest.mark.skip(
-        reason="needs the IDX data sets: set PANS_DATA to the folder that holds mnist/ and fashion-mnist/"
-    )
-    for item in items:
-        if "data" in item.keywords:
-            item.add_marker(skip)
+    if UNCOMPILED:
+        left_out = [item for item in items if not _runs_uncompiled(item)]
+        items[:] = [item for item in items if _runs_uncompiled(item)]
+        config.hook.pytest_deselected(items=left_out)
+    if not os.environ.get("PANS_DATA"):
+        reason = "needs the IDX data sets: set PANS_DATA to the folder that holds mnist/ and fashion-mnist/"
+        for item in items:
+            if "data" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def _runs_uncompiled(item: pytest.Item) -> bool:
+    """A test marked `uncompiled("a", "b")` runs without the compiler in its cases a and b, or in all of them."""
+    mark = item.get_closest_marker("uncompiled")
+    if mark is None:
+        return False
+    call = getattr(item, "callspec", None)
+    return not mark.args or (call is not None and call.id in mark.args)
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,10 @@
-"""The house rules: who imports whom, what the lean runtime never loads, and that the wheel holds the tree."""
+"""Rules for the whole tree: what the lean runtime never loads, that nothing pickles, and that the wheel holds the tree."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
-import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -15,12 +15,6 @@ import pytest
 from tree import ROOT
 
 PACKAGES = ("runtime", "trainer", "firmware_sim", "hw_profiles")
-ALLOWED = {
-    "runtime": {"hw_profiles"},
-    "trainer": {"runtime", "hw_profiles"},
-    "firmware_sim": {"runtime", "hw_profiles"},
-    "hw_profiles": set(),
-}
 HEAVY = ("torch", "matplotlib", "h5py", "optuna", "onnx", "scipy", "pandas")
 
 
@@ -39,11 +33,8 @@ def imported(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_who_imports_whom(package: str) -> None:
+def test_nothing_is_imported_under_a_bare_name(package: str) -> None:
     for path in modules(package):
-        ours = {name.split(".")[1] for name in imported(path) if name.startswith("pans.")}
-        strangers = ours - ALLOWED[package] - {package}
-        assert not strangers, f"{path.relative_to(ROOT)} imports pans.{strangers}"
         bare = {name.split(".")[0] for name in imported(path)} & set(PACKAGES)
         assert not bare, f"{path.relative_to(ROOT)} imports a bare {bare}: a second copy of every class"
 
@@ -108,32 +99,16 @@ def test_the_package_list_is_complete() -> None:
         assert (folder / "__init__.py").is_file(), folder
 
 
-@pytest.mark.skipif(os.environ.get("PANS_SKIP_WHEEL") == "1", reason="PANS_SKIP_WHEEL=1: no build tools here")
 def test_the_wheel_holds_the_tree(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--no-deps",
-        "--no-build-isolation",
-        "-q",
-        "-w",
-        str(tmp_path),
-        str(ROOT),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode and "setuptools" in done.stderr:
-        pytest.skip("setuptools is not installed beside pip: the wheel cannot be built without network")
-    assert done.returncode == 0, done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    held = set(zipfile.ZipFile(wheel).namelist())
-    tracked = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True)
-    wanted = {f"pans/{name}" for name in tracked.stdout.split()}
-    if not wanted:
+    tracked = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    if not tracked:
         pytest.skip("no git here: the tree's files are not known")
-    assert wanted <= held, wanted - held
-    code = {name for name in held if name.startswith("pans/")}
-    assert {name for name in code if name.endswith(".py")} <= wanted | {
-        f"pans/{p.relative_to(ROOT)}" for q in PACKAGES for p in modules(q)
-    }
+    for name in (*tracked, "pyproject.toml", "README.md", "LICENSE", "THIRD_PARTY.md"):  # a copy: a build leaves files
+        if (ROOT / name).exists():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, tmp_path / name)
+    options = ["--no-deps", "--no-build-isolation", "-q", "-w", str(tmp_path / "wheel")]
+    subprocess.run([sys.executable, "-m", "pip", "wheel", *options, str(tmp_path)], check=True)
+    (wheel,) = (tmp_path / "wheel").glob("*.whl")
+    held = {name.removeprefix("pans/") for name in zipfile.ZipFile(wheel).namelist() if name.startswith("pans/")}
+    assert held == {name for name in tracked if (ROOT / name).exists()}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +23,7 @@ def draw(
     return words
 
 
+@pytest.mark.uncompiled("0.0-0.0-10", "0.3-0.2-10")
 @pytest.mark.parametrize("channels", [1, 8, 10, 70])
 @pytest.mark.parametrize(("p_ap", "p_ct"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.2), (0.3, 0.2)])
 def test_the_bits_are_those_of_the_plain_detector(channels: int, p_ap: float, p_ct: float) -> None:
@@ -61,19 +59,3 @@ def test_sparse_sums_are_exact() -> None:
     out = np.empty((20, 6))
     sparse_sums(images, *sparse_patterns(levels), out)
     assert (out == images.astype(np.int64) @ levels.astype(np.int64).T).all()
-
-
-def test_kernels_without_the_compiler() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = [
-        "test_the_bits_are_those_of_the_plain_detector[0.0-0.0-10]",
-        "test_the_bits_are_those_of_the_plain_detector[0.3-0.2-10]",
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from fractions import Fraction
 from functools import cache
 
@@ -48,6 +45,7 @@ def short_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sliding, "PIECE_FRAMES", 13)
 
 
+@pytest.mark.uncompiled("3-4")
 @pytest.mark.parametrize(("n_features", "shots"), [(3, 1), (10, 1), (3, 4), (9, 2)])
 def test_labels_are_those_of_the_counts(n_features: int, shots: int) -> None:
     decider, rng = table_of(n_features, shots), np.random.default_rng(shots)
@@ -72,6 +70,7 @@ def test_no_window_overlaps_a_gap() -> None:
     ).all()
 
 
+@pytest.mark.uncompiled("5")
 @pytest.mark.parametrize("shots", [1, 5, 40])
 def test_score_sums_are_exact_in_steps(shots: int) -> None:
     rng = np.random.default_rng(shots)
@@ -98,6 +97,7 @@ def test_a_drop_of_error_never_grows() -> None:
     assert (windows._sums == windows.table[words[-32:]].sum(axis=0)).all()
 
 
+@pytest.mark.uncompiled("70-4-4", "10-5-2")
 @pytest.mark.parametrize(
     ("n_channels", "shots", "stride"), [(1, 3, 1), (10, 5, 2), (64, 255, 7), (70, 4, 4), (130, 9, 13)]
 )
@@ -117,6 +117,7 @@ def test_counts_of_any_width(n_channels: int, shots: int, stride: int) -> None:
     assert not windows.push(words[: shots - 1])[1].any()
 
 
+@pytest.mark.uncompiled
 def test_interleaved_objects_have_their_own_windows() -> None:
     decider, rng = table_of(3, 4), np.random.default_rng(7)
     words, objects = rng.integers(0, 8, 400).astype(np.uint16), rng.integers(0, 5, 400).astype(np.int32)
@@ -168,21 +169,3 @@ def test_what_cannot_be_is_refused() -> None:
         SlidingCounts(4, 256)
     with pytest.raises(UsageError, match="uint16"):
         SlidingTable(table_of(3, 1), 1).push(np.zeros(3, np.int64))  # type: ignore[arg-type]
-
-
-def test_kernels_without_the_compiler() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = [
-        "test_labels_are_those_of_the_counts[3-4]",
-        "test_score_sums_are_exact_in_steps[5]",
-        "test_interleaved_objects_have_their_own_windows",
-    ]
-    names += ["test_counts_of_any_width[70-4-4]", "test_counts_of_any_width[10-5-2]"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import zlib
 from dataclasses import asdict
 from typing import Any
@@ -103,6 +100,7 @@ def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndar
     return rows
 
 
+@pytest.mark.uncompiled("10-1-4-table", "11-2-3-sparse")
 @pytest.mark.parametrize(("n_features", "shots", "n_windows", "backend"), CASES)
 def test_a_clean_stream(n_features: int, shots: int, n_windows: int, backend: str) -> None:
     plan, decider = parallel(n_features, shots * n_windows), decider_for(n_features, shots, backend)
@@ -147,6 +145,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
     compare(plan, decider, shots, [whole[a:b] for a, b in zip([0, *at], [*at, len(whole)])])
 
 
+@pytest.mark.uncompiled
 def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "ROWS_PER_BATCH", 5)
     plan, decider = parallel(10, 8), decider_for(10, 1, "table")
@@ -156,6 +155,7 @@ def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40
 
 
+@pytest.mark.uncompiled
 def test_what_device_drops_and_sequence_wraps_do() -> None:
     plan, decider = parallel(3, 4), decider_for(3, 1, "table")
     words = np.ones((5, 1), np.uint8)
@@ -225,21 +225,3 @@ def test_the_checksum_of_counts_from_tables(n_features: int, shots: int) -> None
 def test_sequential_plans_are_refused() -> None:
     with pytest.raises(UsageError, match="parallel"):
         StreamCore(shot_major(3, 1), decider_for(3, 1, "table"), 1, 0, SESSION)
-
-
-def test_kernels_without_the_compiler() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = [
-        "test_a_clean_stream[10-1-4-table]",
-        "test_a_clean_stream[11-2-3-sparse]",
-        "test_more_rows_than_a_batch_holds",
-    ]
-    names += ["test_what_device_drops_and_sequence_wraps_do"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -48,6 +45,7 @@ def run(
     return settled, windows
 
 
+@pytest.mark.uncompiled
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_windows_match_the_oracle(data: st.DataObject) -> None:
@@ -101,6 +99,7 @@ def test_whole_visits_that_were_lost_are_reported_one_by_one() -> None:
     assert [(w.missing, w.counts.sum()) for w in lost] == [(2, 0)] * 10
 
 
+@pytest.mark.uncompiled
 @pytest.mark.parametrize("n_features", [1, 8, 10, 64, 70])
 def test_parallel_frames(n_features: int) -> None:
     plan = parallel(n_features, 6)
@@ -123,16 +122,3 @@ def test_shots_that_do_not_divide_are_refused_with_the_numbers() -> None:
 def test_a_visit_that_does_not_fit_in_memory_is_refused() -> None:
     with pytest.raises(PlanError, match="exposures, allowed"):
         DecisionWindows(shot_major(1000, 1 << 20), 1000, 1)
-
-
-def test_kernels_agree_with_the_oracle_when_not_compiled() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = ["test_windows_match_the_oracle", "test_parallel_frames"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

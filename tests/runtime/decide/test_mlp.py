@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import naive_decide as naive
 import numpy as np
 import pytest
@@ -41,6 +37,7 @@ def error_bound(layers: tuple[Layer, ...], means: np.ndarray) -> np.ndarray:
     return bound
 
 
+@pytest.mark.uncompiled("1-sizes0")
 @pytest.mark.parametrize("sizes", SHAPES)
 @pytest.mark.parametrize("shots", [1, 7])
 def test_sparse_scores_are_the_oracles_within_the_bound_of_rounding(sizes: list[int], shots: int) -> None:
@@ -70,6 +67,7 @@ def test_one_alone_and_many_give_the_same_bits(backend: str) -> None:
             assert verdict.probability == pytest.approx(softmax_winner(score).probability, rel=1e-6)
 
 
+@pytest.mark.uncompiled
 def test_ties_and_scores_that_are_not_finite() -> None:
     flat = (Layer(np.zeros((3, 4), np.float32), np.array([1, 2, 2, 0], np.float32), False),)
     decider = SparseDecider(head_bundle(flat))
@@ -152,6 +150,7 @@ def test_tables_of_counts_stay_small() -> None:
 # -- int8 ------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.uncompiled("5-sizes1")
 @pytest.mark.parametrize("sizes", SHAPES)
 @pytest.mark.parametrize("shots", [1, 5])
 def test_int8_scores_are_those_of_the_definition(sizes: list[int], shots: int) -> None:
@@ -241,20 +240,6 @@ def test_int8_heads_of_wrong_shape_are_refused() -> None:
         parts = {name: getattr(head, name) for name in ("sizes", "weights", "affine")} | change
         with pytest.raises(UsageError, match="int8"):
             head_bundle(layers, int8_head=Int8Head(**parts))
-
-
-def test_kernels_without_the_compiler() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = ["test_sparse_scores_are_the_oracles_within_the_bound_of_rounding[1-sizes0]"]
-    names += ["test_int8_scores_are_those_of_the_definition[5-sizes1]", "test_ties_and_scores_that_are_not_finite"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(("d_f", "bits"), [(1, 5), (10, 5), (11, 5), (32, 4), (64, 0)])

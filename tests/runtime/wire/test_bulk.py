@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import random
-import subprocess
-import sys
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -86,6 +83,7 @@ def test_any_stream_cut_anywhere(
         assert [(frame.type, frame.payload) for frame in found] == frames
 
 
+@pytest.mark.uncompiled
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400).map(lambda data: data.replace(b"\0", b"\1\2")))
 def test_code_bytes_that_lead_anywhere(raw: bytes) -> None:
@@ -93,6 +91,7 @@ def test_code_bytes_that_lead_anywhere(raw: bytes) -> None:
     compare([raw + b"\0", b"\0", raw])
 
 
+@pytest.mark.uncompiled
 def test_one_byte_at_a_time() -> None:
     data = b"".join(encode_frame(0x91, bytes(n) + b"ab", 3) for n in range(0, 600, 97)) + b"\0\0junk\0"
     assert len(compare([data[i : i + 1] for i in range(len(data))])) == 7
@@ -119,6 +118,7 @@ def test_a_stream_longer_than_the_buffer() -> None:
     assert len(compare([data])) == 200
 
 
+@pytest.mark.uncompiled
 @pytest.mark.parametrize("size", [0, 1, 7, 15, 16, 17, 1000])
 def test_crc_is_that_of_zlib(size: int) -> None:
     data = np.random.default_rng(size).integers(0, 256, size + 5, dtype=np.uint8)
@@ -128,6 +128,7 @@ def test_crc_is_that_of_zlib(size: int) -> None:
         assert found == zlib.crc32(data[2 : size + 2].tobytes(), seed)
 
 
+@pytest.mark.uncompiled
 def test_find_zero_sees_every_zero_and_nothing_else() -> None:
     for position in range(20):
         data = np.full(20, 0x80, np.uint8)
@@ -137,22 +138,9 @@ def test_find_zero_sees_every_zero_and_nothing_else() -> None:
         assert wire_kernels.find_zero(data, np.uint64(position + 1), np.uint64(20)) == 20
 
 
+@pytest.mark.uncompiled
 def test_full_groups_may_end_with_or_without_an_empty_one() -> None:
     body = b"x" * 250
     crc = zlib.crc32(b"\x91\0\0\0" + body, SCHEMA).to_bytes(4, "little")
     plain = cobs_encode(b"\x91\0\0\0" + body + crc)
     compare([plain + b"\0", plain + b"\1\0", plain.removesuffix(b"\1") + b"\0"])
-
-
-def test_kernels_without_the_compiler() -> None:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        pytest.skip("this is the run without compilation")
-    names = ["test_one_byte_at_a_time", "test_crc_is_that_of_zlib", "test_find_zero_sees_every_zero_and_nothing_else"]
-    names += ["test_full_groups_may_end_with_or_without_an_empty_one", "test_code_bytes_that_lead_anywhere"]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"{__file__}::{name}" for name in names)],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr

@@ -29,7 +29,6 @@ def test_the_model_gives_the_scores_of_the_integers() -> None:
     assert (reference_scores(layers, counts).argmax(axis=1) == own.argmax(axis=1)).mean() > 0.97
 
 
-@pytest.mark.torch
 def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
     torch = pytest.importorskip("torch")
     from pans.runtime.bundle.model import load_bundle

@@ -1,0 +1,108 @@
+"""The order of the packages, as pyproject.toml states it: who may import whom, no circle between modules, no folder too full."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+from tree import ROOT
+
+LAYERS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pans"]["layers"]
+BELOW = {"runtime": {"hw_profiles"}, "trainer": {"runtime", "hw_profiles"}, "firmware_sim": {"runtime", "hw_profiles"}}
+FOLDERS_WITH_CODE = (*LAYERS, "tests")
+MOST_MODULES = 16
+STARTED = re.compile(r"-m[\"', ]+(pans(?:\.\w+)+)")  # another process: `python -m pans...`, as words of a list too
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Dotted name -> file of every module."""
+    files = [path for top in LAYERS for path in (ROOT / top).rglob("*.py") if "__pycache__" not in path.parts]
+    names = {"pans." + ".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    return {name.removesuffix(".__init__"): path for name, path in names.items()}
+
+
+def imports(name: str) -> Iterator[str]:
+    """Yield the modules of ours that a module imports, late imports and those for types included."""
+    path = modules()[name]
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules())
+        elif isinstance(node, ast.ImportFrom):
+            parent = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parent, *([node.module] if node.module else [])])
+            for alias in node.names:
+                full = f"{base}.{alias.name}"
+                if full in modules() or base in modules():
+                    yield full if full in modules() else base
+
+
+def place(name: str) -> tuple[str, str]:
+    """Return the top folder and the package that a module belongs to ("" for one beside the packages)."""
+    _, top, *rest = name.split(".")
+    return top, rest[0] if rest and rest[0] in LAYERS[top] else ""
+
+
+def is_allowed(importer: str, imported: str) -> bool:
+    (top, package), (other_top, other) = place(importer), place(imported)
+    if top != other_top:
+        return other_top in BELOW.get(top, ())
+    return LAYERS[top].index(other) <= LAYERS[top].index(package)
+
+
+def test_every_folder_has_its_place_in_the_order() -> None:
+    for top, packages in LAYERS.items():
+        found = {path.parent.name for path in (ROOT / top).glob("*/__init__.py")}
+        assert found - {"api"} == set(packages) - {""}, top  # api is `import pans` itself, above all
+
+
+@pytest.mark.parametrize("top", LAYERS)
+def test_each_package_imports_only_those_before_it(top: str) -> None:
+    wrong = [
+        f"{name} imports {other}"
+        for name in modules()
+        if name.split(".")[1] == top and not is_the_door(name)
+        for other in imports(name)
+        if not is_allowed(name, other)
+    ]
+    assert not wrong, "\n".join(sorted(set(wrong)))
+
+
+def is_the_door(name: str) -> bool:
+    """`python -m pans.firmware_sim` and `import pans` stand above everything in their folder."""
+    return name.endswith(".__main__") or name.split(".")[:3] == ["pans", "runtime", "api"]
+
+
+@pytest.mark.parametrize("top", LAYERS)
+def test_what_is_started_as_a_process_exists_and_stands_below(top: str) -> None:
+    for name, path in modules().items():
+        if name.split(".")[1] != top:
+            continue
+        for started in STARTED.findall(path.read_text()):
+            assert started in modules(), f"{path}: starts {started}, which does not exist"
+            own_kind = started.split(".")[1] == top
+            assert not own_kind or is_the_door(f"{started}.__main__") or is_allowed(name, started), f"{path}: {started}"
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    graph = {name: set(imports(name)) - {name} for name in modules()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_no_folder_is_a_heap() -> None:
+    files = [
+        path for top in FOLDERS_WITH_CODE for path in (ROOT / top).rglob("*.py") if "__pycache__" not in path.parts
+    ]
+    sizes = Counter(path.parent.relative_to(ROOT).as_posix() for path in files)
+    assert {folder: n for folder, n in sizes.items() if n > MOST_MODULES} == {}

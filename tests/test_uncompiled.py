@@ -1,0 +1,27 @@
+"""Kernels give the same results as plain Python: the tests marked `uncompiled` run once more without the compiler."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from tree import ROOT
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="this is the run without the compiler")
+def test_kernels_without_the_compiler() -> None:
+    marked = [path for path in ROOT.glob("tests/*/**/test_*.py") if "pytest.mark.uncompiled" in path.read_text()]
+    wanted = sum(len(re.findall(r"@pytest\.mark\.uncompiled", path.read_text())) for path in marked)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rA", *map(str, marked)],
+        cwd=ROOT,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    ran = {line.split()[1].partition("[")[0] for line in done.stdout.splitlines() if line.startswith("PASSED ")}
+    assert len(ran) == wanted > 0, ran
