@@ -202,7 +202,7 @@ SENSING_FEW = (100.0, 10.0)  # and up to so many photons, with any number of pat
 PATTERN_PEAKS = (18, 100)  # brightest pixel over the mean of all, first and last stage of a training
 
 # Not the paper's: direct imaging by the exact Poisson likelihood of all 60 000 training objects, all 10 000 test images, 2 trials
-# (docs/BASELINES.md). Photons -> accuracy in %. The paper's own direct imaging is a network trained on clean frames.
+# (docs/how-to/baselines.md). Photons -> accuracy in %. The paper's own direct imaging is a network trained on clean frames.
 DIRECT: dict[str, dict[float, float]] = {
     "fashion-mnist": {5: 44.94, 10: 58.05, 17: 66.61, 30: 73.42, 100: 80.48, 300: 83.27},
     "mnist": {5: 54.43, 10: 72.54, 17: 83.58, 30: 90.35, 100: 95.29, 300: 96.42},

@@ -28,7 +28,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark, a .npz or a .toml file")
     parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
     parser.add_argument(
-        "--changes", default="", help="like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (SIMULATOR.md)"
+        "--changes", default="", help="like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")

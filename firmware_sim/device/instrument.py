@@ -1,4 +1,4 @@
-"""The instrument as a sans-I/O state machine: bytes and ticks in, bytes out (docs/PROTOCOL.md is its specification).
+"""The instrument as a sans-I/O state machine: bytes and ticks in, bytes out (docs/reference/protocol.md is its specification).
 
 Owns the session, commands, states, lease, receive window and gates; never reads a clock, sleeps or opens a port.
 `Instrument.step(tick, data)` moves device time to `tick`, digests what the host sent by then and returns what the device has

@@ -1,4 +1,4 @@
-"""The device's end of the stream: sequence numbers, receive window, buffer and drop count (docs/PROTOCOL.md, section 5).
+"""The device's end of the stream: sequence numbers, receive window, buffer and drop count (docs/reference/protocol.md, section 5).
 
 Owns what waits to be sent; never retransmits. `StreamBuffer.put`, `put_due` and `grant` return the frames that may be sent now.
 """

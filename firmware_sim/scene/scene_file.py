@@ -1,4 +1,4 @@
-"""Scene files in TOML: `kind = "still"`, `"cells"` or `"tape"`, and `[[change]]` tables; docs/SIMULATOR.md explains every key.
+"""Scene files in TOML: `kind = "still"`, `"cells"` or `"tape"`, and `[[change]]` tables; docs/reference/simulator.md explains every key.
 
 Owns the keys, their limits and the words of the errors, which start with file:line:col; never computes anything. `read_scene_file`
 returns a `SceneFile`. Names of other files in it are relative to it. What the simulator cannot do is refused here.
@@ -26,7 +26,7 @@ from .still import SCENE_FOLDER, TARGETS, Scene, load_images, load_scene
 MAX_FILE_BYTES = 1 << 16
 MAX_TAPE_BITS = 1 << 24
 MAX_TIME_S = 1e7
-_PAGE = "docs/SIMULATOR.md"
+_PAGE = "docs/reference/simulator.md"
 _SHARED = {"kind": Key("text", choices=("still", "cells", "tape"))}
 _RULES: dict[str, dict[str, Key]] = {
     "still": {"images": Key("text")},

@@ -1,4 +1,4 @@
-"""Bundles as bytes: docs/FORMATS.md in code.
+"""Bundles as bytes: docs/reference/formats.md in code.
 
 Owns the layout, its checksums and its limits; never touches a file and never makes a bundle. `parse_bundle` raises
 DamagedFileError for any byte that is not as it was written, with the part that changed. The container is our own, not zip: zip

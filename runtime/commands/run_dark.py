@@ -47,7 +47,7 @@ F64 = NDArray[np.float64]
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options to `pans run`."""
-    group = parser.add_argument_group("an honest instrument (docs/CALIBRATION.md, docs/DARK.md)")
+    group = parser.add_argument_group("an honest instrument (docs/how-to/calibrate.md, docs/how-to/dark-counts.md)")
     group.add_argument(
         "--calibration", type=Path, metavar="FILE", help="what `pans calibrate` measured on this instrument"
     )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a flow to `pans run`."""
-    group = parser.add_argument_group("objects that pass by (docs/FLOW.md)")
+    group = parser.add_argument_group("objects that pass by (docs/how-to/flow.md)")
     group.add_argument("--flow", metavar="cells|tape|FILE", help="settings of the flow: shipped ones or a TOML file")
     group.add_argument(
         "--gate-class", action="append", default=[], metavar="NAME", help="class to pulse for (repeatable, or a,b)"

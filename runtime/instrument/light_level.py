@@ -4,7 +4,7 @@ Owns sums of clicks and their comparison with the run's own beginning, which the
 objects, so that a change of their mixture looks like a change of light, and the words say so. Nothing is decided by it.
 
 How much of a change of efficiency is seen in the clicks depends on the patterns: nearly all of it where an exposure clicks
-seldom, next to nothing where objects make it either dark or saturated (docs/CALIBRATION.md has figures).
+seldom, next to nothing where objects make it either dark or saturated (docs/how-to/calibrate.md has figures).
 
 Clicks are added up over batches of decisions, so that the spread between objects is measured and not assumed. The first batches
 give mean m and standard deviation s, until m is known to BASELINE_ERROR; then a two-sided CUSUM (Page 1954) sums the deviation

@@ -1,4 +1,4 @@
-"""Hardware profile: a TOML file -> frozen facts about one instrument. docs/PROFILES.md explains every key.
+"""Hardware profile: a TOML file -> frozen facts about one instrument. docs/reference/profiles.md explains every key.
 
 Owns the facts, and reading files and shipped profiles (profile_check.py holds the rules); never holds what a calibration
 measured (calibration.py), and never decides whether a bundle fits (plan.py). `load_profile` and `parse_profile` return a
@@ -190,5 +190,5 @@ def _decoded(data: bytes, where: str) -> str:
 def _too_large(where: str) -> ConfigError:
     return ConfigError(
         f"{where}:1:1: a profile may hold at most {MAX_PROFILE_BYTES} bytes, found more",
-        remedy="is this a profile? see docs/PROFILES.md",
+        remedy="is this a profile? see docs/reference/profiles.md",
     )

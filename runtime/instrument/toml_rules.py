@@ -81,7 +81,7 @@ def type_remedy(value: Any, kind: str) -> str:
     return "write a plain number"
 
 
-def near(name: str, known: list[str], form: str = "{}", page: str = "docs/PROFILES.md") -> str:
+def near(name: str, known: list[str], form: str = "{}", page: str = "docs/reference/profiles.md") -> str:
     """The known name that was probably meant, or the page that explains them all."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     return f"did you mean {form.format(close[0])}?" if close else f"{page} explains every key"

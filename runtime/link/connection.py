@@ -129,7 +129,7 @@ class Connection:
         missing = [key for key in REQUIRED_FACTS if key not in welcome.facts]
         if missing:
             raise DeviceError(
-                f"the device's WELCOME lacks {', '.join(missing)}", remedy="see docs/PROTOCOL.md, section 3"
+                f"the device's WELCOME lacks {', '.join(missing)}", remedy="see docs/reference/protocol.md, section 3"
             )
         self.clock = ClockModel(int(welcome.facts["tick_hz"]))
         self.session.submit(Opcode.RESET)

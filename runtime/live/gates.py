@@ -6,7 +6,7 @@ acted upon is on record before its command leaves. The instrument refuses what c
 
 `--act` may name a second instrument (second_device.py): a pulse's tick is then converted to the host's time and on to the other
 clock's tick, and what both conversions may be off stands in the event beside it. An actuator of a laboratory's own is found by
-entry point (`pans.actuators`): a function from the URL's rest to an object with `fire` and `close`, see docs/FLOW.md.
+entry point (`pans.actuators`): a function from the URL's rest to an object with `fire` and `close`, see docs/how-to/flow.md.
 """
 
 from __future__ import annotations

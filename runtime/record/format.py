@@ -1,7 +1,7 @@
 """What stands in a recording: block kinds with their limits, and the row of timings.
 
 Owns the vocabulary that writer (recorder.py) and reader (recording.py) share; never touches a file. The decision log's row is in
-core/decision.py, the bytes are in docs/FORMATS.md.
+core/decision.py, the bytes are in docs/reference/formats.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The decision log on disk and its hash: what a decision needs in bytes, and the way back to the rows.
 
-Owns both forms that DECISIONS blocks have had (docs/FORMATS.md): the rows as they are (format version 1) and the compact form (version 2).
+Owns both forms that DECISIONS blocks have had (docs/reference/formats.md): the rows as they are (format version 1)
+and the compact form (version 2).
 Never touches a file and never decides. In the compact form each different verdict stands once and is named by its number; what else a
 row holds goes up in equal steps, so that a run of decisions needs its first row and the steps: 2 bytes for a decision of a fast, regular
 stream, not 52. Nothing is left out: the rows come back bit for bit. The hash does not depend on how the rows were cut into blocks.

@@ -2,8 +2,8 @@
 
 Owns the binding of a thread to a core, and the spinning thread of idle priority that keeps this core from halting; undone afterwards.
 A core that halts between two blocks wakes with cold caches and, in a virtual machine, after somebody else's turn: a turn of the
-loop then takes about twice as long (docs/TIMING.md). The spinner belongs to the same process, so that only threads change over, and
-whatever has something to do goes before it. It costs a whole core, hence only when asked for.
+loop then takes about twice as long (docs/explanation/timing.md). The spinner belongs to the same process, so that only
+threads change over, and whatever has something to do goes before it. It costs a whole core, hence only when asked for.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What compiled walks ask of a decoded FRAMES message: its shape, and whether it is the next one of the stream.
 
-Owns the offsets of the block's header (docs/PROTOCOL.md) for kernels; never allocates and keeps no state.
+Owns the offsets of the block's header (docs/reference/protocol.md) for kernels; never allocates and keeps no state.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bodies of the protocol's commands: pack on the host, unpack on the device (docs/PROTOCOL.md, "Commands").
+"""Bodies of the protocol's commands: pack on the host, unpack on the device (docs/reference/protocol.md, "Commands").
 
 Owns the layouts of LOAD_PATTERN, LOAD_PLAN, ARM and GATE. `pack_*` return bytes for `wire.encode_command`, `unpack_*` return named
 tuples or raise `MalformedMessage`. Sizes are checked before anything is allocated.

@@ -1,4 +1,4 @@
-"""The wire protocol's messages, version 1: named tuples <-> bytes, both ends (docs/PROTOCOL.md is its specification).
+"""The wire protocol's messages, version 1: named tuples <-> bytes, both ends (docs/reference/protocol.md is its specification).
 
 Owns what a message means; the tables are wire_schema.py's and the framing framing.py's, and both are offered from here too. Never reads
 a clock, opens a port or keeps click state. `encode_*` return bytes ready to send; `decode_*` turn a frame's payload into a named tuple

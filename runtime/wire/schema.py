@@ -1,4 +1,4 @@
-"""Protocol 1 in tables: message types, states, limits and byte layouts (docs/PROTOCOL.md is its specification).
+"""Protocol 1 in tables: message types, states, limits and byte layouts (docs/reference/protocol.md is its specification).
 
 Owns the numbers that both ends must agree on, and the schema hash made from them; never encodes a message (wire.py does) and never
 frames one (framing.py does).

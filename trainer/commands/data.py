@@ -1,7 +1,7 @@
 """`pans data`: the public sets (listed, fetched), and scenes for the simulator made from any task.
 
 Owns the command's arguments and how its answers look; the sets are public_sets.py's, the drawn objects generators.py's. A scene is a .npz
-file with images, labels and classes (docs/SIMULATOR.md): objects that stand still, or cells for a scene that moves.
+file with images, labels and classes (docs/reference/simulator.md): objects that stand still, or cells for a scene that moves.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Owns the list and the provenance; never draws itself (see the task_*.py files) and never reads a file. `generate` returns a
 `Drawn`: images uint8 (n, height, width), labels int64 (n,), for training and held out. Every generator here is OURS: the paper's
-images for these tasks are not public in a form that can be reached. docs/TASKS.md shows and measures them.
+images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows and measures them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pictures of the tasks for docs/TASKS.md: some held-out objects of every class, with their mean intensity.
+"""Pictures of the tasks for docs/reference/tasks.md: some held-out objects of every class, with their mean intensity.
 
 Owns these pictures alone (needs the extra `plot`); never a result. Run `python -m pans.trainer.tasks.pictures FOLDER [DATA]`: one PNG
 per drawn task, and with a data folder (holding mnist/) the fibre's speckle as well.

@@ -176,7 +176,7 @@ def test_a_whole_run_tick_by_tick() -> None:
 
 
 def test_the_first_block_byte_by_byte() -> None:
-    """Written from docs/PROTOCOL.md with struct and zlib alone."""
+    """Written from docs/reference/protocol.md with struct and zlib alone."""
     bench = Bench().ready(np.full((2, 1), FULL, np.uint16), exposure_ticks=90)
     bench.arm(start=2000, cycles=1)
     bench.grant()

@@ -189,7 +189,7 @@ def test_parallel_needs_channels():
         ("dead_time = 3", "the unit is part of the name", "convert the value to ns"),
         ("eficiency = 0.5", "[detector] takes kind, channels, efficiency", "did you mean efficiency?"),
         ("lease_ms = 5", "not a key", "belongs in [timing]"),
-        ("zzz = 1", "not a key", "docs/PROFILES.md"),
+        ("zzz = 1", "not a key", "docs/reference/profiles.md"),
     ],
 )
 def test_an_unknown_key_is_an_error_with_a_suggestion(line, message, remedy):
@@ -314,7 +314,7 @@ def test_every_figure_of_a_shipped_profile_has_a_source_or_is_to_be_measured(nam
 
 @pytest.mark.parametrize("name", shipped_profiles())
 def test_every_shipped_key_is_explained(name):
-    page = (ROOT / "docs" / "PROFILES.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "profiles.md").read_text(encoding="utf-8")
     for section, table in tomllib.loads(load_profile(name).text).items():
         assert f"[{section}]" in page
         if section != "sources":

@@ -70,7 +70,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
 
 
 def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
-    """Written out by hand from docs/FORMATS.md, with none of the code under test."""
+    """Written out by hand from docs/reference/formats.md, with none of the code under test."""
 
     def block(kind: int, index: int, chain: int, payload: bytes) -> tuple[bytes, int]:
         start = struct.pack("<II", len(payload), index) + bytes([kind, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""Golden bytes written by hand from docs/PROTOCOL.md, and the framing's hard cases.
+"""Golden bytes written by hand from docs/reference/protocol.md, and the framing's hard cases.
 
 Both ends share wire.py, so a round trip proves little alone: the golden frames below were assembled from the specification with
 COBS groups and CRC-32 worked out independently of the code under test.
@@ -36,7 +36,7 @@ from pans.runtime.wire.commands import (
 from pans.runtime.wire.messages import FrameDecoder, MessageType
 
 SESSION = 0x11223344
-PROTOCOL = (ROOT / "docs" / "PROTOCOL.md").read_text()
+PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text()
 
 
 def frame_by_hand(message_type: int, payload: bytes, seed: int = wire.SCHEMA, session: int = SESSION) -> bytes:

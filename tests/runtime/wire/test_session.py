@@ -207,7 +207,7 @@ def test_impossible_nonces(nonce: int) -> None:
 
 def test_the_limits_are_the_documented_ones() -> None:
 
-    protocol = (ROOT / "docs" / "PROTOCOL.md").read_text()
+    protocol = (ROOT / "docs" / "reference" / "protocol.md").read_text()
     assert "HELLO every 200 ms" in protocol
     assert f"at most {session_module.COMMAND_WINDOW} commands unacknowledged" in protocol
     assert "when the oldest is 250 ms old (at a pace that doubles up to 2 s, and gives up after 10 s)" in protocol
