@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live.loop import RunConfig, run_live
@@ -40,7 +40,7 @@ def witnessed(faults: str) -> tuple[Facts, Verdict]:
         heard.append((facts, verdict))
         return verdict
 
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     config = RunConfig(n_cycles=4000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
     blame.judge = listen

@@ -12,9 +12,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import detector_model, first_click_probability, sample_clicks
+from pans.firmware_sim.scene.detector import sample_clicks
+from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
 from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.light import begin, prepare
 from pans.firmware_sim.scene.moving import Cells

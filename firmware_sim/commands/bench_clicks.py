@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.scene.detector import DetectorModel, first_click_probability, sample_clicks
+from pans.firmware_sim.scene.detector import sample_clicks
 from pans.firmware_sim.scene.detector_kernels import sample_words, sparse_patterns, sparse_sums
+from pans.firmware_sim.scene.detector_model import DetectorModel, first_click_probability
 from pans.runtime.bench.rows import BenchOptions, Row, cpu_time
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.click_law import ClickLaw

@@ -11,8 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import detector_model
+from pans.firmware_sim.scene.detector_model import detector_model
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.light import LightTable, StillObjects, begin, prepare, tabulate, warm_up
@@ -29,7 +30,7 @@ from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageTyp
 from .gates import GATE_CHANNELS, Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
 from .stream_buffer import U32, StreamBuffer
-from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Program, Refused
+from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Refused
 
 if TYPE_CHECKING:
     from pans.firmware_sim.scene.shifts import ShiftTable

@@ -14,6 +14,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.light import RunLight
 from pans.firmware_sim.scene.marks import Stamp
@@ -24,7 +25,7 @@ from pans.runtime.wire.schema import SCHEMA
 from . import frame_writer
 from .frame_writer import BlockPlan
 from .sequential import Timetable
-from .upload import Program, word_bytes
+from .upload import word_bytes
 
 STRETCH_EXPOSURES = 2048  # made at a time, in whole blocks, where time is virtual,
 AHEAD_EXPOSURES = 256  # and where it is real, between one block and the next: making them must not hold that one up

@@ -10,12 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.light import StillObjects
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import NO_OBJECT, AckStatus, ClickBlock, FrameBlock, Mark
 
-from .upload import Program, Refused
+from .upload import Refused
 
 BATCH_NUMBERS = 1 << 14  # clicks drawn at a time
 MAX_LEASE_MS = 3_600_000

@@ -1,6 +1,6 @@
 """What the host has uploaded: pattern memory and plan memory, with every limit checked before anything is stored.
 
-Owns the checks of LOAD_PATTERN and LOAD_PLAN and the compiled `Program`; never runs it. A chunk that cannot be meant raises
+Owns the checks of LOAD_PATTERN and LOAD_PLAN and compiles the `Program`; never runs it. A chunk that cannot be meant raises
 `Refused` with the status and text of the acknowledgement, and leaves the memory as it was. Chunks come in order; the one that
 starts at 0 starts over.
 """
@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.program import Program
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk, PlanChunk
 from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, DARK_PATTERN, MAX_PAYLOAD_BYTES, AckStatus
@@ -31,29 +32,6 @@ class Refused(Exception):
         super().__init__(text)
         self.status = status
         self.text = text
-
-
-@dataclass(frozen=True, slots=True)
-class Program:
-    """A complete plan: exposures of one cycle, int64 (slots,), and how they are cut into blocks (first slot, count)."""
-
-    mode: int
-    n_patterns: int
-    exposure_ticks: int
-    slot_period_ticks: int
-    cycle_ticks: int
-    cycles_per_object: int
-    offsets: NDArray[np.int64]
-    patterns: NDArray[np.uint16]
-    blocks: tuple[tuple[int, int], ...]
-
-    @property
-    def n_slots(self) -> int:
-        return len(self.offsets)
-
-    @property
-    def channels(self) -> int:
-        return self.n_patterns if self.mode == PARALLEL else 1
 
 
 @dataclass(slots=True)

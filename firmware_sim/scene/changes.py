@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .detector import DetectorModel, first_click_probability
+from .detector_model import DetectorModel, first_click_probability
 from .moving import ALL_CHANNELS, Change
 
 F64 = NDArray[np.float64]

@@ -1,68 +1,32 @@
-"""From photoelectrons to clicks: the detector's law, its memory and its random numbers.
+"""From click probabilities to clicks: the detector's memory and its random numbers, in numpy.
 
-Owns the click probability with the effects that the profile declares, and a counter-based generator: the number drawn
-for an exposure depends on (seed, exposure, channel) alone, so that blocks, batches and threads change nothing. Never keeps
-state: the click of the exposure before is an argument. What is not declared costs nothing.
+Owns a counter-based generator: the number drawn for an exposure depends on (seed, exposure, channel) alone, so that blocks, batches
+and threads change nothing. Never keeps state: the click of the exposure before is an argument. The law is detector_model.py's; the
+compiled twin is detector_kernels.py.
 
-Sources: thresholded Poisson law and qCMOS threshold in pans.runtime.clicks; afterpulsing 1 - (1 - p)(1 - p_ap * previous);
-non-paralysable dead time n / (1 + n tau); the generator mixes counters with the finaliser of Steele, Lea and Flood,
+Sources: afterpulsing 1 - (1 - p)(1 - p_ap * previous); the generator mixes counters with the finaliser of Steele, Lea and Flood,
 "Fast splittable pseudorandom number generators" (2014).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
-from pans.runtime.instrument.profile import Profile
+from .detector_model import (
+    CHANNEL_STEP,
+    CLICK_STREAM,
+    GOLDEN,
+    LOWER_CROSSTALK_STREAM,
+    MASK,
+    MIX_1,
+    MIX_2,
+    UPPER_CROSSTALK_STREAM,
+    DetectorModel,
+    stream_key,
+)
 
-DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
-GOLDEN = 0x9E3779B97F4A7C15
-CHANNEL_STEP = 0xD1342543DE82EF95
-_MASK = (1 << 64) - 1
 KERNEL_EXPOSURES = 256  # from here on the compiled loop pays
-CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM = 0, 1, 2
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorModel:
-    """What turns lambda into clicks at one exposure time; zeros switch an effect off."""
-
-    law: ClickLaw
-    dead_fraction: float = 0.0
-    afterpulse_probability: float = 0.0
-    crosstalk_probability: float = 0.0
-
-
-def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
-    """Collect the profile's effects for this exposure: dead time where it matters, crosstalk where there are neighbours."""
-    detector = profile.detector
-    dead_fraction = detector.dead_time_ns * 1e-3 / exposure_us
-    return DetectorModel(
-        law=click_law(profile, exposure_us),
-        dead_fraction=dead_fraction if dead_fraction > DEAD_TIME_MATTERS else 0.0,
-        afterpulse_probability=detector.afterpulse_probability,
-        crosstalk_probability=detector.crosstalk_probability if profile.mode == "parallel" else 0.0,
-    )
-
-
-def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Click probability before memory effects, float64 of the shape of `photoelectrons` (lambda, without dark counts)."""
-    if not model.dead_fraction:
-        return click_probability(model.law, photoelectrons)
-    mean = photoelectrons + model.law.dark_per_exposure
-    counted = mean / (1.0 + mean * model.dead_fraction)
-    return click_probability(replace(model.law, dark_per_exposure=0.0), counted)
-
-
-@lru_cache(maxsize=64)
-def stream_key(seed: int, stream: int) -> int:
-    """Return the 64-bit key of one stream of random numbers."""
-    return _mix_int(_mix_int(seed & _MASK) ^ _mix_int(stream + 1))
 
 
 def uniform_numbers(
@@ -70,7 +34,7 @@ def uniform_numbers(
 ) -> NDArray[np.float64]:
     """Return float64 (n_exposures, n_channels) in [0, 1) of 53 bits, each a function of (seed, stream, exposure, channel)."""
     key = stream_key(seed, stream)
-    exposures = np.arange(n_exposures, dtype=np.uint64) + np.uint64(first_exposure & _MASK)
+    exposures = np.arange(n_exposures, dtype=np.uint64) + np.uint64(first_exposure & MASK)
     state = _mix(exposures * np.uint64(GOLDEN) + np.uint64(key))
     steps = np.arange(1, n_channels + 1, dtype=np.uint64) * np.uint64(CHANNEL_STEP)
     words = _mix(state[:, None] + steps[None, :])
@@ -91,7 +55,13 @@ def sample_clicks(
     before, which only afterpulsing looks at.
     """
     if model.afterpulse_probability and model.crosstalk_probability and len(probability) >= KERNEL_EXPOSURES:
-        return _by_kernel(model, probability, seed, first_exposure, previous)
+        # The two effects feed each other: only a loop over exposures draws them, here a compiled one with the same bits.
+        from .detector_kernels import sample_words  # numba is loaded only for profiles that declare both
+
+        n_exposures, n_channels = probability.shape
+        words = np.zeros((n_exposures, -(-n_channels // 8)), np.uint8)
+        sample_words(model, probability, np.arange(n_exposures), seed, first_exposure, previous.copy(), words)
+        return np.unpackbits(words, axis=1, bitorder="little", count=n_channels)
     numbers = uniform_numbers(seed, first_exposure, *probability.shape)
     primary = numbers < probability
     if not model.afterpulse_probability and not model.crosstalk_probability:
@@ -101,22 +71,6 @@ def sample_clicks(
     if not model.crosstalk_probability:
         return _after(primary, primed, previous).view(np.uint8)
     return _after_and_across(model, primary, primed, previous, seed, first_exposure)
-
-
-def _by_kernel(
-    model: DetectorModel,
-    probability: NDArray[np.float64],
-    seed: int,
-    first_exposure: int,
-    previous: NDArray[np.uint8],
-) -> NDArray[np.uint8]:
-    """Afterpulsing and crosstalk feed each other, so that only a loop over exposures draws them: a compiled one, the same bits."""
-    from .detector_kernels import sample_words  # numba is loaded only for profiles that declare both
-
-    n_exposures, n_channels = probability.shape
-    words = np.zeros((n_exposures, -(-n_channels // 8)), np.uint8)
-    sample_words(model, probability, np.arange(n_exposures), seed, first_exposure, previous.copy(), words)
-    return np.unpackbits(words, axis=1, bitorder="little", count=n_channels)
 
 
 def _after(primary: NDArray[np.bool_], primed: NDArray[np.bool_], previous: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -165,15 +119,8 @@ def _across(own: NDArray[np.bool_], from_below: NDArray[np.bool_], from_above: N
 def _mix(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The splitmix64 finaliser, in place."""
     words ^= words >> np.uint64(30)
-    words *= np.uint64(0xBF58476D1CE4E5B9)
+    words *= np.uint64(MIX_1)
     words ^= words >> np.uint64(27)
-    words *= np.uint64(0x94D049BB133111EB)
+    words *= np.uint64(MIX_2)
     words ^= words >> np.uint64(31)
     return words
-
-
-def _mix_int(word: int) -> int:
-    word = (word + GOLDEN) & _MASK
-    word = ((word ^ (word >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-    word = ((word ^ (word >> 27)) * 0x94D049BB133111EB) & _MASK
-    return word ^ (word >> 31)

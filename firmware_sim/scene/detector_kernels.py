@@ -1,6 +1,6 @@
 """The compiled kernels of the simulated detector and optics: many clicks, packed as a parallel instrument sends them.
 
-Owns the loops; the law, the model and the generator are detector.py's, and every bit is the one that `detector.sample_clicks` draws.
+Owns the loops; law and model are detector_model.py's, and every bit is the one that `detector.sample_clicks` draws.
 What the profile does not declare is in no loop: dead time, read noise and dark counts are in the probability already, afterpulsing
 looks one exposure back, crosstalk draws two more numbers for neighbours of a click and none elsewhere.
 """
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import ClickLaw
 
-from .detector import (
+from .detector_model import (
     CHANNEL_STEP,
     CLICK_STREAM,
     GOLDEN,
     LOWER_CROSSTALK_STREAM,
+    MIX_1,
+    MIX_2,
     UPPER_CROSSTALK_STREAM,
     DetectorModel,
     stream_key,
@@ -25,7 +27,7 @@ from .detector import (
 
 _U = np.uint64
 _GOLDEN, _STEP = _U(GOLDEN), _U(CHANNEL_STEP)
-_M1, _M2 = _U(0xBF58476D1CE4E5B9), _U(0x94D049BB133111EB)
+_M1, _M2 = _U(MIX_1), _U(MIX_2)
 _S11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .changes import Changes
-from .detector import DetectorModel, first_click_probability, sample_clicks
+from .detector import sample_clicks
+from .detector_model import DetectorModel, first_click_probability
 from .exposure_times import Exposures
 from .light import RunLight
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.program import Program
 from pans.runtime.wire.messages import DARK_PATTERN
 
 I64 = NDArray[np.int64]

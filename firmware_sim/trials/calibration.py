@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.scene.detector import detector_model, first_click_probability
 from pans.firmware_sim.scene.detector_kernels import sample_words
+from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
 from pans.runtime.core.calibration import (
     TELLING,
     CalibrationCore,

@@ -20,12 +20,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pans.firmware_sim.ports.faulty import FaultyDevice, Schedule
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
-from pans.runtime.bundle.model import Bundle, bundle_bytes, make_bundle
+from pans.firmware_sim.testing import N_PATTERNS, small_bundle
+from pans.runtime.bundle.model import Bundle, bundle_bytes
 from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.core.still import Core
@@ -38,7 +37,6 @@ from pans.runtime.record.recorder import Recorder
 from .causes import HOG_PRIORITY, HOST_CORE, INSTRUMENT_CORE, Injection
 
 EXPOSURE_US = 250.0
-N_PATTERNS = 4
 DEADLINE_US = 10_000.0
 HEAP_OBJECTS = 1_500_000
 PIPE_BYTES = 4096
@@ -51,20 +49,7 @@ NEVER = 1 << 62
 def setup() -> tuple[Profile, Bundle, Plan]:
     """Return an instrument, a bundle and a plan that give a block and a decision every millisecond."""
     profile = load_profile("ideal")
-    top = profile.projector.levels - 1
-    levels = np.random.default_rng(1).integers(0, top // 3, (N_PATTERNS, 4)).astype(np.uint16)
-    levels[0, 0] = top
-    bundle = make_bundle(
-        name="blame",
-        task="blame",
-        classes=("a", "b", "c"),
-        image_shape=(2, 2),
-        levels=top + 1,
-        pattern_levels=levels,
-        photons_per_level=EXPOSURE_US * 1e-6 * profile.projector.peak_photoelectrons_hz / top,
-        table=np.random.default_rng(2).normal(size=(1 << N_PATTERNS, 3)).astype(np.float32),
-        provenance={},
-    )
+    bundle = small_bundle(profile, EXPOSURE_US)
     return profile, bundle, replace(build_plan(profile, bundle, dark_slots_per_cycle=0), block_exposures=N_PATTERNS)
 
 

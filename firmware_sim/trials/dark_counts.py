@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.scene.detector import CLICK_STREAM, stream_key
 from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_words
+from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.cusum_design import design_cusum
 from pans.runtime.instrument.dark_rate import wilson_interval

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,11 @@ from pans.firmware_sim.ports.faults import NAMES, parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
-from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.decision import Output
-from pans.runtime.core.plan import Plan, build_plan
+from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.recovery import Recovery
 from pans.runtime.live.loop import Onlookers, RunConfig, run_live
 from pans.runtime.live.run import LiveRun
@@ -40,8 +39,6 @@ from pans.runtime.wire.commands import Gate
 
 from .checkers import Checker, WatchedInstrument
 
-N_PATTERNS = 4
-EXPOSURE_US = 100.0
 SHOTS = 1
 GATE_EVERY = 32  # decisions
 CASES = ("none", *NAMES, "all")
@@ -86,35 +83,10 @@ def case_faults(case: str) -> str:
     return GRID_ALL if case == "all" else f"{case}:{GRID_TIMES[case]}" if case in GRID_TIMES else case
 
 
-def grid_setup(mode: str) -> tuple[Profile, Bundle, Plan]:
-    """Return an instrument, a bundle and a plan that put many small frames on the wire."""
-    profile = load_profile("ideal")
-    top = profile.projector.levels - 1
-    if mode == "parallel":
-        detector = replace(profile.detector, channels=N_PATTERNS)
-        profile = replace(profile, mode="parallel", detector=detector)
-    rng = np.random.default_rng(1)
-    levels = rng.integers(0, top // 3, (N_PATTERNS, 4)).astype(np.uint16)
-    levels[0, 0] = top
-    bundle = make_bundle(
-        name="grid",
-        task="grid",
-        classes=("a", "b", "c"),
-        image_shape=(2, 2),
-        levels=top + 1,
-        pattern_levels=levels,
-        photons_per_level=EXPOSURE_US * 1e-6 * profile.projector.peak_photoelectrons_hz / top,
-        table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32),
-        provenance={},
-    )
-    plan = build_plan(profile, bundle, shots_per_object=4)
-    return profile, bundle, replace(plan, block_exposures=2 if mode == "sequential" else 1)
-
-
 def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) -> GridResult:
     """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults."""
     mode = "parallel" if seed % 2 else "sequential"
-    profile, bundle, plan = grid_setup(mode)
+    profile, bundle, plan = small_setup(mode)
     checker = Checker(plan, SHOTS)
     clock = DeviceClock(profile.clock.tick_hz)
     images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)

@@ -21,6 +21,7 @@ from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
 from pans.firmware_sim.scene.still import Scene, load_scene
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
@@ -29,8 +30,6 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
-
-from .fault_grid import grid_setup
 
 BATCH_BYTES = 1 << 16
 BATCH_FRAMES = 200
@@ -147,7 +146,7 @@ class Fuzzer:
     def _fresh_host(self) -> None:
         self._session = HostSession(NONCE)
         self._session.start(0)
-        _, bundle, plan = grid_setup("sequential")
+        _, bundle, plan = small_setup("sequential")
         self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
         self._core.begin(0, 0)
         self._host_decoder = wire.FrameDecoder()

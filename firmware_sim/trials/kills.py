@@ -32,6 +32,7 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.scene.still import load_scene
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import Output
 from pans.runtime.core.still import Core
@@ -43,8 +44,6 @@ from pans.runtime.live.run import LiveRun
 from pans.runtime.record.recorder import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
-
-from .fault_grid import grid_setup
 
 LEASE_MS = 200
 PATIENCE_S = 30.0
@@ -71,14 +70,14 @@ class DarkWatch(Instrument):
 
 def lit_host(url: str) -> None:
     """A host that runs until somebody ends it."""
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     config = RunConfig(deadline_us=1e9, lease_ms=LEASE_MS, realtime=False)
     run_live(open_link(url), profile, bundle, plan, Core(plan, make_decider(bundle), 1, 0), config)
 
 
 def recording_host(path: str, acted: int, seed: int) -> None:
     """A host in virtual time that records, acts on every fifth decision and says so on the pipe `acted`."""
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     link = open_sim(f"sim:ideal?scene=uniform&pace=fast&seed={seed}")
     data = bundle_bytes(bundle)
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
@@ -110,7 +109,7 @@ def _kill(process: Any) -> None:
 def lease_kills(kills: int, seed: int = 1) -> dict[str, Any]:
     """Kill that many lit hosts; return how long the light stayed on after each, and how many broke the promise."""
     dice = random.Random(seed)
-    profile, _, _ = grid_setup("sequential")
+    profile, _, _ = small_setup("sequential")
     clock = DeviceClock(profile.clock.tick_hz)
     device = DarkWatch(profile, load_scene("uniform"), power_on_tick=clock.tick_at(time.perf_counter_ns()))
     port, stopped = TcpPort("127.0.0.1", 0), threading.Event()

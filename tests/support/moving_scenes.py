@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.moving import Cells, Tape
 from pans.firmware_sim.scene.still import Scene, scene_from_arrays
 from pans.runtime.instrument.profile import load_profile

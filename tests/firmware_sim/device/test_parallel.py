@@ -18,11 +18,11 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun, Stretch
 from pans.firmware_sim.device.sequential import Measurement
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
-from pans.firmware_sim.device.upload import Program
 from pans.firmware_sim.ports.faults import parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import detector_model
+from pans.firmware_sim.scene.detector_model import detector_model
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.light import begin, prepare

@@ -8,13 +8,8 @@ import naive_detector as naive
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.detector import (
-    DetectorModel,
-    detector_model,
-    first_click_probability,
-    sample_clicks,
-    uniform_numbers,
-)
+from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
+from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
 

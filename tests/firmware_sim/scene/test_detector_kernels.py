@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.firmware_sim.scene.detector import DetectorModel, sample_clicks, uniform_numbers
+from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
 from pans.firmware_sim.scene.detector_kernels import click_thresholds, sample_words, sparse_patterns, sparse_sums
+from pans.firmware_sim.scene.detector_model import DetectorModel
 from pans.runtime.instrument.click_law import ClickLaw
 
 PLAIN = DetectorModel(ClickLaw())

@@ -18,12 +18,12 @@ from pans.firmware_sim.device import parallel as frame_run
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
 from pans.firmware_sim.device.sequential import Measurement
-from pans.firmware_sim.device.upload import Program
+from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene import cells as cells_module
 from pans.firmware_sim.scene import shifts
 from pans.firmware_sim.scene.cells import CellFlow
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import detector_model
+from pans.firmware_sim.scene.detector_model import detector_model
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.light import StillObjects, begin, prepare

@@ -25,7 +25,7 @@ from pans.firmware_sim.ports.inprocess import ThreadedInstrument
 from pans.firmware_sim.ports.protocol_panssim import register
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
-from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
@@ -183,7 +183,7 @@ def one_shot_core(plan: Plan, bundle: Bundle, config: RunConfig) -> Core:
 
 
 def test_a_whole_run_decides(rigged: Rig) -> None:
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     config = RunConfig(n_cycles=200, deadline_us=1e9, realtime=False)
     result = run_live(rigged.link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
     assert (result.ended, result.tally.decisions, result.tally.abstained) == ("completed", 200, 0)
@@ -194,7 +194,7 @@ def test_a_whole_run_decides(rigged: Rig) -> None:
 def test_a_device_that_comes_back_is_found_again() -> None:
     """Over pyusb: the cable is pulled after some blocks and plugged in again; the run goes on and completes."""
     made = rig("usb")
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     seen = [0]
 
     def pull(run: Any, output: Any) -> None:
@@ -231,7 +231,7 @@ def test_a_device_that_comes_back_is_found_again() -> None:
 
 def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
     made = rig("virtual")
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
 
     def pull(run: Any, output: Any) -> None:
         made.vanish()
@@ -499,7 +499,7 @@ def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypa
     thread.start()
     try:
         link = open_link(f"pipe:{tmp_path}/lab")
-        profile, bundle, plan = grid_setup("sequential")
+        profile, bundle, plan = small_setup("sequential")
         config = RunConfig(n_cycles=100, deadline_us=1e9, realtime=False)
         result = run_live(link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
         assert (result.ended, result.tally.decisions) == ("completed", 100)

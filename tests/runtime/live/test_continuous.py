@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
@@ -108,7 +108,7 @@ def test_signals_become_words_while_somebody_looks() -> None:
 @pytest.fixture(scope="module")
 def bundle_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bundle") / "grid.pans"
-    write_bundle(grid_setup("sequential")[1], path)
+    write_bundle(small_setup("sequential")[1], path)
     return path
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.cli import main
 from pans.runtime.commands.replay import replay
@@ -32,7 +32,7 @@ def record(
     folder: Path, limits: PartLimits, *, faults: str = "", cycles: int = 3000, prepared: Any = None
 ) -> RunResult:
     """Run in virtual time into parts below `folder`; wait for each part's making, so that virtual time cannot outrun the disk."""
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     url = f"sim:ideal?scene=uniform&pace=fast&seed=4&faults={faults}"
     link = open_sim(url)
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}, "simulated": True}

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pans.firmware_sim.ports.serve import open_sim
-from pans.firmware_sim.trials.fault_grid import grid_setup
+from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import make_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.still import Core
@@ -258,7 +258,7 @@ def test_memory_is_bounded() -> None:
     ],
 )
 def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, causes: set[str], tmp_path: Path) -> None:
-    profile, bundle, plan = grid_setup("sequential")
+    profile, bundle, plan = small_setup("sequential")
     config = RunConfig(n_cycles=8000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
     path = tmp_path / "run.pansrec"

@@ -1,0 +1,71 @@
+"""The detector's law and the keys of its random numbers: what the plain and the compiled generator share.
+
+Owns the click probability with the effects that the profile declares, the streams of random numbers and their keys; never draws one.
+What is not declared costs nothing.
+
+Sources: thresholded Poisson law and qCMOS threshold in pans.runtime.instrument.click_law; non-paralysable dead time n / (1 + n tau).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
+from pans.runtime.instrument.profile import Profile
+
+DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
+GOLDEN = 0x9E3779B97F4A7C15  # the increment of splitmix64: 2^64 over the golden ratio, odd
+CHANNEL_STEP = (
+    0xD1342543DE82EF95  # odd, of good spectrum: the multiplier of Java's L64X128MixRandom (Steele and Vigna 2021)
+)
+MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # of the splitmix64 finaliser
+MASK = (1 << 64) - 1
+CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorModel:
+    """What turns lambda into clicks at one exposure time; zeros switch an effect off."""
+
+    law: ClickLaw
+    dead_fraction: float = 0.0
+    afterpulse_probability: float = 0.0
+    crosstalk_probability: float = 0.0
+
+
+def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
+    """Collect the profile's effects for this exposure: dead time where it matters, crosstalk where there are neighbours."""
+    detector = profile.detector
+    dead_fraction = detector.dead_time_ns * 1e-3 / exposure_us
+    return DetectorModel(
+        law=click_law(profile, exposure_us),
+        dead_fraction=dead_fraction if dead_fraction > DEAD_TIME_MATTERS else 0.0,
+        afterpulse_probability=detector.afterpulse_probability,
+        crosstalk_probability=detector.crosstalk_probability if profile.mode == "parallel" else 0.0,
+    )
+
+
+def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Click probability before memory effects, float64 of the shape of `photoelectrons` (lambda, without dark counts)."""
+    if not model.dead_fraction:
+        return click_probability(model.law, photoelectrons)
+    mean = photoelectrons + model.law.dark_per_exposure
+    counted = mean / (1.0 + mean * model.dead_fraction)
+    return click_probability(replace(model.law, dark_per_exposure=0.0), counted)
+
+
+@lru_cache(maxsize=64)
+def stream_key(seed: int, stream: int) -> int:
+    """Return the 64-bit key of one stream of random numbers."""
+    return _mix_int(_mix_int(seed & MASK) ^ _mix_int(stream + 1))
+
+
+def _mix_int(word: int) -> int:
+    word = (word + GOLDEN) & MASK
+    word = ((word ^ (word >> 30)) * MIX_1) & MASK
+    word = ((word ^ (word >> 27)) * MIX_2) & MASK
+    return word ^ (word >> 31)

@@ -1,0 +1,51 @@
+"""What a test needs to run against the simulator: an instrument, a bundle and a plan, made from nothing and small.
+
+Public: a lab's own package may use it in the tests of its drivers and back ends. Owns the making of these three; never opens a link.
+
+>>> profile, bundle, plan = small_setup()
+>>> profile.name, bundle.classes, plan.n_patterns
+('ideal', ('a', 'b', 'c'), 4)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.core.plan import Plan, build_plan
+from pans.runtime.instrument.profile import Profile, load_profile
+
+N_PATTERNS = 4
+EXPOSURE_US = 100.0
+
+
+def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
+    """Return an instrument, a bundle and a plan that put many small frames on the wire; `mode` is sequential or parallel."""
+    profile = load_profile("ideal")
+    if mode == "parallel":
+        detector = replace(profile.detector, channels=N_PATTERNS)
+        profile = replace(profile, mode="parallel", detector=detector)
+    bundle = small_bundle(profile, EXPOSURE_US)
+    plan = build_plan(profile, bundle, shots_per_object=4)
+    return profile, bundle, replace(plan, block_exposures=2 if mode == "sequential" else 1)
+
+
+def small_bundle(profile: Profile, exposure_us: float) -> Bundle:
+    """Return a bundle of four random patterns of 2 x 2 pixels, three classes and a random table, for `profile`."""
+    rng = np.random.default_rng(1)
+    top = profile.projector.levels - 1
+    levels = rng.integers(0, top // 3, (N_PATTERNS, 4)).astype(np.uint16)
+    levels[0, 0] = top
+    return make_bundle(
+        name="small",
+        task="small",
+        classes=("a", "b", "c"),
+        image_shape=(2, 2),
+        levels=top + 1,
+        pattern_levels=levels,
+        photons_per_level=exposure_us * 1e-6 * profile.projector.peak_photoelectrons_hz / top,
+        table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32),
+        provenance={},
+    )
