@@ -19,7 +19,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options, plain_options
 from pans.trainer.paper_tables import PATTERN_PEAKS
 from pans.trainer.tasks.registry import load_task
-from pans.trainer.train.course import FIRST, TRAINING_OBJECTS, follow
+from pans.trainer.train.history import FIRST, TRAINING_OBJECTS, follow
 
 from . import figures_training
 from .cache import kept

@@ -1,27 +1,40 @@
-"""How a training went: figures of every epoch, and what the patterns looked like on the way (`pans train --history DIR`).
+"""How a training went: figures of every epoch, and the patterns after some of them. SIMULATED.
 
-Owns the file `history.json` and its pictures (extra `plot`); never trains. Patterns of earlier epochs are read from the checkpoints as they
-pass by, so that nothing is kept that a training does not write anyway. SIMULATED figures, of the training objects.
+`History` (`pans train --history DIR`) owns the file `history.json` and its pictures (extra `plot`). It reads the patterns of earlier
+epochs from the checkpoints, which a training writes anyway; its figures are of the training objects.
+
+`follow` trains one run epoch by epoch and measures the accuracy on training and held-out objects in between. It draws from random
+numbers of its own, so that the training gives what `train` gives.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pans.runtime.container import replace_file
+from pans.runtime.instrument.profile import Profile
 from pans.trainer.figures import new_figure, save_figure
+from pans.trainer.model.detection import click_probability, sample_clicks
+from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.options import Options
+from pans.trainer.tasks.registry import Task
 
 from .checkpoint import read_checkpoint
-from .loop import EpochReport
+from .data import CHUNK, TrainingData, encoder_input
+from .loop import EpochReport, Run, Trained
 
+TRAINING_OBJECTS = 5000  # by which the accuracy on training objects is judged: the first ones
+FIRST = 200
 STEPS_SHOWN = 8
 PATTERNS_SHOWN = 8
 QUANTITIES = (("loss", "loss"), ("clicks", "clicks per decision"), ("photons", "photons per decision"))
@@ -57,7 +70,7 @@ class History:
             "patterns_at": sorted(self.patterns),
         }
         replace_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode())
-        draw_curves(folder / "curves.png", {"": self.epochs})
+        draw_curves(folder / "curves.png", self.epochs)
         written = [folder / "history.json", folder / "curves.png"]
         if self.patterns:
             draw_evolution(folder / "evolution.png", self.patterns, image_shape)
@@ -65,29 +78,18 @@ class History:
         return written
 
 
-def draw_curves(path: Path, runs: dict[str, list[EpochReport]]) -> None:
-    """Draw loss, clicks and photons over the epochs, one line per run and restart; `runs` is name -> its reports."""
+def draw_curves(path: Path, reports: list[EpochReport]) -> None:
+    """Draw loss, clicks and photons over the epochs, one line per restart."""
     figure, axes = new_figure(width=12.0, height=3.6, panels=len(QUANTITIES))
     for axis, (name, label) in zip(axes, QUANTITIES):
-        for number, (run, reports) in enumerate(runs.items()):
-            for restart in sorted({report.restart for report in reports}):
-                of_one = [report for report in reports if report.restart == restart]
-                values = [getattr(report, name) for report in of_one]
-                words = run if restart == 0 else None
-                # starts and restarts run through the same epochs again: the order is that of the training
-                axis.plot(
-                    range(1, len(values) + 1),
-                    values,
-                    color=f"C{number % 10}",
-                    alpha=0.9 if restart == 0 else 0.4,
-                    label=words,
-                )
+        for restart in sorted({report.restart for report in reports}):
+            # starts and restarts run through the same epochs again: the order is that of the training
+            values = [getattr(report, name) for report in reports if report.restart == restart]
+            axis.plot(range(1, len(values) + 1), values, color="C0", alpha=0.9 if restart == 0 else 0.4)
         axis.set(xlabel="epochs trained", ylabel=label)
         axis.grid(alpha=0.3)
-    if any(runs):
-        axes[-1].legend(fontsize=8)
     stages: dict[str, int] = {}
-    for index, report in enumerate(next(iter(runs.values()), [])):
+    for index, report in enumerate(reports):
         stages.setdefault(report.stage, index)
     for stage, begin in stages.items():
         axes[0].axvline(begin, color="0.7", lw=0.8)
@@ -122,3 +124,85 @@ def _shown(weight: NDArray[np.float32], encoder: str) -> NDArray[np.float32]:
     if encoder != "coherent":
         return np.asarray(weight**2, np.float32)
     return np.asarray(np.sqrt((weight**2).sum(axis=0)), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class EpochFigures:
+    """The state after one epoch, one draw of clicks (K = 1); accuracies in %. The light is the mean over the epoch's batches."""
+
+    loss: float
+    training: float
+    held_out: float
+    held_out_first_200: float
+    clicks: float
+    photons: float
+    illumination: float
+    peak: float  # brightest pixel over the mean of all pixels of all patterns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """All epochs, the patterns (d_f, pixels) after some of them, and the finished model."""
+
+    epochs: list[EpochFigures]
+    patterns: dict[int, NDArray[np.float32]]
+    trained: Trained
+
+    def columns(self) -> dict[str, list[float]]:
+        """Return the figures of all epochs, one list per quantity, five digits each."""
+        rows = [asdict(epoch) for epoch in self.epochs]
+        return {key: [float(f"{row[key]:.5g}") for row in rows] for key in rows[0]}
+
+
+def follow(
+    task: Task,
+    profile: Profile,
+    options: Options,
+    *,
+    patterns_after: tuple[int, ...] = (),
+    report: Callable[[EpochReport], None] = lambda _: None,
+) -> Course:
+    """Train one run of active illumination by `options` and judge it after every epoch; the result is that of `train`.
+
+    ValueError for passive encoders.
+    """
+    if options.encoder != "active":
+        raise ValueError(f"a training with the encoder {options.encoder!r} cannot be followed, allowed: 'active'")
+    data = TrainingData(task, profile, options)
+    run = Run(data, profile, options, 0)
+    assert isinstance(run.encoder, ActiveIllumination)
+    held_out, labels = encoder_input(task, task.test, profile, options), torch.from_numpy(task.test.labels)
+    n = min(TRAINING_OBJECTS, data.n_fit)
+    random = torch.Generator().manual_seed(options.seed)
+    epochs: list[EpochFigures] = []
+    patterns: dict[int, NDArray[np.float32]] = {}
+    while run.epoch < options.epochs:
+        told = run.one_epoch()
+        report(told)
+        of_training = _right(run, data.shown[:n], data.labels[:n], random)
+        of_held_out = _right(run, held_out, labels, random)
+        intensity = (run.encoder.weight.detach() ** 2).cpu().numpy()
+        epochs.append(
+            EpochFigures(
+                loss=told.loss,
+                training=100 * float(of_training.mean()),
+                held_out=100 * float(of_held_out.mean()),
+                held_out_first_200=100 * float(of_held_out[:FIRST].mean()),
+                clicks=told.clicks,
+                photons=told.photons,
+                illumination=told.illumination,
+                peak=float(intensity.max() / intensity.mean()),
+            )
+        )
+        if run.epoch in patterns_after:
+            patterns[run.epoch] = intensity
+    return Course(epochs, patterns, run.finish((run.validation_loss(),)))
+
+
+def _right(run: Run, shown: Tensor, labels: Tensor, random: torch.Generator) -> Tensor:
+    """Whether each object is decided right, from one draw of clicks by the present patterns and head."""
+    law = run.law()
+    run.head.eval()
+    with torch.no_grad():
+        p = torch.cat([click_probability(run.encoder(part, run.data.floor), law) for part in shown.split(CHUNK)])
+        return (run.head(sample_clicks(p, random).float()).argmax(dim=1) == labels).double()

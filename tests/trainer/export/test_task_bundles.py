@@ -3,13 +3,14 @@
 # ruff: noqa: E402  (what follows needs torch)
 import json
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("onnx", reason="needs the train extra")
+
+from trainings import short_fits  # noqa: F401  a fixture
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
@@ -22,17 +23,11 @@ from pans.trainer.export.writer import export_trained, reference_scores
 from pans.trainer.options import Options
 from pans.trainer.tasks.public_sets import PUBLIC_SETS
 from pans.trainer.tasks.registry import FIBRE_TASKS, Objects, Task, draw_task, physical_encoder, task_names
-from pans.trainer.train import head_fit
 from pans.trainer.train.data import encoder_input
 from pans.trainer.train.loop import train
 
 PROFILE = load_profile("ideal")
-
-
-@pytest.fixture(autouse=True)
-def short_fits(monkeypatch):
-    """The last stage of a training takes 1500 steps however small the task is; nothing here asks for a good head."""
-    monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=10))
+pytestmark = pytest.mark.usefixtures("short_fits")
 
 
 def small_task(name):

@@ -13,7 +13,6 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.common import measure
 from pans.trainer.baselines.compressive import clean_mlp, patterns
@@ -29,7 +28,7 @@ from pans.trainer.paper.page import Asked, write_page
 from pans.trainer.paper_tables import ACTIVE
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train import head_fit
-from pans.trainer.train.course import follow
+from pans.trainer.train.history import follow
 from pans.trainer.train.loop import train
 
 PNG = b"\x89PNG"
@@ -276,7 +275,7 @@ def test_a_followed_training_ends_where_an_ordinary_one_does(task):
     assert list(course.patterns) == [1, 6]
     last = course.patterns[6]
     assert columns["peak"][-1] == pytest.approx(last.max() / last.mean(), rel=1e-4)
-    with pytest.raises(UsageError, match="--encoder coherent"):
+    with pytest.raises(ValueError, match="'coherent'"):
         follow(task, profile, dataclasses.replace(SMALL, encoder="coherent"))
 
 

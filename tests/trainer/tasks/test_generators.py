@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from brightness import brightness_rows, decide_on_total, total_intensity
 
 from pans.runtime.errors import UsageError
-from pans.trainer.tasks.brightness import brightness_rows, decide_on_total, total_intensity
 from pans.trainer.tasks.draw import CHUNK
 from pans.trainer.tasks.generators import GENERATORS, generate
 

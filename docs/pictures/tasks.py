@@ -1,7 +1,8 @@
-"""Pictures of the tasks for docs/reference/tasks.md: some held-out objects of every class, with their mean intensity.
+"""Draw docs/pictures/task_*.png: some held-out objects of every class, with their mean intensity (extras `train` and `plot`).
 
-Owns these pictures alone (needs the extra `plot`); never a result. Run `python -m pans.trainer.tasks.pictures FOLDER [DATA]`: one PNG
-per drawn task, and with a data folder (holding mnist/) the fibre's speckle as well.
+python docs/pictures/tasks.py FOLDER [DATA]
+
+One PNG per drawn task, and with a data folder (holding mnist/) the fibre's speckle as well.
 """
 
 from __future__ import annotations
@@ -13,10 +14,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.incident import incident_intensity
-
-from .brightness import total_intensity
-from .generators import GENERATORS, generate
-from .registry import load_task
+from pans.trainer.tasks.generators import GENERATORS, generate
+from pans.trainer.tasks.registry import load_task
 
 PER_CLASS = 8
 DPI = 70
@@ -29,7 +28,7 @@ def picture_of(name: str, path: Path) -> None:
     rows: list[tuple[str, NDArray[Any], NDArray[Any] | None]] = []
     for label, title in enumerate(drawn.recipe.classes):
         images = drawn.test_images[drawn.test_labels == label][:PER_CLASS]
-        rows.append((title, images, total_intensity(images, drawn.recipe.light)))
+        rows.append((title, images, incident_intensity(images, drawn.recipe.light, "none").mean(axis=(1, 2))))
     _write(rows, path, flat=drawn.recipe.image_shape[0] == 1)
 
 

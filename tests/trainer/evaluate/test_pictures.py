@@ -1,0 +1,83 @@
+"""The map of clicks, and the pictures of a training and of a bundle, written whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("matplotlib")
+pytest.importorskip("sklearn")
+
+from trainings import short_fits  # noqa: F401  a fixture
+
+from pans.runtime.cli import main
+from pans.trainer.evaluate.tsne import tsne
+
+RNG = np.random.default_rng(4)
+
+
+def test_clusters_stay_apart_and_the_map_repeats():
+    labels = np.repeat(np.arange(4), 40)
+    features = np.eye(4)[labels] * 6 + RNG.normal(size=(160, 4))
+    place = tsne(features, perplexity=15.0)
+    squared = ((place[:, None] - place[None]) ** 2).sum(axis=2) + np.diag(np.full(160, np.inf))
+    assert (labels[squared.argmin(axis=1)] == labels).mean() > 0.95
+    assert np.array_equal(place, tsne(features, perplexity=15.0))
+
+
+def test_equal_clicks_do_not_break_the_map():
+    place = tsne(RNG.integers(0, 2, (150, 3)).astype(float), perplexity=20.0)
+    assert np.isfinite(place).all()
+
+
+@pytest.mark.parametrize("n", [10, 3000])
+def test_too_few_or_too_many_points_are_refused(n):
+    with pytest.raises(ValueError, match="allowed for a map"):
+        tsne(np.zeros((n, 2)))
+
+
+def own_images(path):
+    rng = np.random.default_rng(1)
+    labels = np.arange(150) % 2
+    images = rng.integers(0, 60, (150, 5, 6), dtype=np.uint8)
+    images[labels == 1, :, 2] += 150
+    np.savez(path, images=images, labels=labels)
+    return str(path)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_a_training_leaves_its_history(tmp_path, capsys):
+    task = own_images(tmp_path / "own.npz")
+    words = ["--features", "2", "--epochs", "6", "--hidden", "8", "-o", str(tmp_path / "own.pans"), "--json"]
+    assert main(["train", task, *words, "--history", str(tmp_path / "course")]) == 0
+    course = json.loads((tmp_path / "course" / "history.json").read_text())
+    assert [(epoch["restart"], epoch["epoch"]) for epoch in course["epochs"][-6:]] == [(0, i) for i in range(1, 7)]
+    assert course["patterns_at"][-1] == 6
+    assert len(course["patterns_at"]) >= 3
+    for name in ("curves.png", "evolution.png"):
+        assert (tmp_path / "course" / name).read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "own.pans.checkpoint").exists()
+    capsys.readouterr()
+    assert (
+        main(["evaluate", str(tmp_path / "own.pans"), "--task", task, "--pictures", str(tmp_path / "seen"), "--json"])
+        == 0
+    )
+    drawn = json.loads(capsys.readouterr().out)["pictures"]
+    assert {path.name for path in map(Path, drawn)} == {"patterns.png", "confusion.png"}  # too few objects for a map
+    assert all(Path(path).read_bytes().startswith(b"\x89PNG") for path in drawn)
+
+
+@pytest.mark.usefixtures("short_fits")
+def test_more_weight_on_light_means_less_light(tmp_path, capsys):
+    task = own_images(tmp_path / "own.npz")
+    light = []
+    for alpha in ("1e-4", "0.3"):
+        out = str(tmp_path / f"{alpha}.pans")
+        words = ["--features", "2", "--epochs", "15", "--hidden", "8", "--alpha", alpha, "-o", out]
+        assert main(["train", task, *words, "--json"]) == 0
+        light.append(json.loads(capsys.readouterr().out)["illumination"])
+    assert light[1] < light[0]
