@@ -10,29 +10,20 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
+from pans.trainer.baselines.options import METHODS, BaselineOptions
 
 if TYPE_CHECKING:
-    from pans.trainer.baselines.common import Decide, Measurement, Report
+    from pans.trainer.baselines.common import Report
     from pans.trainer.tasks.registry import Task
 
-    At = Callable[[float], tuple[Decide, dict[str, Any]]]  # photons per object -> the decision, and facts about it
-
 DEFAULT_PHOTONS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0)
-DEFAULT_METHOD = {"direct": "bayes", "compressive": "mlp", "e2e": "qat"}
-METHODS = {
-    "direct": ("bayes", "cnn", "clean-cnn"),
-    "compressive": ("mlp", "clean-mlp", "bayes"),
-    "e2e": ("qat", "plain"),
-}
-FIRST = 200
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -79,6 +70,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from pans.trainer.baselines.rows import baseline_rows
     from pans.trainer.tasks.registry import load_task
 
     _check(args)
@@ -89,7 +81,7 @@ def _run(args: argparse.Namespace) -> int:
     code = EXIT_FINE
     try:
         with _progress() as report:
-            for row in rows_of(task, args, report):
+            for row in baseline_rows(task, _options(args), args.photons, report):
                 say(_line(row))
                 rows.append(row)
     except KeyboardInterrupt:
@@ -102,17 +94,8 @@ def _run(args: argparse.Namespace) -> int:
     return code
 
 
-def rows_of_words(words: Sequence[str], task: Task, report: Report) -> Iterator[dict[str, Any]]:
-    """Yield what `pans baseline WORDS` measures on `task`, which stands for the one that they name."""
-    parser = argparse.ArgumentParser(prog="pans baseline")
-    _configure(parser)
-    args = parser.parse_args(words)
-    _check(args)
-    yield from rows_of(_shortened(task, args.train_objects, args.objects), args, report)
-
-
 def _check(args: argparse.Namespace) -> None:
-    args.method = args.method or DEFAULT_METHOD[args.paradigm]
+    args.method = args.method or METHODS[args.paradigm][0]
     if args.method not in METHODS[args.paradigm]:
         raise UsageError(
             f"--method is {args.method!r}, allowed with {args.paradigm}: {', '.join(METHODS[args.paradigm])}"
@@ -136,108 +119,15 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--dark is {args.dark:g}, allowed: finite and at least 0")
 
 
+def _options(args: argparse.Namespace) -> BaselineOptions:
+    return BaselineOptions(**{field.name: getattr(args, field.name) for field in fields(BaselineOptions)})
+
+
 def _shortened(task: Task, n_train: int | None, n_test: int | None) -> Task:
     def first(objects: Any, n: int | None) -> Any:
         return type(objects)(objects.images[:n], objects.labels[:n])
 
     return replace(task, train=first(task.train, n_train), test=first(task.test, n_test))
-
-
-def rows_of(task: Task, args: argparse.Namespace, report: Report) -> Iterator[dict[str, Any]]:
-    """Yield one row of figures per photon level, in the order of `args.photons`."""
-    from pans.trainer.baselines.common import run_trials
-
-    measurement, at = _paradigm(task, args, report)
-    trials = args.trials or (2 if args.method == "bayes" else 10)
-    for photons in args.photons:
-        started = time.perf_counter()
-        decide, extra = at(photons)
-        done = run_trials(measurement, photons, args.detector, decide, trials=trials, seed=args.seed, dark=args.dark)
-        yield {
-            **asdict(done.measured()),
-            "first_200": asdict(done.measured(FIRST)),
-            "photons_asked": photons,
-            "detector": args.detector,
-            "brightness": args.brightness,
-            "dark": args.dark,
-            "features": measurement.train.shape[1],
-            "train_objects": len(task.train),
-            **extra,
-            "seconds": time.perf_counter() - started,
-        }
-
-
-def _paradigm(task: Task, args: argparse.Namespace, report: Report) -> tuple[Measurement, At]:
-    """The measurement, and what gives the decision at a photon level, with facts about it."""
-    if args.paradigm == "e2e":
-        return _end_to_end(task, args, report)
-    from pans.trainer.baselines.bayes import bayes
-    from pans.trainer.baselines.common import measure
-
-    patterns, facts = None, {}
-    if args.paradigm == "compressive":
-        from pans.trainer.baselines.compressive import patterns as fixed_patterns
-
-        patterns = fixed_patterns(args.patterns, args.features, task.image_shape, args.seed)
-        facts = {"patterns": args.patterns}
-    measurement = measure(task, patterns, args.brightness)
-    if args.method != "bayes":
-        return measurement, _network(measurement, args, facts, report)
-
-    def exact(photons: float) -> tuple[Decide, dict[str, Any]]:
-        decide, floor = bayes(
-            measurement, photons, args.detector, seed=args.seed, dark=args.dark, floor=args.floor, report=report
-        )
-        known = _information(measurement, photons, floor, args) if args.information else {}
-        return decide, facts | {"floor": floor} | known
-
-    return measurement, exact
-
-
-def _information(measurement: Measurement, photons: float, floor: float, args: argparse.Namespace) -> dict[str, Any]:
-    """One more readout of every test object, judged by the posterior; and what its statistics alone say."""
-    import numpy as np
-
-    from pans.trainer.baselines.bayes import log_joint
-    from pans.trainer.baselines.common import detect
-    from pans.trainer.evaluate.information import fisher, posterior_information
-
-    light = measurement.photoelectrons(measurement.test, photons)
-    readouts = detect(light, args.detector, np.random.default_rng([args.seed, 4]), args.dark)
-    joint = log_joint(measurement, readouts, photons, args.detector, floor=floor, dark=args.dark)
-    mean = light.astype(np.float64) + args.dark  # of Poisson counts, and their variance too
-    return {
-        "information": asdict(posterior_information(joint, measurement.test_labels)),
-        "fisher": asdict(fisher(mean, mean, measurement.test_labels)),
-    }
-
-
-def _network(measurement: Measurement, args: argparse.Namespace, facts: dict[str, Any], report: Report) -> At:
-    from pans.trainer.baselines.compressive import aware_mlp, clean_mlp
-    from pans.trainer.baselines.direct import aware_cnn, clean_cnn
-
-    shared: dict[str, Any] = {"seed": args.seed, "report": report}
-    if args.epochs:
-        shared["epochs"] = args.epochs
-    if args.method == "clean-cnn":
-        of_frame = clean_cnn(measurement, **shared)
-        return lambda _photons: (of_frame, facts)
-    if args.method == "clean-mlp":
-        of_level = clean_mlp(measurement, **shared)
-        return lambda photons: (of_level(photons, args.detector), facts)
-    aware = aware_cnn if args.method == "cnn" else aware_mlp
-    return lambda photons: (aware(measurement, photons, args.detector, dark=args.dark, **shared), facts)
-
-
-def _end_to_end(task: Task, args: argparse.Namespace, report: Report) -> tuple[Measurement, At]:
-    from pans.trainer.baselines.e2e import EPOCHS, measured_by, train_conventionally
-
-    bits = args.bits if args.method == "qat" else None
-    model = train_conventionally(
-        task, args.features, seed=args.seed, bits=bits, epochs=args.epochs or EPOCHS, report=report
-    )
-    measurement, of_level = measured_by(model, task, args.brightness)
-    return measurement, lambda photons: (of_level(photons, args.detector), {"bits": bits})
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """Curves of the baselines over photons: which are measured for the paper's figures, each a command of `pans baseline`.
 
-Owns the list of curves, their place in the cache folder, and what is read off them; measuring is cmd_baseline.py's.
+Owns the list of curves, their place in the cache folder, and what is read off them; measuring is the package baselines's.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from pans.trainer.baselines.common import silent
-from pans.trainer.commands.baseline import rows_of_words
+from pans.trainer.baselines.options import METHODS, BaselineOptions
+from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.tasks.registry import load_task
 
 from .cache import kept
@@ -32,37 +33,50 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One way over photon levels: `words` are those of `pans baseline`, but for the task."""
+    """One way over photon levels, on `TASK`."""
 
     way: str
-    words: tuple[str, ...]
+    options: BaselineOptions
+    levels: tuple[float, ...]
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words of `pans baseline` that measure the curve alone, but for the task; the cache knows the curve by them."""
+        o = self.options
+        of_patterns = () if o.paradigm == "direct" else ("--features", str(o.features))
+        family = ("--patterns", o.patterns) if o.paradigm == "compressive" else ()
+        method = () if o.method == METHODS["e2e"][0] else ("--method", o.method)
+        epochs = () if o.epochs is None else ("--epochs", str(o.epochs))
+        photons = ("--photons", *(f"{level:g}" for level in self.levels))
+        return (o.paradigm, *of_patterns, *family, *method, *epochs, "--trials", str(o.trials), *photons)
 
     def command(self) -> str:
         """Return the command that measures the curve alone."""
         return f"pans baseline {self.words[0]} --task {TASK} {' '.join(self.words[1:])}"
 
 
-def _curve(way: str, words: str, levels: tuple[float, ...]) -> Curve:
-    return Curve(way, (*words.split(), "--photons", *(f"{level:g}" for level in levels)))
+CLEAN = Curve("direct, network of clean frames", BaselineOptions("direct", "clean-cnn", epochs=2, trials=2), LEVELS)
+POSTERIOR = Curve("direct, exact posterior", BaselineOptions("direct", "bayes", trials=2), POSTERIOR_LEVELS)
 
 
-_SENSING = "compressive --features 64 --patterns"
-CLEAN = _curve("direct, network of clean frames", "direct --method clean-cnn --epochs 2 --trials 2", LEVELS)
-POSTERIOR = _curve("direct, exact posterior", "direct --method bayes --trials 2", POSTERIOR_LEVELS)
+def _sensing(family: str, method: str, trials: int) -> BaselineOptions:
+    return BaselineOptions("compressive", method, features=64, patterns=family, trials=trials)
+
+
 CURVES = (  # what takes longest is last
     CLEAN,
     POSTERIOR,
-    _curve("random binary, clean features", f"{_SENSING} binary --method clean-mlp --trials 5", LEVELS),
-    _curve("Hadamard, clean features", f"{_SENSING} hadamard --method clean-mlp --trials 5", LEVELS),
-    _curve("random binary, exact posterior", f"{_SENSING} binary --method bayes --trials 2", SENSING_LEVELS),
-    _curve("Hadamard, exact posterior", f"{_SENSING} hadamard --method bayes --trials 2", SENSING_LEVELS),
-    _curve("direct, network of each level", "direct --method cnn --epochs 2 --trials 2", NETWORK_LEVELS),
+    Curve("random binary, clean features", _sensing("binary", "clean-mlp", 5), LEVELS),
+    Curve("Hadamard, clean features", _sensing("hadamard", "clean-mlp", 5), LEVELS),
+    Curve("random binary, exact posterior", _sensing("binary", "bayes", 2), SENSING_LEVELS),
+    Curve("Hadamard, exact posterior", _sensing("hadamard", "bayes", 2), SENSING_LEVELS),
+    Curve("direct, network of each level", BaselineOptions("direct", "cnn", epochs=2, trials=2), NETWORK_LEVELS),
 )
 
 
 def e2e_curve(features: int) -> Curve:
     """Return the curve of conventional end-to-end optimisation with that many patterns."""
-    return _curve(f"end-to-end, d_f = {features}", f"e2e --features {features} --trials 5", LEVELS)
+    return Curve(f"end-to-end, d_f = {features}", BaselineOptions("e2e", "qat", features=features, trials=5), LEVELS)
 
 
 def curve_rows(asked: Asked, curve: Curve) -> Rows:
@@ -71,9 +85,7 @@ def curve_rows(asked: Asked, curve: Curve) -> Rows:
 
     def make() -> dict[str, Any]:
         rows = []
-        for row in rows_of_words(
-            (curve.words[0], "--task", TASK, *curve.words[1:]), load_task(TASK, asked.data_dir), silent
-        ):
+        for row in baseline_rows(load_task(TASK, asked.data_dir), curve.options, curve.levels, silent):
             asked.report(f"{curve.way}, {row['photons_asked']:g} photons: {100 * row['accuracy_mean']:.2f} %")
             rows.append(row)
         return {"rows": rows}

@@ -14,6 +14,7 @@ from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_USAGE, main
 from pans.runtime.errors import UsageError
 from pans.trainer.baselines import bayes as baseline_bayes
 from pans.trainer.baselines import common as baselines
+from pans.trainer.baselines import rows as baseline_rows
 from pans.trainer.baselines.bayes import FLOORS, bayes, choose_floor, log_joint
 from pans.trainer.baselines.common import Trials, detect, measure, run_trials
 from pans.trainer.baselines.compressive import patterns, walsh
@@ -415,7 +416,7 @@ def test_an_interrupt_keeps_the_levels_that_are_done(
             raise KeyboardInterrupt
         return whole(measurement, photons, *rest, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(baselines, "run_trials", interrupted)
+    monkeypatch.setattr(baseline_rows, "run_trials", interrupted)
     code, answer = called(capsys, "direct", "--task", task_file, "--photons", 4, 40)
     assert code == EXIT_INTERRUPTED
     assert answer["interrupted"] is True

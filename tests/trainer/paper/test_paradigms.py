@@ -16,6 +16,7 @@ pytest.importorskip("matplotlib", reason="needs the plot extra")
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.common import measure
 from pans.trainer.baselines.compressive import clean_mlp, patterns
+from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.commands import baseline as cmd_baseline
 from pans.trainer.options import Options, check_options
 from pans.trainer.paper import alpha as reproduce_alpha
@@ -87,12 +88,13 @@ def test_every_curve_is_a_command_that_the_baselines_take():
     for curve in every:
         args = parser.parse_args(curve.command().split()[2:])
         cmd_baseline._check(args)
-        assert list(args.photons) == sorted(args.photons)
+        assert cmd_baseline._options(args) == curve.options
+        assert tuple(args.photons) == curve.levels == tuple(sorted(curve.levels))
 
 
 def test_a_curve_is_measured_once_told_and_refused_to_none_when_collecting(task, tmp_path, monkeypatch):
     monkeypatch.setattr(curves, "load_task", lambda *_: task)
-    curve = curves._curve("end-to-end, d_f = 3", "e2e --features 3 --trials 2 --epochs 60", (5.0, 1e4))
+    curve = curves.Curve("end-to-end, d_f = 3", BaselineOptions("e2e", "qat", 3, epochs=60, trials=2), (5.0, 1e4))
     page, said = asked(tmp_path)
     assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == []
     assert curve.command() in said[0]
