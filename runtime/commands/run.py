@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.cli import Command
+from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError
 from pans.runtime.flow.settings import FlowSettings
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -24,16 +25,6 @@ from .carry_out import carry_out
 from .run_dark import add_options as add_dark_options
 from .run_flow import add_options, settings_of
 
-BACKENDS = (
-    "auto",
-    "table",
-    "count-table",
-    "sparse",
-    "onnx",
-    "int8",
-    "int8-onnx",
-    "float64",
-)  # decide.BACKENDS, unloaded
 DEMO_BUNDLE = "fashion10.pans"
 DEMO_PROFILE = "oled-qcmos"
 DEMO_SCENE = "fashion200"
@@ -80,7 +71,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
         "--order", default="auto", choices=("auto", "pattern-major", "shot-major"), help="pattern order"
     )
     parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
-    parser.add_argument("--backend", default="auto", choices=BACKENDS, help="decision back end")
+    parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     parser.add_argument(
         "--core", type=int, metavar="N", help="bind the loop to processor core N and keep that awake; takes all of it"

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 
+from .names import BACKENDS as BACKENDS
+from .names import backend_names, offered_backends
 from .onnx import OnnxDecider as OnnxDecider
 from .picture import PictureDecider as PictureDecider
 from .table import CountTableDecider, fits_count_table
@@ -25,8 +27,9 @@ from .verdict import Decider as Decider
 from .verdict import Verdict as Verdict
 from .verdict import softmax_winner as softmax_winner
 
-BACKENDS = ("auto", "table", "count-table", "sparse", "onnx", "int8", "int8-onnx", "float64")
 MEASURED_CALLS = 200
+OFFERED_CALLS = 64  # enough to meet a wrong shape or range, few enough to cost nothing
+CLICKS_SEED = 20250103
 
 
 def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> Decider:
@@ -36,8 +39,8 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
     those that answer as the float head does (`choice` says what was measured). UsageError for a back end that the bundle does not have
     or that cannot answer `shots`; DamagedFileError when it contradicts the golden vectors.
     """
-    if backend not in BACKENDS:
-        raise UsageError(f"back end {backend!r}, allowed: {', '.join(BACKENDS)}")
+    if backend not in BACKENDS and backend not in offered_backends():
+        raise UsageError(f"back end {backend!r}, allowed: {', '.join(backend_names())}")
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
     if bundle.picture_shape is not None:
@@ -46,7 +49,7 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
         return PictureDecider(bundle)
     if backend == "auto":
         return _choose(bundle, shots)
-    return _make(bundle, shots, backend)
+    return _make(bundle, shots, backend) if backend in BACKENDS else _offered(bundle, shots, backend)
 
 
 def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
@@ -64,6 +67,21 @@ def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
         "float64": decide_mlp.ReferenceDecider,
     }
     return makers[backend](bundle)
+
+
+def _offered(bundle: Bundle, shots: int, backend: str) -> Decider:
+    """Make a back end of another package. It need not agree with the head, but it must answer any clicks in range."""
+    decider: Decider = offered_backends()[backend].load()(bundle)
+    wanted = (backend, bundle.n_features, len(bundle.classes))
+    found = (decider.name, decider.n_features, decider.n_classes)
+    if found != wanted:
+        raise UsageError(f"back end {backend!r} says (name, patterns, classes) {found}, must be {wanted}")
+    counts = np.random.default_rng(CLICKS_SEED).integers(0, shots + 1, size=(OFFERED_CALLS, bundle.n_features))
+    for row in counts:
+        label, probability = decider.decide(row, shots)
+        if not (0 <= label < wanted[2] and 0.0 <= probability <= 1.0):
+            raise UsageError(f"back end {backend!r} answers {(label, probability)} to the clicks {row.tolist()}")
+    return decider
 
 
 def _choose(bundle: Bundle, shots: int) -> Decider:
@@ -91,7 +109,7 @@ def _choose(bundle: Bundle, shots: int) -> Decider:
 
 def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> float:
     """Return the median time of one decision in microseconds, over varied clicks with a fixed seed."""
-    rng = np.random.default_rng(20250103)
+    rng = np.random.default_rng(CLICKS_SEED)
     counts: NDArray[np.int64] = rng.integers(0, shots + 1, size=(calls, decider.n_features))
     times: list[int] = []
     for row in counts:

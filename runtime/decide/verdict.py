@@ -31,7 +31,7 @@ class Decider(Protocol):
 
     @property
     def name(self) -> str:
-        """One of decide.BACKENDS, without `auto`."""
+        """The name by which it is asked for (names.backend_names, without `auto`)."""
 
     @property
     def n_features(self) -> int:
