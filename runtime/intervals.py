@@ -1,4 +1,4 @@
-"""Intervals and tail probabilities of counts that a lean installation must compute itself: beta and chi-square.
+"""Intervals and tail probabilities of counts that a lean installation must compute itself: binomial, beta and chi-square.
 
 Owns the special functions and the intervals made from them; never knows what was counted. All are scalar float64.
 
@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 _TINY = 1e-300
 _EPSILON = 1e-16
+Z_95 = 1.959963984540054  # 0.975 quantile of the normal distribution: what a two-sided 95 % interval takes
 CHI2_95 = 3.841458820694124  # 0.95 quantile of chi-square with one degree of freedom
 
 
@@ -42,6 +43,44 @@ def jeffreys_interval(clicks: int, exposures: int, coverage: float = 0.95) -> tu
     low = 0.0 if clicks == 0 else beta_quantile(tail, a, b)
     high = 1.0 if clicks == exposures else beta_quantile(1.0 - tail, a, b)
     return low, high
+
+
+def wilson_interval(clicks: int, exposures: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a click probability (Wilson 1927); (0, 1) without data."""
+    if exposures == 0:
+        return 0.0, 1.0
+    z2 = Z_95 * Z_95
+    rate = clicks / exposures
+    centre = (rate + z2 / (2 * exposures)) / (1 + z2 / exposures)
+    half = Z_95 / (1 + z2 / exposures) * math.sqrt(rate * (1 - rate) / exposures + z2 / (4 * exposures**2))
+    return (0.0 if clicks == 0 else centre - half), (1.0 if clicks == exposures else centre + half)
+
+
+def binomial_tail(clicks: int, exposures: int, probability: float) -> float:
+    """Return P(X >= clicks) for X ~ Binomial(exposures, probability).
+
+    Terms are summed from the first down their geometric decay in log space, so that tails down to 1e-300 keep their digits; below, 0.
+    """
+    if clicks <= 0:
+        return 1.0
+    if probability <= 0.0:
+        return 0.0
+    if probability >= 1.0 or clicks <= exposures * probability:
+        return 1.0  # at or below the mean nothing is alarming: the exact value, at least about a half, is not needed
+    log_term = (
+        math.lgamma(exposures + 1)
+        - math.lgamma(clicks + 1)
+        - math.lgamma(exposures - clicks + 1)
+        + clicks * math.log(probability)
+        + (exposures - clicks) * math.log1p(-probability)
+    )
+    odds = probability / (1.0 - probability)
+    total, term, k = 1.0, 1.0, clicks
+    while k < exposures and term > 1e-17 * total:
+        term *= odds * (exposures - k) / (k + 1)
+        total += term
+        k += 1
+    return min(1.0, math.exp(log_term) * total) if log_term > -700 else 0.0
 
 
 def beta_quantile(probability: float, a: float, b: float) -> float:

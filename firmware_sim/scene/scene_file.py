@@ -16,8 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError
-from pans.runtime.instrument.toml_position import KeyPath, Position, position_of, read_toml
-from pans.runtime.instrument.toml_rules import Key, found, near, type_remedy
+from pans.runtime.instrument.checked_toml import (
+    Key,
+    KeyPath,
+    Position,
+    found,
+    near,
+    position_of,
+    read_toml,
+    type_remedy,
+)
 
 from . import moving
 from .moving import ALL_CHANNELS, CHANGE_KINDS, Cells, Change, SceneFile, Tape

@@ -28,12 +28,12 @@ from pans.runtime.core.calibration import (
     CalibrationCore,
     Design,
     calibration_exposure_us,
+    calibration_values,
     count_model,
     counts_of,
     design_run,
     profile_level,
 )
-from pans.runtime.core.calibration_result import calibration_values
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
 from pans.runtime.instrument.estimate import CountModel, Counts, Interval, fit_light
 from pans.runtime.instrument.profile import Profile, load_profile

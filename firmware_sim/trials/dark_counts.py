@@ -22,7 +22,7 @@ from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_wor
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.cusum_design import design_cusum
-from pans.runtime.instrument.dark_rate import wilson_interval
+from pans.runtime.intervals import wilson_interval
 
 BATCH = 1 << 20
 FACTOR, DELAY_FACTOR = 1.5, 1.25

@@ -22,7 +22,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.core.sliding import SlidingCounts, SlidingScores, SlidingTable, log_evidence
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider
-from pans.runtime.decide.picture import PictureDecider
+from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.table import CountTableDecider, TableDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError

@@ -41,13 +41,13 @@ def _calibrate(args: argparse.Namespace) -> int:
         LADDER,
         TELLING,
         calibration_exposure_us,
+        calibration_values,
         count_model,
         counts_of,
         design_run,
         joined_counts,
         profile_level,
     )
-    from pans.runtime.core.calibration_result import calibration_values
     from pans.runtime.instrument.calibration import save_calibration
     from pans.runtime.instrument.estimate import fit_light
 

@@ -22,8 +22,9 @@ from pans.runtime.decide.backends import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Finding
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch
-from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport, wilson_interval
+from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
 from pans.runtime.instrument.dead_channels import LitWatch, Silence
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 from .dark_tables import Adapter, extra_probability, make_adapter

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import (
     ClickBlock,
     DeviceState,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pans.runtime.decide.verdict import Decider, verdicts_of
 from pans.runtime.errors import UsageError
 from pans.runtime.wire.bulk import BulkDecoder
-from pans.runtime.wire.framing import Frame, unpack_body
+from pans.runtime.wire.frame import Frame, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType
 
 from . import stream_kernels as kernels

@@ -12,17 +12,18 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pans.runtime.wire.block_kernels import (
+from pans.runtime.wire.kernels import (
     BLOCK_HEADER,
     BODY_HEADER,
     MARK_BYTES,
     block_shape,
     block_times,
     is_next,
+    load4,
+    load8,
     mark_photons,
     mark_truth,
 )
-from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH, MessageType
 
 from .decision import NO_LABEL, DecisionFlag

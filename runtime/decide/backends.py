@@ -20,7 +20,7 @@ from pans.runtime.errors import UsageError
 from .names import BACKENDS as BACKENDS
 from .names import backend_names, offered_backends
 from .onnx import OnnxDecider as OnnxDecider
-from .picture import PictureDecider as PictureDecider
+from .onnx import PictureDecider
 from .table import CountTableDecider, fits_count_table
 from .table import TableDecider as TableDecider
 from .verdict import Decider as Decider

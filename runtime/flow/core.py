@@ -25,7 +25,7 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, softmax_winner
 from pans.runtime.errors import UsageError
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
 
 from . import kernels

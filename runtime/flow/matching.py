@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Passage
-from pans.runtime.instrument.dark_rate import wilson_interval
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import Mark
 
 MAX_REMEMBERED_PULSES = 1 << 16  # whose fate may still change

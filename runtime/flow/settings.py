@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import ConfigError, UsageError
-from pans.runtime.instrument.dark_rate import binomial_tail
-from pans.runtime.instrument.toml_position import position_of, read_toml
+from pans.runtime.instrument.checked_toml import position_of, read_toml
+from pans.runtime.intervals import binomial_tail
 
 SHIPPED = Path(__file__).parent.parent / "shipped"
 KINDS = ("cells", "tape")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pans.runtime.wire.block_kernels import (
+from pans.runtime.wire.kernels import (
     BLOCK_HEADER,
     BODY_HEADER,
     LARGEST,
@@ -20,10 +20,11 @@ from pans.runtime.wire.block_kernels import (
     block_shape,
     block_times,
     is_next,
+    load4,
+    load8,
     mark_photons,
     mark_truth,
 )
-from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import MessageType
 
 from .kernels import EMPTY_FRAMES, NEXT, put_frames, scan

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.intervals import wilson_interval
+
 from .cusum import ALL_CHANNELS, Alarm, ChannelWatch
-from .dark_rate import wilson_interval
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]

@@ -26,8 +26,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.intervals import wilson_interval
+
 from .cusum import FLOOR_RATE
-from .dark_rate import wilson_interval
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]

@@ -1,6 +1,6 @@
 """Hardware profile: a TOML file -> frozen facts about one instrument. docs/reference/profiles.md explains every key.
 
-Owns the facts, and reading files and shipped profiles (profile_check.py holds the rules); never holds what a calibration
+Owns the facts, and reading files and shipped profiles (profile_schema.py holds the rules); never holds what a calibration
 measured (calibration.py), and never decides whether a bundle fits (plan.py). `load_profile` and `parse_profile` return a
 `Profile` whose numbers are all possible ones, or raise a ConfigError that starts with file:line:col. Detector effects that
 the file does not declare are 0 and cost nothing.
@@ -17,8 +17,8 @@ from pathlib import Path
 
 from pans.runtime.errors import ConfigError
 
+from .checked_toml import read_toml
 from .profile_schema import ProfileCheck
-from .toml_position import read_toml
 
 MAX_PROFILE_BYTES = 1 << 20
 
@@ -154,24 +154,21 @@ def parse_profile(text: str, where: str) -> Profile:
     if len(text.encode()) > MAX_PROFILE_BYTES:
         raise _too_large(where)
     tables, positions = read_toml(text, where)
-    check = ProfileCheck(tables, positions, where)
-    values = check.values()
-    profile = Profile(
-        name=values["profile"]["name"],
-        description=values["profile"].get("description", ""),
-        mode=values["profile"]["mode"],
-        projector=Projector(**values["projector"]),
-        object_modulator=ObjectModulator(**values["object"]) if "object" in values else None,
-        detector=Detector(**values["detector"]),
-        exposure=Exposure(**values["exposure"]),
-        clock=Clock(**values["clock"]),
-        timing=Timing(**values["timing"]),
-        sources=check.sources(values),
-        measure=check.measure(values),
+    facts = ProfileCheck(tables, positions, where).facts()
+    return Profile(
+        name=facts["profile"]["name"],
+        description=facts["profile"].get("description", ""),
+        mode=facts["profile"]["mode"],
+        projector=Projector(**facts["projector"]),
+        object_modulator=ObjectModulator(**facts["object"]) if "object" in facts else None,
+        detector=Detector(**facts["detector"]),
+        exposure=Exposure(**facts["exposure"]),
+        clock=Clock(**facts["clock"]),
+        timing=Timing(**facts["timing"]),
+        sources=facts["sources"],
+        measure=facts["profile"]["measure"],
         text=text,
     )
-    check.across(profile)
-    return profile
 
 
 def _decoded(data: bytes, where: str) -> str:

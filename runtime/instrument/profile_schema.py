@@ -1,7 +1,7 @@
 """The rules of a profile file: which keys there are, what they may hold, and what must hold between them.
 
-Owns the schema and the words of its error messages; never reads files and never makes a Profile (profile.py does). `ProfileCheck`
-returns checked values, or raises a ConfigError that starts with file:line:col.
+Owns the schema and the words of its error messages; never reads files and never makes a Profile (profile.py does). `ProfileCheck.facts`
+returns the checked values as a dict, or raises a ConfigError that starts with file:line:col.
 """
 
 from __future__ import annotations
@@ -9,15 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pans.runtime.errors import ConfigError
 
-from .toml_position import KeyPath, Position, position_of
-from .toml_rules import Key, found, near, type_remedy
-
-if TYPE_CHECKING:
-    from .profile import Profile
+from .checked_toml import Key, KeyPath, Position, found, near, position_of, type_remedy
 
 MODES = ("sequential", "parallel")
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
@@ -80,10 +76,14 @@ class ProfileCheck:
     positions: Mapping[KeyPath, Position]
     where: str
 
-    def values(self) -> dict[str, dict[str, Any]]:
-        """Every section's checked values, without [sources] and profile.measure."""
+    def facts(self) -> dict[str, dict[str, Any]]:
+        """Return every section's checked values, with [sources] and, in [profile], `measure` (both empty where the file has none)."""
         self._sections()
-        return {name: self._section(name) for name in _SCHEMA if name in self.tables}
+        values = {name: self._section(name) for name in _SCHEMA if name in self.tables}
+        sources, measure = self._sources(values), self._measure(values)
+        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease):
+            check(values, self.fault)
+        return {**values, "profile": {**values["profile"], "measure": measure}, "sources": sources}
 
     def fault(self, path: KeyPath, message: str, remedy: str = "") -> ConfigError:
         """The error to raise: `message` with the place of `path` before it."""
@@ -149,7 +149,7 @@ class ProfileCheck:
         hint = f"{key} belongs in [{owner}]" if owner else near(key, list(rules), "{}")
         return self.fault((section, key), f"{section}.{key} is not a key; [{section}] takes {', '.join(rules)}", hint)
 
-    def sources(self, values: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    def _sources(self, values: _Values) -> dict[str, str]:
         """[sources], each of whose keys names a key in `values`."""
         sources = self.tables.get("sources", {})
         for name, text in sources.items():
@@ -164,7 +164,7 @@ class ProfileCheck:
             self._names_a_key(("sources", name), name, values)
         return dict(sources)
 
-    def measure(self, values: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    def _measure(self, values: _Values) -> tuple[str, ...]:
         """profile.measure, each of whose entries names a key in `values`."""
         names = self.tables["profile"].get("measure", [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -177,7 +177,7 @@ class ProfileCheck:
             self._names_a_key(("profile", "measure"), name, values)
         return tuple(names)
 
-    def _names_a_key(self, path: KeyPath, name: str, values: Mapping[str, Mapping[str, Any]]) -> None:
+    def _names_a_key(self, path: KeyPath, name: str, values: _Values) -> None:
         known = [f"{section}.{key}" for section, table in values.items() for key in table]
         if name not in known:
             list_name = path[0] if path[0] == "sources" else ".".join(path)
@@ -185,75 +185,72 @@ class ProfileCheck:
                 path, f'{list_name} names "{name}", which is not a key of this profile', near(name, known, "{}")
             )
 
-    def across(self, profile: Profile) -> None:
-        """Check what needs more than one key."""
-        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease):
-            check(profile, self.fault)
 
-
+_Values = Mapping[str, Mapping[str, Any]]
 _Fault = Callable[..., ConfigError]
 
 
-def _check_channels(profile: Profile, fault: _Fault) -> None:
-    channels, path = profile.detector.channels, ("detector", "channels")
-    if profile.mode == "sequential" and channels != 1:
+def _check_channels(values: _Values, fault: _Fault) -> None:
+    channels, path = values["detector"]["channels"], ("detector", "channels")
+    if values["profile"]["mode"] == "sequential" and channels != 1:
         raise fault(
             path,
             f"detector.channels must be 1 in sequential mode (one detector, pattern after pattern), found {channels}",
             'set channels = 1, or mode = "parallel" if all channels click at once',
         )
-    if profile.mode == "parallel" and channels < 2:
+    if values["profile"]["mode"] == "parallel" and channels < 2:
         raise fault(
             path,
             f"detector.channels must be at least 2 in parallel mode (one per pattern), found {channels}",
             'set the number of channels, or mode = "sequential"',
         )
-    if profile.detector.crosstalk_probability > 0 and channels < 2:
+    crosstalk = values["detector"].get("crosstalk_probability", 0.0)
+    if crosstalk > 0 and channels < 2:
         raise fault(
             ("detector", "crosstalk_probability"),
-            "detector.crosstalk_probability must be 0 with 1 channel (there is no neighbour), "
-            f"found {profile.detector.crosstalk_probability:g}",
+            f"detector.crosstalk_probability must be 0 with 1 channel (there is no neighbour), found {crosstalk:g}",
             "remove the line",
         )
 
 
-def _check_exposure(profile: Profile, fault: _Fault) -> None:
-    low, high = profile.exposure.min_us, profile.exposure.max_us
+def _check_exposure(values: _Values, fault: _Fault) -> None:
+    low, high = values["exposure"]["min_us"], values["exposure"]["max_us"]
     if low > high:
         message = f"exposure.min_us must be at most exposure.max_us = {high:g}, found {low:g}"
         raise fault(("exposure", "min_us"), message)
 
 
-def _check_dead_time(profile: Profile, fault: _Fault) -> None:
-    dead_us = profile.detector.dead_time_ns / 1000
-    spacing_us = profile.exposure.min_us + profile.exposure.readout_us
+def _check_dead_time(values: _Values, fault: _Fault) -> None:
+    dead_ns = values["detector"].get("dead_time_ns", 0.0)
+    dead_us = dead_ns / 1000
+    spacing_us = values["exposure"]["min_us"] + values["exposure"]["readout_us"]
     if dead_us > spacing_us:
         raise fault(
             ("detector", "dead_time_ns"),
             f"detector.dead_time_ns must be at most exposure.min_us + exposure.readout_us = {1000 * spacing_us:g} ns "
-            f"(a click would blind whole exposures after it), found {profile.detector.dead_time_ns:g}",
+            f"(a click would blind whole exposures after it), found {dead_ns:g}",
             f"raise exposure.min_us or exposure.readout_us by {dead_us - spacing_us:g} us",
         )
 
 
-def _check_ticks(profile: Profile, fault: _Fault) -> None:
-    least_us = MIN_EXPOSURE_TICKS * 1e6 / profile.clock.tick_hz
-    if profile.exposure.min_us < least_us * (1 - 1e-9):
+def _check_ticks(values: _Values, fault: _Fault) -> None:
+    tick_hz, min_us = values["clock"]["tick_hz"], values["exposure"]["min_us"]
+    least_us = MIN_EXPOSURE_TICKS * 1e6 / tick_hz
+    if min_us < least_us * (1 - 1e-9):
         raise fault(
             ("exposure", "min_us"),
             f"exposure.min_us must be at least {MIN_EXPOSURE_TICKS} ticks = {least_us:g} us at clock.tick_hz = "
-            f"{profile.clock.tick_hz}, found {profile.exposure.min_us:g}",
+            f"{tick_hz}, found {min_us:g}",
             "give the device's true tick rate, or a longer shortest exposure",
         )
 
 
-def _check_lease(profile: Profile, fault: _Fault) -> None:
-    lease_us, deadline_us = 1000 * profile.timing.lease_ms, profile.timing.decision_deadline_us
-    if lease_us <= deadline_us:
+def _check_lease(values: _Values, fault: _Fault) -> None:
+    lease_ms, deadline_us = values["timing"]["lease_ms"], values["timing"]["decision_deadline_us"]
+    if 1000 * lease_ms <= deadline_us:
         raise fault(
             ("timing", "lease_ms"),
-            f"timing.lease_ms must be above timing.decision_deadline_us = {deadline_us / 1000:g} ms, "
-            f"found {profile.timing.lease_ms}",
+            f"timing.lease_ms must be above timing.decision_deadline_us = {deadline_us / 1000:g} ms, found {lease_ms}",
             "the lease is what the device waits before it goes dark: some hundred ms",
         )
 

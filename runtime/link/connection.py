@@ -23,7 +23,7 @@ from pans.runtime.wire.commands import (
     pack_pattern,
     pack_plan,
 )
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome
 from pans.runtime.wire.session import HostSession
 

@@ -21,7 +21,7 @@ from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record.parts_writer import AnyRecorder, PartedRecorder, repeated_setup
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, pack_body
 from pans.runtime.wire.tracker import StreamTracker
 

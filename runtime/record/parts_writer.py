@@ -30,7 +30,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Opcode, encode_command
 
 from .recorder import Recorder

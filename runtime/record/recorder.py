@@ -23,7 +23,7 @@ from pans.runtime.container import MIB, block_ends, canonical_json, file_prologu
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 
 from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind
 from .log import BLOCK_ROWS, LogEncoder, decision_log_sha256

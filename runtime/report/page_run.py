@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.core.plan import Plan
-from pans.runtime.instrument.dark_rate import wilson_interval
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.record.exposures import Exposures, is_dark, iter_exposures, recorded_plan
 from pans.runtime.record.recorder import Recording
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.container import replace_file
 from pans.runtime.core.decision import Decision, DecisionFlag
-from pans.runtime.decide.picture import PictureDecider
+from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness

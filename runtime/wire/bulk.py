@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import kernels
-from .framing import DecoderCounters, Frame
+from .frame import DecoderCounters, Frame
 from .schema import HEADER, MAX_FRAME_BYTES, SCHEMA
 
 CHUNK_BYTES = 1 << 18  # decoded at a time: large against a frame, small against a level-2 cache

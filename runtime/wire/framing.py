@@ -7,12 +7,9 @@ what was damaged: damage is a measurement, not a failure.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
+from .frame import DecoderCounters, Frame, unpack_body
 from .schema import HEADER, MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA, UNSEEDED, MalformedMessage
 
 if TYPE_CHECKING:
@@ -21,15 +18,6 @@ if TYPE_CHECKING:
 
 _CODES = tuple(bytes((length + 1,)) for length in range(254))
 _CRC_SEEDS = tuple(0 if message_type in UNSEEDED else SCHEMA for message_type in range(256))
-
-
-class Frame(NamedTuple):
-    """One whole frame whose CRC was right."""
-
-    type: int
-    flags: int
-    session: int
-    payload: bytes
 
 
 def cobs_encode(data: bytes) -> bytes:
@@ -72,39 +60,6 @@ def cobs_decode(data: bytes) -> bytes | None:
     return bytes(out)
 
 
-def pack_body(frame: Frame) -> bytes:
-    """Return header and payload as they stood inside the frame: what a recording keeps."""
-    return HEADER.pack(frame.type, frame.flags, 0, frame.session) + frame.payload
-
-
-def unpack_body(body: bytes) -> Frame:
-    """Invert `pack_body`; MalformedMessage when there is no whole header."""
-    if len(body) < HEADER.size:
-        raise MalformedMessage(f"a message has {len(body)} bytes, at least {HEADER.size} expected")
-    message_type, flags, _, session = HEADER.unpack_from(body)
-    return Frame(message_type, flags, session, body[HEADER.size :])
-
-
-class Messages(NamedTuple):
-    """Stream messages of one read, decoded: bodies (header and payload) at the spans int64 (n, 2) of `buffer` uint8.
-
-    Both belong to the decoder and are valid until it is given the next bytes.
-    """
-
-    buffer: npt.NDArray[np.uint8]
-    spans: npt.NDArray[np.int64]
-
-    def frame(self, place: int) -> Frame:
-        """Return message `place` as a frame of its own."""
-        first, stop = self.spans[place].tolist()
-        return unpack_body(self.buffer[first:stop].tobytes())
-
-    def kept(self) -> Messages:
-        """Return a copy that the decoder's next bytes do not touch."""
-        end = int(self.spans[-1, 1]) if len(self.spans) else 0
-        return Messages(self.buffer[:end].copy(), self.spans.copy())
-
-
 def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0) -> bytes:
     """Return one frame ready to send, delimiter included; `MalformedMessage` above MAX_PAYLOAD_BYTES."""
     if len(payload) > MAX_PAYLOAD_BYTES:
@@ -113,19 +68,6 @@ def encode_frame(message_type: int, payload: bytes, session: int, flags: int = 0
     crc = zlib.crc32(body, _CRC_SEEDS[message_type])
     # A run that ends exactly at a 254-byte boundary would cost one code byte more; cobs_encode keeps the plain form.
     return cobs_encode(body + crc.to_bytes(4, "little")) + b"\0"
-
-
-@dataclass(slots=True)
-class DecoderCounters:
-    """What the decoder has seen since it was made; every byte is in a good frame or counted as discarded."""
-
-    frames: int = 0
-    bytes_in: int = 0
-    crc_errors: int = 0
-    cobs_errors: int = 0
-    short_frames: int = 0
-    oversized_frames: int = 0
-    bytes_discarded: int = 0
 
 
 class FrameDecoder:

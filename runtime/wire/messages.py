@@ -1,6 +1,6 @@
 """The wire protocol's messages, version 1: named tuples <-> bytes, both ends (docs/reference/protocol.md is its specification).
 
-Owns what a message means; the tables are wire_schema.py's and the framing framing.py's, and both are offered from here too. Never reads
+Owns what a message means; the tables are schema.py's and the framing framing.py's, and both are offered from here too. Never reads
 a clock, opens a port or keeps click state. `encode_*` return bytes ready to send; `decode_*` turn a frame's payload into a named tuple
 or raise `MalformedMessage`, which callers count.
 """
@@ -14,14 +14,13 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from .framing import DecoderCounters as DecoderCounters
-from .framing import Frame as Frame
+from .frame import Frame as Frame
+from .frame import pack_body as pack_body
+from .frame import unpack_body as unpack_body
 from .framing import FrameDecoder as FrameDecoder
 from .framing import cobs_decode as cobs_decode
 from .framing import cobs_encode as cobs_encode
 from .framing import encode_frame as encode_frame
-from .framing import pack_body as pack_body
-from .framing import unpack_body as unpack_body
 from .schema import BLOCK_HEADER_BYTES as BLOCK_HEADER_BYTES
 from .schema import DARK_PATTERN as DARK_PATTERN
 from .schema import HEADER as HEADER

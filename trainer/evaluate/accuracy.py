@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.decide.backends import PictureDecider, make_decider
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission

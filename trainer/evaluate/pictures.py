@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.decide.backends import PictureDecider, make_decider
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.image_quality import likeness
 from pans.runtime.report import figures as page_figures
 from pans.trainer.figures import new_figure, save_figure

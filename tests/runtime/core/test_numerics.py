@@ -22,7 +22,7 @@ from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import softmax_winner, softmax_winners
-from pans.runtime.instrument.dark_rate import binomial_tail, wilson_interval
+from pans.runtime.intervals import binomial_tail, wilson_interval
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder

@@ -18,7 +18,8 @@ import pytest
 from pans.runtime.bundle.model import Bundle, make_bundle, word_means
 from pans.runtime.decide import kernels as decide_kernels
 from pans.runtime.decide import names as backend_names_module
-from pans.runtime.decide.backends import OnnxDecider, TableDecider, make_decider, softmax_winner
+from pans.runtime.decide.backends import TableDecider, make_decider, softmax_winner
+from pans.runtime.decide.onnx import OnnxDecider
 from pans.runtime.decide.verdict import choice_of
 from pans.runtime.errors import DamagedFileError, UsageError
 

@@ -7,7 +7,7 @@ import pytest
 
 from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Passage
 from pans.runtime.flow.matching import PassageMatcher, abort_reason
-from pans.runtime.instrument.dark_rate import wilson_interval
+from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import Mark
 
 GATED = frozenset({1})

@@ -19,7 +19,7 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.record.recorder import Recorder, read_recording
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.bulk import BulkDecoder
-from pans.runtime.wire.framing import Messages, pack_body
+from pans.runtime.wire.frame import Messages, pack_body
 from pans.runtime.wire.messages import NO_OBJECT, FrameBlock, FrameDecoder
 
 NOTHING = Output([], [], None)

@@ -8,7 +8,8 @@ from math import comb
 import mpmath
 import pytest
 
-from pans.runtime.instrument.dark_rate import DarkMonitor, binomial_tail, wilson_interval
+from pans.runtime.instrument.dark_rate import DarkMonitor
+from pans.runtime.intervals import binomial_tail, wilson_interval
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tree import ROOT
 
 from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.checked_toml import key_positions, position_of
 from pans.runtime.instrument.profile import MAX_PROFILE_BYTES, load_profile, parse_profile, shipped_profiles
-from pans.runtime.instrument.toml_position import key_positions, position_of
 
 GOOD = """\
 [profile]

@@ -11,7 +11,7 @@ from pans.runtime.core.decision import Action, Output
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Arrived
 from pans.runtime.live.run import LiveRun
-from pans.runtime.wire.framing import Messages
+from pans.runtime.wire.frame import Messages
 
 
 def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from pans.runtime.wire import kernels as wire_kernels
 from pans.runtime.wire.bulk import CHUNK_BYTES, BulkDecoder
-from pans.runtime.wire.framing import Frame, FrameDecoder, cobs_encode, encode_frame
+from pans.runtime.wire.frame import Frame
+from pans.runtime.wire.framing import FrameDecoder, cobs_encode, encode_frame
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, MAX_PAYLOAD_BYTES, SCHEMA
 
 

@@ -14,7 +14,8 @@ from trainings import short_fits  # noqa: F401  a fixture
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.decide.backends import PictureDecider, make_decider
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_pictures, light_of
