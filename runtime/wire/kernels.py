@@ -1,7 +1,7 @@
 """The compiled kernels of bulk decoding: delimiters, COBS and CRC-32 on one buffer, in place; and the header of a decoded FRAMES block.
 
-Owns the loops over bytes and the offsets of the block's header (docs/reference/protocol.md) for kernels; never allocates and keeps no state of
-its own. `unstuff_frames` gives the same frames and counts as `FrameDecoder`, byte for byte (tests/runtime/wire/test_bulk.py compares them).
+Owns the loops over bytes and, for kernels, the offsets of the block's header (docs/reference/protocol.md); never allocates and keeps no
+state of its own. `unstuff_frames` gives the same frames and counts as `FrameDecoder`, byte for byte (tests/runtime/wire/test_bulk.py).
 Imported by whoever measures, before arming: what decodes only a few messages does so in Python and must not pay for numba.
 """
 
