@@ -13,6 +13,7 @@ import hashlib
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, re
 FILE_MAX_BYTES = 1 << 30
 IMAGES_MAX_BYTES = 1 << 30
 HOLD_OUT_EVERY = 5
+GROUP = "pans.tasks"  # a lab's own: name -> maker(data_seed) -> Task
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +113,8 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
         return replace(digits, name=name_or_path, light="field", optics="mmf", target=FIBRE_TASKS[name_or_path])
     if name_or_path in GENERATORS:
         return draw_task(name_or_path, data_seed)
+    if name_or_path in (offered := _offered_tasks()):
+        return _checked_task(offered[name_or_path].load()(data_seed), name_or_path)
     path = Path(name_or_path)
     if path.is_dir():
         return _load_folder(path)
@@ -131,7 +135,28 @@ def physical_encoder(task: Task) -> str:
 
 def task_names() -> tuple[str, ...]:
     """Return the names that `load_task` knows."""
-    return (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)
+    return (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS, *sorted(_offered_tasks()))
+
+
+def _offered_tasks() -> dict[str, EntryPoint]:
+    """Tasks of other packages by name; a name of ours cannot be taken."""
+    ours = (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in ours}
+
+
+def _checked_task(task: Task, name: str) -> Task:
+    """Return a task of another package; UsageError where its arrays are not what `Task` says."""
+    for part, objects in (("train", task.train), ("test", task.test)):
+        images, labels = np.asarray(objects.images), np.asarray(objects.labels)
+        if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1:] != task.image_shape:
+            raise UsageError(
+                f"task {name!r}, {part}: images are {images.dtype} {images.shape}, must be uint8 (n, h, w)"
+            )
+        if labels.shape != images.shape[:1] or not len(labels):
+            raise UsageError(f"task {name!r}, {part}: {labels.shape} labels for {len(images)} images")
+        if not ((labels >= 0) & (labels < len(task.classes))).all():
+            raise UsageError(f"task {name!r}, {part}: labels must lie in 0..{len(task.classes) - 1}")
+    return task
 
 
 def draw_task(name: str, seed: int = 0, n_train: int | None = None, n_test: int | None = None) -> Task:

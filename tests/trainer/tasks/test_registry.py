@@ -2,6 +2,8 @@
 
 import gzip
 import json
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.trainer.tasks import registry as tasks
 from pans.trainer.tasks.public_sets import PUBLIC_SETS, PinnedFile, check_pinned, fetch, file_sha256, read_idx
-from pans.trainer.tasks.registry import load_task
+from pans.trainer.tasks.registry import load_task, task_names
 
 RNG = np.random.default_rng(0)
 
@@ -267,3 +269,22 @@ def test_the_shipped_scene_is_the_first_200_test_images(data_dir):
         assert np.array_equal(arrays["images"], task.test.images[:200])
         assert np.array_equal(arrays["labels"], task.test.labels[:200])
         assert tuple(arrays["classes"].tolist()) == task.classes
+
+
+def test_a_lab_s_own_task_is_found_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "labtask.py").write_text(
+        "import numpy as np\n"
+        "from pans.trainer.tasks.registry import Objects, Task\n"
+        "def make(seed, top=1):\n"
+        "    part = Objects(np.full((4, 3, 5), seed, np.uint8), np.array([0, 1, 0, top]))\n"
+        "    return Task('lab', ('a', 'b'), part, part, '0' * 64, 'by hand')\n"
+        "def bad(seed):\n"
+        "    return make(seed, 2)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    points = [EntryPoint("lab", "labtask:make", "pans.tasks"), EntryPoint("bad", "labtask:bad", "pans.tasks")]
+    monkeypatch.setattr(tasks, "entry_points", lambda group: points)
+    assert load_task("lab", data_seed=7).train.images.max() == 7
+    assert task_names()[-2:] == ("bad", "lab")
+    with pytest.raises(UsageError, match=r"'bad', train: labels must lie in 0\.\.1"):
+        load_task("bad")
