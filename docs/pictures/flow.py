@@ -14,13 +14,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from pans.runtime.commands.replay import sent_plan
-from pans.runtime.commands.run_flow import replayed_core
 from pans.runtime.core.decision import NO_LABEL
 from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.flow.make import recorded_flow_core
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record.recorder import read_recording
+from pans.runtime.record.sent_plan import sent_plan
 from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
 
 recording = read_recording(Path(sys.argv[1]))
@@ -31,7 +31,7 @@ chunks, arms = sent_plan(recording)
 plan = plan_from_chunks(chunks, int(config["tick_hz"]))
 decider = make_decider(bundle)
 arm = arms[0][1]
-core = replayed_core(config["flow"], plan, decider, bundle, 1, arm.n_cycles)
+core = recorded_flow_core(config["flow"], plan, decider, bundle, 1, arm.n_cycles)
 core.begin(arm.start_tick, arm.n_cycles)
 stop = first + count
 words, marks, rows, gates = np.zeros(count, np.int64), [], [], {}

@@ -31,7 +31,9 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live.loop import LiveRun, Onlookers, RunConfig, run_live
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record.recorder import Recorder
 
 from .causes import HOG_PRIORITY, HOST_CORE, INSTRUMENT_CORE, Injection
@@ -202,7 +204,7 @@ def host(url: str, script_path: str, recording: str) -> None:
         seconds = script[-1].at_ns * 1e-9 + AFTER_S + 0.5
         config = RunConfig(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=5000)
         result = run_live(
-            open_link(url), profile, bundle, plan, core, config, recorder, onlookers=Onlookers(disturber.watch, prepared)
+            open_link(url), profile, bundle, plan, core, config, recorder, observers=Observers(disturber.watch, prepared)
         )  # fmt: skip
         recorder.close({})
     words = {

@@ -32,9 +32,10 @@ from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.link.recovery import Recovery
-from pans.runtime.live.loop import Onlookers, RunConfig, run_live
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.reconnect import Recovery
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.wire.commands import Gate
 
 from .checkers import Checker, WatchedInstrument
@@ -104,8 +105,8 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
     started = time.perf_counter()
     core = Core(plan, make_decider(bundle, shots=SHOTS, backend="table"), SHOTS, config.n_cycles)
     recovery = Recovery.of(link, "", 30.0)
-    onlookers = Onlookers(host.watch, host.start)
-    result = run_live(link, profile, bundle, plan, core, config, recovery=recovery, onlookers=onlookers)
+    observers = Observers(host.watch, host.start)
+    result = run_live(link, profile, bundle, plan, core, config, recovery=recovery, observers=observers)
     checker.close()
     host.finish(result.ended)
     return GridResult(

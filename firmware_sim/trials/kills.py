@@ -39,8 +39,9 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import open_link
-from pans.runtime.live.loop import Onlookers, RunConfig, run_live
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record.recorder import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
@@ -92,7 +93,7 @@ def recording_host(path: str, acted: int, seed: int) -> None:
     with Recorder(path, header, bundle=data) as recorder:
         config = RunConfig(deadline_us=1e9, lease_ms=1000, realtime=False)
         core = Core(plan, make_decider(bundle), 1, 0)
-        run_live(link, profile, bundle, plan, core, config, recorder, onlookers=Onlookers(act))
+        run_live(link, profile, bundle, plan, core, config, recorder, observers=Observers(act))
 
 
 def _context() -> Any:

@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.commands.replay import replay
 from pans.runtime.errors import PansError
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.recorder import read_recording
+from pans.runtime.record.replay import replay
 from pans.runtime.report.verify import verify_folder
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"

@@ -26,9 +26,10 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile, parse_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.link.recovery import Recovery
-from pans.runtime.live.loop import Onlookers, RunConfig, run_live
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.reconnect import Recovery
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record.recorder import Recorder
 
 from .rows import BenchOptions, Row, table_text
@@ -73,7 +74,7 @@ def _run(bundle: Bundle, slot_us: float, realtime: bool, seconds: float, load: b
             recovery = Recovery.of(
                 link, link.name, RECOVER_S
             )  # starved for a whole lease, the host finds its instrument dark
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, Onlookers(waits.watch))
+            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, Observers(waits.watch))
             recorder.close({})
         cpu_s = time.process_time() - started
     latency = result.timing.total.summary()

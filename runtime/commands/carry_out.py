@@ -15,22 +15,21 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
 from pans.runtime.link.base import open_link
-from pans.runtime.live.signals import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
+from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 
-from .run_dark import DarkRun
-from .run_words import closing_words, recording_header, what_was_run
+from .job import Job, recording_header, what_was_run
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.link.base import Link
-    from pans.runtime.link.recovery import Recovery
-    from pans.runtime.live.loop import LiveCore, RunConfig, RunResult
+    from pans.runtime.live.config import RunConfig, RunResult
+    from pans.runtime.live.dark_run import DarkRun
+    from pans.runtime.live.flow_run import FlowRun
+    from pans.runtime.live.reconnect import Recovery
+    from pans.runtime.live.run import LiveCore
     from pans.runtime.record.parts_writer import AnyRecorder
-
-    from .run import Job
-    from .run_flow import FlowRun
 
 T = TypeVar("T")
 
@@ -72,7 +71,7 @@ class _Prepared:
     bundle: Bundle
     bundle_sha256: str
     decider: Decider
-    honest: DarkRun
+    dark: DarkRun
     plan: Plan
     core: LiveCore
     passing: FlowRun | None
@@ -82,45 +81,46 @@ class _Prepared:
     expected_decisions: int
 
 
-def _prepare(args: argparse.Namespace, job: Job, started_ns: int) -> _Prepared:
+def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.bundle.model import load_bundle
     from pans.runtime.core.plan import build_plan
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
+    from pans.runtime.flow.make import plan_flow
+    from pans.runtime.live.config import RunConfig
+    from pans.runtime.live.dark_run import DarkRun
+    from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.gates import open_actuator
-    from pans.runtime.live.loop import RunConfig
-
-    from .run_flow import FlowRun, core_of
 
     bundle, bundle_sha256 = load_bundle(job.bundle_path)
     decider = make_decider(bundle, shots=job.shots, backend=job.backend)
-    honest = DarkRun.of(args, job.profile)
+    dark = DarkRun.of(job.dark, job.profile)
     n_objects, passing, seconds = -(-job.decisions // job.trials), None, job.seconds
     core: LiveCore
     if job.flow is not None:
-        plan, flow_core, n_cycles = core_of(honest.profile, bundle, decider, job.flow, job.shots, job.seconds)
-        flow_core.guard = honest.guard(plan, bundle, job.shots, flow=True)
+        plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, job.flow, job.shots, job.seconds)
+        flow_core.guard = dark.guard(plan, bundle, job.shots, flow=True)
         core, passing, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act, job.act_profile)), 0.0
     else:
         plan = build_plan(
-            honest.profile,
+            dark.profile,
             bundle,
             shots_per_object=job.shots * job.trials,
             dark_slots_per_cycle=job.dark_slots,
             order=job.order,
         )
         n_cycles = n_objects * plan.cycles_per_object
-        core = Core(plan, decider, job.shots, n_cycles, honest.guard(plan, bundle, job.shots))
+        core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
     config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
     job.out.mkdir(parents=True, exist_ok=True)
     header = recording_header(job, bundle_sha256, decider, n_objects)
-    header["config"]["dark"] = honest.header()
+    header["config"]["dark"] = dark.header()
     if passing is not None:
         header["config"]["flow"] = passing.header()
     recording = job.record or job.out / "run.pansrec"
     expected = n_objects * job.trials
-    return _Prepared(bundle, bundle_sha256, decider, honest, plan, core, passing, config, header, recording, expected)
+    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, passing, config, header, recording, expected)
 
 
 def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
@@ -128,15 +128,15 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
     opening = _Background(lambda: open_link(job.device))
     try:
         from pans.runtime.container import read_file
-        from pans.runtime.link.recovery import Recovery
         from pans.runtime.link.trace import TracedLink
         from pans.runtime.live.continuous import open_recorder
+        from pans.runtime.live.reconnect import Recovery
 
-        ready = _prepare(args, job, started_ns)
+        ready = _prepare(job, started_ns)
     except BaseException:
         _close_quietly(opening)
         raise
-    for warning in ready.honest.warnings:
+    for warning in ready.dark.warnings:
         say(f"pans: {warning}")
     link = opening.result()
     if job.trace is not None:
@@ -153,31 +153,30 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
 def _watched(
     job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder, recovery: Recovery | None, stop: Stop
 ) -> RunResult:
-    """Run, with everybody looking on: the dark counts' guard, the live view, metrics and the state file."""
+    """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
     from pans.runtime.live.continuous import Attendants
-    from pans.runtime.live.loop import LiveRun, Onlookers, run_live
+    from pans.runtime.live.loop import run_live
+    from pans.runtime.live.run import LiveRun, Observers
     from pans.runtime.live.view import live_view
 
-    bundle, honest, seen = ready.bundle, ready.honest, Attendants(job.continuous, recorder)
+    bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder)
     title = f"{bundle.name} on {job.profile.name}"
     view = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
     with seen, view as watch:
 
         def prepared(run: LiveRun) -> None:
-            honest.check_device(run)
+            dark.check_device(run)
             seen.prepared(run)
             if ready.passing is not None:
                 ready.passing.prepared(run)
 
         def look(run: LiveRun, output: Output) -> None:
-            honest.look(run, output)
+            dark.look(run, output)
             watch(run, output)
 
-        onlookers = Onlookers(look, prepared, stop)
-        return run_live(
-            link, honest.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, onlookers
-        )
+        observers = Observers(look, prepared, stop)
+        return run_live(link, dark.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers)
 
 
 def _summary(job: Job, ready: _Prepared, result: RunResult) -> dict[str, Any]:
@@ -190,7 +189,7 @@ def _summary(job: Job, ready: _Prepared, result: RunResult) -> dict[str, Any]:
         expected_decisions=ready.expected_decisions,
         flow=None if ready.passing is None else ready.passing.summary(),
     )
-    ready.honest.add_to(summary)
+    ready.dark.add_to(summary)
     if ready.passing is not None:
         result.tally.confusion += ready.passing.core.matcher.confusion
     return summary
@@ -199,6 +198,7 @@ def _summary(job: Job, ready: _Prepared, result: RunResult) -> dict[str, Any]:
 def _conclude(args: argparse.Namespace, job: Job, ready: _Prepared, result: RunResult, summary: dict[str, Any]) -> int:
     """Write the page, say how it went and return the exit code."""
     from pans.runtime.report.summary import write_markdown
+    from pans.runtime.report.words import closing_words
 
     page, bundle = job.out / "summary.md", ready.bundle
     facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, ready.recording, summary)
@@ -208,7 +208,7 @@ def _conclude(args: argparse.Namespace, job: Job, ready: _Prepared, result: RunR
         "recording": str(ready.recording),
         "report": str(page),
         "shots": job.shots,
-        "seed": getattr(args, "seed", None),
+        "seed": job.seed,
     }
     emit(args, payload, closing_words(payload))
     return _exit_code(summary)

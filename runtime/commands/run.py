@@ -10,54 +10,23 @@ import argparse
 import importlib.resources
 import shlex
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.cli import Command
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError
-from pans.runtime.flow.settings import FlowSettings
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.live.continuous import Continuous, add_continuous_options, continuous_of
+from pans.runtime.instrument.profile import load_profile
 from pans.runtime.timing.cpu import check_core
 
 from .carry_out import carry_out
-from .run_dark import add_options as add_dark_options
-from .run_flow import add_options, settings_of
+from .job import Job
+from .options import add_continuous_options, add_dark_options, add_flow_options, continuous_of, dark_of, flow_of
 
 DEMO_BUNDLE = "fashion10.pans"
 DEMO_PROFILE = "oled-qcmos"
 DEMO_SCENE = "fashion200"
 DEMO_OBJECTS = 200
 DEMO_TRIALS = 5
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """What one call of the command is to do, resolved."""
-
-    bundle_path: Path
-    device: str
-    profile: Profile
-    out: Path
-    shots: int
-    trials: int
-    decisions: int
-    seconds: float
-    deadline_us: float
-    order: str
-    dark_slots: int
-    backend: str
-    realtime: bool
-    core: int | None
-    record: Path | None
-    reconnect_s: float
-    trace: Path | None
-    command: str
-    flow: FlowSettings | None
-    act: str
-    act_profile: Profile
-    continuous: Continuous
 
 
 def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
@@ -94,7 +63,7 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", type=Path, help="recording to write (default: run.pansrec in --out)")
     parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
     _configure_common(parser, trials=1)
-    add_options(parser)
+    add_flow_options(parser)
     add_dark_options(parser)
     add_continuous_options(parser)
 
@@ -130,7 +99,7 @@ def _job(
     if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
         raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
     check_core(args.core)
-    loaded, flow = load_profile(profile), settings_of(args)
+    loaded, flow = load_profile(profile), flow_of(args)
     if flow is not None and (decisions or args.trials != 1):
         raise UsageError(
             "a flow has as many decisions as objects pass", remedy="--seconds, in place of --decisions and --trials"
@@ -157,7 +126,9 @@ def _job(
         flow=flow,
         act=getattr(args, "act", "device"),
         act_profile=load_profile(args.act_profile) if getattr(args, "act_profile", None) else loaded,
+        dark=dark_of(args),
         continuous=continuous_of(args),
+        seed=getattr(args, "seed", None),
     )
 
 

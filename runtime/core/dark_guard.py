@@ -11,6 +11,7 @@ leaves channels out that are hot, quiet or dead; both abstain where all are left
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Finding
-from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch
+from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch, WatchSettings
 from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
 from pans.runtime.instrument.dead_channels import LitWatch, Silence
 from pans.runtime.intervals import wilson_interval
@@ -255,6 +256,19 @@ class DarkGuard:
             )
             for finding in self.health.present
         )
+
+
+def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:
+    """Return the guard that a header speaks of, None if of none; KeyError, TypeError or ValueError if it is damaged."""
+    if not header:
+        return None
+    expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
+    settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
+    watch = ChannelWatch(len(expected), expected, settings, low, high)
+    lit = None
+    if "lit" in header:  # recordings made before have none
+        lit = LitWatch(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)
 
 
 def _silence_words(who: str, has_others: bool, silence: Silence) -> str:

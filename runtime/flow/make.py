@@ -5,15 +5,21 @@ Owns the choice and the checks against the bundle; `make_flow_core` returns a co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.decide.backends import Decider
 from pans.runtime.errors import UsageError
+from pans.runtime.instrument.click_law import click_law, click_probability
+from pans.runtime.instrument.profile import Profile
 
 from .cells import CellCore
 from .core import FlowCore
-from .settings import FlowSettings, flow_limits
+from .plan import build_flow_plan
+from .settings import FlowSettings, flow_limits, flow_of_header
 from .tape import TapeCore
 
 
@@ -43,3 +49,33 @@ def make_flow_core(
     core = kind(plan, decider, settings, flow_limits(settings, plan, dark_probability), gated, shots, n_cycles)
     core.dark_probability = dark_probability
     return core
+
+
+def plan_flow(
+    profile: Profile, bundle: Bundle, decider: Decider, settings: FlowSettings, shots: int, seconds: float
+) -> tuple[Plan, FlowCore, int]:
+    """Return plan, core and number of cycles (0: until stopped) of a flow that lasts `seconds`."""
+    plan = build_flow_plan(profile, bundle, block_us=settings.block_us, dark_every=settings.dark_every)
+    dark = float(click_probability(click_law(profile, plan.exposure_us), 0.0))
+    cycles = math.ceil(seconds * 1e6 / plan.cycle_us * (1 - 1e-12)) if seconds else 0
+    core = make_flow_core(plan, decider, settings, bundle.classes, shots=shots, dark_probability=dark, n_cycles=cycles)
+    return plan, core, cycles
+
+
+def recorded_flow_core(
+    header: Mapping[str, Any], plan: Plan, decider: Decider, bundle: Bundle, shots: int, n_cycles: int
+) -> FlowCore:
+    """Return the core of a recorded flow; `header` is what the recording says of it. KeyError, TypeError or UsageError if it is damaged."""
+    settings, dark = flow_of_header(header["settings"]), float(header["dark_probability"])
+    return make_flow_core(
+        plan, decider, settings, bundle.classes, shots=shots, dark_probability=dark, n_cycles=n_cycles
+    )
+
+
+def replayed_figures(core: FlowCore, events: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a replayed flow was worth; `events` tell which pulses were not made."""
+    core.matcher.finish()
+    for event in events:
+        if event["kind"] in ("gate_refused", "gate_expired") and "decision" in event:
+            core.matcher.undo(int(event["decision"]))
+    return core.matcher.summary(core.frames)

@@ -1,28 +1,30 @@
-"""Running for days from the command line: recordings in parts, a state file, metrics, and how a signal ends it.
+"""Running for days: recordings in parts, a state file, metrics, and how a signal ends the run.
 
-Owns these options of `pans run` and what lives as long as the run does; each thing itself is in rotate.py, state_file.py, metrics.py and
-stopping.py. `Attendants` are started before the loop asks for real-time privileges, so that none of their threads inherits them.
+Owns what lives as long as a run does, and the handlers of signals while it does; each thing itself is in parts_writer.py, state_file.py and
+metrics.py. `Attendants` are started before the loop asks for real-time privileges, so that none of their threads inherits them. A
+signal becomes a word that the loop reads at the end of its turn, so that nothing is cut in its middle; while the loop does not look
+(setting up, waiting for a lost device, the second time) the signal interrupts as Ctrl-C does.
 """
 
 from __future__ import annotations
 
-import argparse
+import signal
+import threading
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
-
-from pans.runtime.errors import UsageError
 
 if TYPE_CHECKING:  # the options must not load what a run needs
     from pans.runtime.record.parts_writer import AnyRecorder, PartLimits
 
     from .run import LiveRun
 
-MIB = 1 << 20
+INTERRUPTED = "interrupted"
+ASKED_TO_STOP = "stopped by SIGTERM"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,44 +34,6 @@ class Continuous:
     limits: PartLimits | None = None
     state: Path | None = None
     metrics: str = ""
-
-
-def add_continuous_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to `pans run`."""
-    group = parser.add_argument_group("running for days")
-    group.add_argument("--rotate-mb", type=float, default=0.0, metavar="N", help="record in parts of about N MiB")
-    group.add_argument(
-        "--keep-mb",
-        type=float,
-        default=0.0,
-        metavar="N",
-        help="delete the oldest parts above N MiB (default: keep all)",
-    )
-    group.add_argument("--state", type=Path, metavar="FILE", help="write the run's state there as JSON, each second")
-    group.add_argument(
-        "--metrics",
-        default="",
-        metavar="HOST:PORT",
-        help="serve figures for Prometheus; a port alone: this machine only",
-    )
-
-
-def continuous_of(args: argparse.Namespace) -> Continuous:
-    """Return what the options ask for; UsageError for what cannot be meant. Commands without the options ask for nothing."""
-    rotate_mb, keep_mb = getattr(args, "rotate_mb", 0.0), getattr(args, "keep_mb", 0.0)
-    if min(rotate_mb, keep_mb) < 0:
-        raise UsageError("--rotate-mb and --keep-mb must not be negative")
-    if keep_mb and not rotate_mb:
-        raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
-    if rotate_mb and getattr(args, "on_dark", "warn") != "warn":
-        raise UsageError(
-            f"--rotate-mb with --on-dark {args.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
-            remedy="record without parts, or use --on-dark warn",
-        )
-    from pans.runtime.record.parts_writer import PartLimits
-
-    limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None
-    return Continuous(limits, getattr(args, "state", None), getattr(args, "metrics", ""))
 
 
 def open_recorder(path: Path, header: Mapping[str, Any], bundle: bytes, limits: PartLimits | None) -> AnyRecorder:
@@ -120,3 +84,35 @@ class Attendants:
         from .state_file import picture_of
 
         return picture_of(self._run, self._recorder, self._started_s)
+
+
+class Stop:
+    """`word` is why to stop, "" while nobody has asked; `polled` is True while somebody looks at it again and again."""
+
+    def __init__(self, *, continuous: bool = False) -> None:
+        self.word = ""
+        self.polled = False
+        self._continuous = continuous
+
+    def ask(self, signum: int, frame: FrameType | None) -> None:
+        """Take a signal; a run without an end of its own ends well when SIGTERM asks for it."""
+        second = bool(self.word)
+        self.word = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED
+        if second or not self.polled:
+            raise KeyboardInterrupt(self.word)
+
+
+@contextmanager
+def stop_signals(*, continuous: bool) -> Iterator[Stop]:
+    """Turn SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
+    stop = Stop(continuous=continuous)
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    names = [name for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)]
+    before = {getattr(signal, name): signal.signal(getattr(signal, name), stop.ask) for name in names}
+    try:
+        yield stop
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

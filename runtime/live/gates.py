@@ -57,7 +57,7 @@ class GateCounters:
     expired: int = 0  # not sent: it would have been late
 
 
-class GateDesk:
+class GateQueue:
     """Takes actions from outputs and gets them done within the session's window; `failed` is told the decision of each that was not."""
 
     def __init__(self, recorder: AnyRecorder | None, journal: Journal) -> None:

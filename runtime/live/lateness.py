@@ -86,7 +86,7 @@ class Lateness:
         self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)
 
-    def last_words(self, now_ns: int) -> list[dict[str, Any]]:
+    def closing_verdicts(self, now_ns: int) -> list[dict[str, Any]]:
         """Return the verdicts on what the end of the run cuts short."""
         return list(iter(lambda: self.incidents.verdict(now_ns, final=True), None))
 

@@ -1,9 +1,9 @@
 """The live loop: from an open device to timed, recorded decisions. One screen, in the order in which data flows.
 
     handshake -> check -> upload -> clock -> [arm] -> pump -> core.step -> judge the timing -> record -> show -> ... -> stop -> close
-                     ^----------- come back (bounded) <---- the link broke, the device fell silent or went dark
+                     ^----------- reconnect (bounded) <---- the link broke, the device fell silent or went dark
 
-Owns the order of things and the ends of a run; a turn is live_run.py's, an outage outage.py's, and the physics, the protocol and the
+Owns the order of things and the ends of a run; a turn is run.py's, an outage reconnect.py's, and the physics, the protocol and the
 decisions live in the modules that they call. `run_live` returns a `RunResult`, also when the link is lost for good (`link_lost`); a
 device that cannot be armed raises LinkError. However a run ends, the device is told to stop; one that cannot be told goes dark when
 its lease runs out.
@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard
@@ -22,77 +20,20 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
 from pans.runtime.errors import LinkError, RecordingError
 from pans.runtime.instrument.click_law import click_law, click_probability
-from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
+from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection, check_device
-from pans.runtime.link.recovery import Recovery
 from pans.runtime.record.parts_writer import AnyRecorder
 from pans.runtime.timing.cpu import kept_awake
-from pans.runtime.timing.ledger import TimingLedger, arm_realtime
+from pans.runtime.timing.ledger import arm_realtime
 
-from .outage import come_back
-from .run import LiveCore as LiveCore
-from .run import LiveRun as LiveRun
-from .run import Watcher as Watcher
-from .signals import INTERRUPTED, Stop
-from .tally import RunTally
+from .config import RunConfig, RunResult
+from .continuous import INTERRUPTED, Stop
+from .reconnect import Recovery, reconnect_run
+from .run import NO_OBSERVERS, LiveCore, LiveRun, Observers
 
 NS_PER_S = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class RunConfig:
-    """What to run: `shots` per decision, how many cycles (0: until `seconds` have passed or the device stops).
-
-    `started_ns` is the time from which "armed after" counts, on time.perf_counter_ns (0: from the call of run_live).
-    """
-
-    shots: int = 1
-    n_cycles: int = 0
-    seconds: float = 0.0
-    deadline_us: float = 0.0
-    lease_ms: int = 1000
-    realtime: bool = True
-    started_ns: int = 0
-    core: int | None = None  # that the loop is bound to, and kept awake
-
-
-@dataclass(frozen=True, slots=True)
-class Onlookers:
-    """Who looks on: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
-
-    watch: Watcher | None = None
-    prepared: Callable[[LiveRun], None] | None = None
-    stop: Stop | None = None
-
-
-NOBODY = Onlookers()
-
-
-@dataclass(slots=True)
-class RunResult:
-    """Everything a report needs; figures are measured, none is inferred from the configuration."""
-
-    tally: RunTally
-    timing: TimingLedger
-    dark: DarkReport
-    stream: dict[str, int]
-    decoder: dict[str, int]
-    clock: dict[str, Any]
-    realtime: dict[str, Any]
-    device: dict[str, Any]
-    slot_jitter_us: float
-    wrong_patterns: int
-    armed_after_s: float
-    seconds: float
-    ended: str
-    link_lost: bool
-    reconnects: int = 0
-    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
-    lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
-    decisions_sha256: str = ""
-    events: list[dict[str, Any]] = field(default_factory=list)
 
 
 def run_live(
@@ -104,11 +45,11 @@ def run_live(
     config: RunConfig,
     recorder: AnyRecorder | None = None,
     recovery: Recovery | None = None,
-    onlookers: Onlookers = NOBODY,
+    observers: Observers = NO_OBSERVERS,
 ) -> RunResult:
     """Run `plan` on the device behind `link` and let `core` decide until it is done; see the module's docstring.
 
-    `recovery` says how to come back when the device is lost; without it the run ends there.
+    `recovery` says how to reconnect when the device is lost; without it the run ends there.
     """
     started_ns = config.started_ns or time.perf_counter_ns()
     on_sent = None if recorder is None else recorder.add_command
@@ -143,10 +84,10 @@ def run_live(
         ):
             run.realtime = granted | awake
             try:
-                if onlookers.prepared is not None:
-                    onlookers.prepared(run)
+                if observers.prepared is not None:
+                    observers.prepared(run)
                 run.arm()
-                _until_ended(run, recovery, prepare, onlookers)
+                _until_ended(run, recovery, prepare, observers)
             except KeyboardInterrupt as interrupt:
                 run.ended = str(interrupt) or INTERRUPTED
             except RecordingError:
@@ -160,13 +101,13 @@ def run_live(
 
 
 def _until_ended(
-    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], onlookers: Onlookers
+    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], observers: Observers
 ) -> None:
-    stop = onlookers.stop or Stop()
+    stop = observers.stop or Stop()
     while not run.ended:
         try:
             stop.polled = True
-            run.turn(onlookers.watch)
+            run.turn(observers.watch)
             run.ended = run.ended or stop.word
             stop.polled = False
         except LinkError as error:
@@ -174,7 +115,7 @@ def _until_ended(
             if recovery is None:
                 run.lose_link(error)
             else:
-                come_back(run, error, recovery, prepare)
+                reconnect_run(run, error, recovery, prepare)
 
 
 def _result(run: LiveRun, profile: Profile) -> RunResult:

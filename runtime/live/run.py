@@ -1,6 +1,6 @@
 """One live run in progress, turn by turn: wait for bytes, decide on them, judge the time, record, renew the lease.
 
-Owns the state of a run while it lives and what is due in a turn; the order of a whole run is loop.py's, its outages are outage.py's, and
+Owns the state of a run while it lives and what is due in a turn; the order of a whole run is loop.py's, its outages are reconnect.py's, and
 what a frame means is the core's. Any core with the shape of `LiveCore` can be driven. `turn` sets `ended` when the run is over.
 """
 
@@ -9,7 +9,8 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,17 +23,15 @@ from pans.runtime.record.parts_writer import AnyRecorder, PartedRecorder, repeat
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, pack_body
+from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, StateReason, pack_body
 from pans.runtime.wire.tracker import StreamTracker
 
-from .gates import GateDesk
+from .config import RunConfig
+from .continuous import Stop
+from .gates import GateQueue
 from .journal import Journal
 from .lateness import Lateness
-from .outage import why_ended
 from .tally import RunTally
-
-if TYPE_CHECKING:
-    from .loop import RunConfig
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
@@ -40,6 +39,8 @@ RECEIVE_WINDOW = 4096  # stream messages
 FLUSH_EVERY_NS = 500 * NS_PER_MS
 POLL_S = 0.02
 STOP_GIVE_UP_NS = 1 * NS_PER_S
+UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every second
+SILENCE_NS = 5 * NS_PER_S  # without clicks
 
 
 class LiveCore(Protocol):
@@ -96,7 +97,7 @@ class LiveRun:
         self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
         self.tally = RunTally(n_classes, config.shots)
         self.journal = Journal(recorder)
-        self.gates = GateDesk(recorder, self.journal)
+        self.gates = GateQueue(recorder, self.journal)
         self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
         self.ended = ""
@@ -153,7 +154,7 @@ class LiveRun:
             self.ended = self.ended or "interrupted"
         self.settle(self.core.end())
         self.gates.finish(session)
-        for verdict in self.lateness.last_words(self.now_ns()):
+        for verdict in self.lateness.closing_verdicts(self.now_ns()):
             self.journal.event(verdict)
         self.lateness.close()
         self.journal.clock(self.connection)
@@ -206,7 +207,27 @@ class LiveRun:
             self._recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self._turn_page(now_ns)
-        self.ended = why_ended(self, now_ns)
+        self.ended = self._why_ended(now_ns)
+
+    def _why_ended(self, now_ns: int) -> str:
+        """Return why the run is over ("" while it is not); LinkError when the device is lost in a way that may be recovered from."""
+        if self.core.completed:
+            return "completed"
+        session = self.connection.session
+        status = session.status
+        is_news = status is not None and status.tick >= self.core.start_tick  # of this run, not of what was before it
+        if status is not None and is_news and status.state == DeviceState.SAFE:
+            if status.reason == StateReason.LEASE_EXPIRED:
+                raise LinkError("the device went dark: it had not heard from us for a whole lease")
+            self.link_lost = True
+            return f"the device went dark by itself: reason {status.reason}"
+        if self.config.seconds and now_ns - self.start_ns >= self.config.seconds * NS_PER_S:
+            return "time is up"
+        if now_ns - session.heard_ns > UNHEARD_NS:
+            raise LinkError("the device fell silent")
+        if now_ns - self.last_data_ns > SILENCE_NS + self.plan.cycle_us * NS_PER_US:
+            raise LinkError("the device answers, but sends no clicks")
+        return ""
 
     def _act(self, now_ns: int) -> None:
         """Send the pulses that wait, at once: a pulse does not wait for the rest of what has to be done."""
@@ -327,3 +348,15 @@ class LiveRun:
             self._counted = self.connection
             counters = self.connection.decoder.counters
             self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+
+
+@dataclass(frozen=True, slots=True)
+class Observers:
+    """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
+
+    watch: Watcher | None = None
+    prepared: Callable[[LiveRun], None] | None = None
+    stop: Stop | None = None
+
+
+NO_OBSERVERS = Observers()

@@ -12,15 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.commands.replay import sent_plan
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_from_chunks
-from pans.runtime.errors import DamagedFileError
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,
     FrameBlock,
-    MalformedMessage,
     Mark,
     MessageType,
     unpack_body,
@@ -42,15 +38,6 @@ class Exposures(NamedTuple):
     start_tick: NDArray[np.int64]  # (n,): begin of each exposure
     pattern: NDArray[np.uint16]  # (n,): the pattern shown, DARK_PATTERN in a dark slot; 0 where all shine at once
     clicks: NDArray[np.bool_]  # (n, channels)
-
-
-def recorded_plan(recording: Recording) -> Plan:
-    """Return the plan that the device was sent; DamagedFileError if the recording does not hold it whole."""
-    try:
-        chunks, _ = sent_plan(recording)
-        return plan_from_chunks(chunks, int(recording.header["config"]["tick_hz"]))
-    except (KeyError, TypeError, ValueError, MalformedMessage) as error:
-        raise DamagedFileError(f"{recording.path}: its plan cannot be rebuilt: {error}") from error
 
 
 def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mark]:

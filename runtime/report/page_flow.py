@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.commands.run_flow import flow_rows
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record.recording import Recording
 
 from . import figures as draw
 from .page import Page
+from .words import flow_rows
 
 BINS = 60
 I64 = NDArray[np.int64]
@@ -36,7 +36,7 @@ def add_passages(page: Page, recording: Recording, bundle: Bundle | None) -> Non
     if bundle is None:
         page.text("The bundle is not in the recording: its decisions cannot be matched with what passed.", "note")
         return
-    from pans.runtime.commands.replay import replayed_flow
+    from pans.runtime.record.replay import replayed_flow
 
     figures, confusion = replayed_flow(recording, bundle)
     pulses = _pulses(recording, bundle)

@@ -12,10 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.commands.run_flow import flow_faults, flow_rows
 from pans.runtime.container import replace_file
-from pans.runtime.live.loop import RunResult
+from pans.runtime.live.config import RunResult
 from pans.runtime.live.tally import RunTally
+
+from .words import flow_faults, flow_rows
 
 MAX_VERDICTS = 20  # of a summary; the recording has them all
 
@@ -25,7 +26,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the run's figures under the contract's keys; `illumination` is per decision, in photoelectrons per unit transmission.
 
-    `flow` is what run_flow.FlowRun says of passing objects; its figures replace those of still ones.
+    `flow` is what FlowRun says of passing objects; its figures replace those of still ones.
     """
     tally, timing = result.tally, result.timing
     faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None)

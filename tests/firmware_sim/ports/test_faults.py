@@ -22,7 +22,7 @@ from pans.firmware_sim.trials.fault_grid import case_faults, run_case
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.errors import ConfigError, LinkError, UsageError
-from pans.runtime.link.recovery import pauses_s
+from pans.runtime.live.reconnect import pauses_s
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire import session as session_module
 from pans.runtime.wire import tracker as ingest

@@ -36,10 +36,12 @@ from pans.runtime.link import reader as link_reader
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import LinkReader
-from pans.runtime.link.recovery import Recovery
 from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link.usb import UsbLink, usb_target
-from pans.runtime.live.loop import Onlookers, RunConfig, run_live
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.reconnect import Recovery
+from pans.runtime.live.run import Observers
 from pans.runtime.wire import messages as wire
 
 PATIENCE_S = 20.0
@@ -218,7 +220,7 @@ def test_a_device_that_comes_back_is_found_again() -> None:
             one_shot_core(plan, bundle, config),
             config,
             recovery=recovery,
-            onlookers=Onlookers(pull),
+            observers=Observers(pull),
         )
     finally:
         made.link.close()
@@ -249,7 +251,7 @@ def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
         one_shot_core(plan, bundle, config),
         config,
         recovery=recovery,
-        onlookers=Onlookers(pull),
+        observers=Observers(pull),
     )
     assert result.link_lost
     assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"

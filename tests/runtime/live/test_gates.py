@@ -9,7 +9,7 @@ import pytest
 from pans.runtime.core.decision import Action
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.gates import MAX_WAITING, GateDesk, open_actuator
+from pans.runtime.live.gates import MAX_WAITING, GateQueue, open_actuator
 from pans.runtime.live.journal import Journal
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
@@ -33,7 +33,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.journal, self.clock = Journal(None), clock()
-        self.desk = GateDesk(None, self.journal)
+        self.desk = GateQueue(None, self.journal)
         self.failed: list[int] = []
         self.desk.failed = self.failed.append
         self.session = HostSession(9)

@@ -19,7 +19,7 @@ from pans.runtime.errors import DeviceError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
-from pans.runtime.live.gates import GateDesk, open_actuator
+from pans.runtime.live.gates import GateQueue, open_actuator
 from pans.runtime.live.journal import Journal
 from pans.runtime.live.second_device import SecondInstrument, idle_plan
 from pans.runtime.timing.clock import ClockModel
@@ -78,7 +78,7 @@ class Lab:
         self.connection.handshake()
         self.clock: ClockModel = self.connection.synchronise()
         self.journal = Journal(None)
-        self.desk = GateDesk(None, self.journal)
+        self.desk = GateQueue(None, self.journal)
         self.failed: list[int] = []
         self.desk.failed = self.failed.append
         self.desk.second = second

@@ -14,15 +14,17 @@ from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.cli import main
-from pans.runtime.commands.replay import replay
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
-from pans.runtime.link.recovery import Recovery
-from pans.runtime.live.loop import LiveRun, Onlookers, RunConfig, RunResult, run_live
+from pans.runtime.live.config import RunConfig, RunResult
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.reconnect import Recovery
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in
 from pans.runtime.record.parts_writer import PartedRecorder, PartLimits, index_path, part_path
 from pans.runtime.record.recorder import read_recording
+from pans.runtime.record.replay import replay
 from pans.runtime.report.verify import verify_folder
 
 KIB = 1024
@@ -45,10 +47,10 @@ def record(
             if recorder._now.size_bytes >= limits.rotate_bytes and recorder._ready.empty():
                 recorder._ready.put(recorder._ready.get(timeout=20))
 
-        onlookers, recovery = Onlookers(wait, prepared), Recovery.of(link, url, 10.0)
+        observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("pans.runtime.live.run.FLUSH_EVERY_NS", 20_000_000)  # small parts need small blocks
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, onlookers)
+            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
         result.decisions_sha256 = recorder.close({"decisions": result.tally.decisions})
     return result
 

@@ -1,20 +1,23 @@
-"""What to do when the device is lost in the middle of a run: try again, with growing pauses, for a bounded time.
+"""A lost device: look for it with growing pauses for a bounded time, and arm it for what is left of the run.
 
-Owns the schedule and the way back to an open link; never decides what a lost stream means (core.py) and never starts one (loop.py).
-`reconnect` returns a connection that has been prepared anew, or raises the LinkError of the last attempt.
+Owns the schedule of attempts, the way back to an open link and what is told about an outage; never decides what a lost stream means,
+which is the core's. `reconnect` returns a connection that has been prepared anew, or raises the LinkError of the last attempt.
 """
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from pans.runtime.errors import DeviceError, LinkError
+from pans.runtime.link.base import Link, open_link
+from pans.runtime.link.connection import Connection
 
-from .base import Link, open_link
-from .connection import Connection
+from .run import LiveRun
 
+NS_PER_MS = 1_000_000
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
 
@@ -77,3 +80,26 @@ def reconnect(
             error = failure
     link.close()
     raise LinkError(f"{error.message} ({attempts} attempts in {recovery.give_up_s:g} s)", remedy=error.remedy)
+
+
+def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Callable[[Link], Connection]) -> None:
+    """Find the device again and arm it for what is left of the run, or end the run because that failed."""
+    now_ns = run.now_ns()
+    run.outage_ns = now_ns if run.outage_ns is None else run.outage_ns
+    run.journal.event({"kind": "link_lost", "reason": error.message})
+    run.journal.clock(run.connection)
+    run.count_decoded()
+    try:
+        run.connection, attempts = reconnect(recovery, run.connection, run.outage_ns, prepare)
+    except LinkError as failure:
+        run.lose_link(failure)
+        return
+    run.reconnects += 1
+    gc.collect()  # it is off while armed, and an old connection's objects name each other: here nobody waits
+    outage_ms = (run.now_ns() - run.outage_ns) / NS_PER_MS
+    run.journal.event({"kind": "reconnected", "attempts": attempts, "outage_ms": outage_ms})
+    run.settle(run.core.end())
+    if run.config.n_cycles and run.core.cycles_left(run.config.n_cycles) <= 0:
+        run.ended = "the link was lost within the last object"
+        return
+    run.arm()

@@ -13,14 +13,16 @@ import pytest
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.cli import main
-from pans.runtime.commands.run_flow import FlowRun, core_of
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, PlanError, UsageError
+from pans.runtime.flow.make import plan_flow
 from pans.runtime.flow.plan import build_flow_plan
 from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.loop import Onlookers, RunConfig, run_live
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live.config import RunConfig
+from pans.runtime.live.flow_run import FlowRun
+from pans.runtime.live.loop import run_live
+from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record.recorder import read_recording
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.trainer.export.tape_bundle import exact_table, tape_bundle
@@ -78,7 +80,7 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     bundle = load_bundle(flow_folder / "thirds.pans")[0]
     settings = FlowSettings("cells", fields_per_s=FIELDS_PER_S, onset_frames=4, gate_classes=("a",))
     decider = make_decider(bundle)
-    plan, core, cycles = core_of(PROFILE, bundle, decider, settings, 1, 0.05)
+    plan, core, cycles = plan_flow(PROFILE, bundle, decider, settings, 1, 0.05)
     asked: list[int] = []
     link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast")
     device = link.device  # type: ignore[attr-defined]
@@ -88,7 +90,7 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
         asked.extend(action.tick for action in output.actions)
 
     config = RunConfig(n_cycles=cycles, deadline_us=1000.0)
-    result = run_live(link, PROFILE, bundle, plan, core, config, onlookers=Onlookers(watch, flow.prepared))
+    result = run_live(link, PROFILE, bundle, plan, core, config, observers=Observers(watch, flow.prepared))
     assert result.ended == "completed"
     pulses = [pulse.tick for pulse in device.gates.pulses]
     assert len(asked) > 20
@@ -251,4 +253,4 @@ def test_an_unknown_gate_class_is_a_usage_error(flow_folder: Path) -> None:
     bundle = thirds(flow_folder)
     settings = FlowSettings("cells", gate_classes=("x",))
     with pytest.raises(UsageError, match="gate class x"):
-        core_of(PROFILE, bundle, make_decider(bundle), settings, 1, 0.1)
+        plan_flow(PROFILE, bundle, make_decider(bundle), settings, 1, 0.1)

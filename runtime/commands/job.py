@@ -1,22 +1,53 @@
-"""What a run says of itself: the header of its recording, the lines below the page's figures, its closing words.
+"""What one `pans run` is to do, resolved, and how a recording and a page tell it.
 
-Owns wording and keys alone; never measures. Each call returns text or a JSON-able map.
+Owns the keys of the recording's header; never measures and never runs anything.
 """
 
 from __future__ import annotations
 
 import platform
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__
-
-from .run_flow import flow_words
+from pans.runtime.flow.settings import FlowSettings
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.live.config import DarkSettings
+from pans.runtime.live.continuous import Continuous
 
 if TYPE_CHECKING:
     from pans.runtime.decide.verdict import Decider
 
-    from .run import Job
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What one call of the command is to do, resolved."""
+
+    bundle_path: Path
+    device: str
+    profile: Profile
+    out: Path
+    shots: int
+    trials: int
+    decisions: int
+    seconds: float
+    deadline_us: float
+    order: str
+    dark_slots: int
+    backend: str
+    realtime: bool
+    core: int | None
+    record: Path | None
+    reconnect_s: float
+    trace: Path | None
+    command: str
+    flow: FlowSettings | None
+    act: str
+    act_profile: Profile
+    dark: DarkSettings
+    continuous: Continuous
+    seed: int | None = None  # of a simulated detector, where the command has one
 
 
 def what_was_run(
@@ -70,23 +101,3 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "platform": platform.platform(),
         },
     }
-
-
-def closing_words(summary: dict[str, Any]) -> str:
-    """The lines that the command ends with."""
-    banner = "SIMULATED · " if summary["simulated"] else ""
-    accuracy = "unknown" if summary["accuracy"] is None else f"{summary['accuracy']:.2%}"
-    clicks = summary["clicks_mean"] or 0.0
-    photons = "unknown" if summary["photons_mean"] is None else f"{summary['photons_mean']:.2f}"
-    latency = summary["latency_us"]
-    lines = [
-        f"{banner}{summary['verdict']}: {summary['decisions']} decisions ({summary['objects']} objects × {summary['trials']} trials)",
-        f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary['illumination']:.1f} each",
-        f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
-        f"max {latency['max']:.0f} us; late {summary['late']}, lost {summary['lost']}",
-        *(flow_words(summary) if "flow" in summary else ()),
-        *(f"  fault         {fault}" for fault in summary["faults"]),
-        f"  recording     {summary['recording']}",
-        f"  report        {summary['report']}",
-    ]
-    return "\n".join(lines)

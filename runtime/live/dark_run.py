@@ -1,24 +1,21 @@
-"""What a run does about calibration and dark counts: its options, the guard that they ask for, what the recording and the
-summary say.
+"""Calibration and dark counts of one run: the guard that its settings ask for, what the recording and the summary say.
 
-Owns the joining alone: the file is calibration.py's, the watch dark_watch.py's, consequences dark_guard.py's. A replay makes
-the same guard from the recording's header.
+Owns the joining alone: the file is calibration.py's, the watch cusum.py's, consequences dark_guard.py's. A replay makes the same guard
+from the recording's header (`recorded_guard`).
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pans.runtime.core.decision import DecisionFlag
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
+from pans.runtime.core.decision import DecisionFlag, Output
+from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.calibration import (
-    MAX_AGE_H,
     Calibration,
     find_objections,
     find_warnings,
@@ -29,12 +26,10 @@ from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import Profile
 
+from .config import DarkSettings
+
 if TYPE_CHECKING:
-    from pans.runtime.bundle.model import Bundle
-    from pans.runtime.core.dark_guard import DarkGuard
-    from pans.runtime.core.decision import Output
-    from pans.runtime.core.plan import Plan
-    from pans.runtime.live.run import LiveRun
+    from .run import LiveRun
 
 FALSE_ALARM_H = (
     240.0  # hours between false alarms about the dark counts, in the mean; as many about dead channels in the light
@@ -42,28 +37,6 @@ FALSE_ALARM_H = (
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
 NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
-F64 = NDArray[np.float64]
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to `pans run`."""
-    group = parser.add_argument_group("an honest instrument (docs/how-to/calibrate.md, docs/how-to/dark-counts.md)")
-    group.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="what `pans calibrate` measured on this instrument"
-    )
-    group.add_argument(
-        "--calibration-max-age-h",
-        type=float,
-        default=MAX_AGE_H,
-        metavar="H",
-        help=f"older is stale (default {MAX_AGE_H:g})",
-    )
-    group.add_argument(
-        "--on-dark",
-        default="warn",
-        choices=("warn", "tables", "mask", "abstain"),
-        help="when the dark counts have changed: tell (default), decide with tables for them, leave channels out, or abstain",
-    )
 
 
 class DarkRun:
@@ -76,18 +49,15 @@ class DarkRun:
         self.light = LightWatch()
 
     @staticmethod
-    def of(args: argparse.Namespace, profile: Profile) -> DarkRun:
-        """Read what the command line asks for; ConfigError for a calibration of another profile."""
-        path = getattr(args, "calibration", None)
-        calibration = None if path is None else load_calibration(path)
-        max_age_h = getattr(args, "calibration_max_age_h", MAX_AGE_H)
-        if not max_age_h > 0:
-            raise UsageError(f"--calibration-max-age-h must be above 0, found {max_age_h:g}")
+    def of(settings: DarkSettings, profile: Profile) -> DarkRun:
+        """Read what `settings` ask for; ConfigError for a calibration of another profile."""
+        calibration = None if settings.calibration is None else load_calibration(settings.calibration)
+        if not settings.max_age_h > 0:
+            raise UsageError(f"--calibration-max-age-h must be above 0, found {settings.max_age_h:g}")
         if calibration is not None:
             find_objections(calibration, profile, None)
-        asked = hasattr(args, "calibration")  # `pans demo` has no instrument to calibrate
-        warnings = find_warnings(calibration, now_utc(), max_age_h) if asked else []
-        return DarkRun(profile, calibration, getattr(args, "on_dark", "warn"), warnings)
+        warnings = find_warnings(calibration, now_utc(), settings.max_age_h) if settings.warns else []
+        return DarkRun(profile, calibration, settings.policy, warnings)
 
     def guard(self, plan: Plan, bundle: Bundle, shots: int, flow: bool = False) -> DarkGuard | None:
         """Return the guard of a core; None where the plan has nothing dark in it and nothing was asked for.
@@ -124,7 +94,7 @@ class DarkRun:
                 "arl_objects": max(LEAST_ARL, 2 * FALSE_ALARM_H * 3600 * plan.objects_hz),
             },
         }
-        return made_guard(self._header, plan, bundle, shots)
+        return recorded_guard(self._header, plan, bundle, shots)
 
     def header(self) -> dict[str, Any]:
         """What the recording says, and a replay needs."""
@@ -162,20 +132,3 @@ class DarkRun:
         if contradicted:
             summary["faults"] = [*summary["faults"], *contradicted]
             summary["verdict"] = "FAIL"
-
-
-def made_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots: int) -> DarkGuard | None:
-    """Return the guard that a header speaks of, None if of none; KeyError, TypeError or ValueError if it is damaged."""
-    from pans.runtime.core.dark_guard import DarkGuard
-    from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
-    from pans.runtime.instrument.dead_channels import LitWatch
-
-    if not header:
-        return None
-    expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
-    settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
-    watch = ChannelWatch(len(expected), expected, settings, low, high)
-    lit = None
-    if "lit" in header:  # recordings made before have none
-        lit = LitWatch(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
-    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)

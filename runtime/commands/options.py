@@ -1,0 +1,121 @@
+"""Options of `pans run` in groups: passing objects, calibration and dark counts, running for days.
+
+Owns how these are spelled and what cannot be meant; never loads what a run needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from pans.runtime.errors import UsageError
+from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
+from pans.runtime.instrument.calibration import MAX_AGE_H
+from pans.runtime.live.config import DarkSettings
+from pans.runtime.live.continuous import Continuous
+
+MIB = 1 << 20
+
+
+def add_flow_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a flow to `pans run`."""
+    group = parser.add_argument_group("objects that pass by (docs/how-to/flow.md)")
+    group.add_argument("--flow", metavar="cells|tape|FILE", help="settings of the flow: shipped ones or a TOML file")
+    group.add_argument(
+        "--gate-class", action="append", default=[], metavar="NAME", help="class to pulse for (repeatable, or a,b)"
+    )
+    group.add_argument(
+        "--gate-delay-us", type=float, metavar="US", help="from leaving to the pulse (default: the settings', 900)"
+    )
+    group.add_argument(
+        "--act",
+        default="device",
+        metavar="URL",
+        help="what pulses: device (default: its GATE command), a second instrument's URL (tcp:HOST:PORT too), or NAME:...",
+    )
+    group.add_argument(
+        "--act-profile",
+        metavar="PROFILE",
+        help="hardware profile of the second instrument (default: that of the first)",
+    )
+    group.add_argument(
+        "--pool", type=int, metavar="N", help="windows side by side whose evidence is added (default: the settings', 1)"
+    )
+
+
+def flow_of(args: argparse.Namespace) -> FlowSettings | None:
+    """Return the settings that the command line asks for, None without --flow."""
+    if getattr(args, "flow", None) is None:
+        return None
+    classes = tuple(name for part in args.gate_class for name in part.split(",") if name)
+    settings = with_gate(read_flow(args.flow), classes, args.gate_delay_us)
+    return settings if args.pool is None else replace(settings, pool=args.pool)
+
+
+def add_dark_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to `pans run`."""
+    group = parser.add_argument_group(
+        "calibration and dark counts (docs/how-to/calibrate.md, docs/how-to/dark-counts.md)"
+    )
+    group.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="what `pans calibrate` measured on this instrument"
+    )
+    group.add_argument(
+        "--calibration-max-age-h",
+        type=float,
+        default=MAX_AGE_H,
+        metavar="H",
+        help=f"older is stale (default {MAX_AGE_H:g})",
+    )
+    group.add_argument(
+        "--on-dark",
+        default="warn",
+        choices=("warn", "tables", "mask", "abstain"),
+        help="when the dark counts have changed: tell (default), decide with tables for them, leave channels out, or abstain",
+    )
+
+
+def dark_of(args: argparse.Namespace) -> DarkSettings:
+    """Return what the command line asks for; `pans demo` has no instrument to calibrate, and asks for nothing."""
+    if not hasattr(args, "calibration"):
+        return DarkSettings()
+    return DarkSettings(args.calibration, args.calibration_max_age_h, args.on_dark, warns=True)
+
+
+def add_continuous_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to `pans run`."""
+    group = parser.add_argument_group("running for days")
+    group.add_argument("--rotate-mb", type=float, default=0.0, metavar="N", help="record in parts of about N MiB")
+    group.add_argument(
+        "--keep-mb",
+        type=float,
+        default=0.0,
+        metavar="N",
+        help="delete the oldest parts above N MiB (default: keep all)",
+    )
+    group.add_argument("--state", type=Path, metavar="FILE", help="write the run's state there as JSON, each second")
+    group.add_argument(
+        "--metrics",
+        default="",
+        metavar="HOST:PORT",
+        help="serve figures for Prometheus; a port alone: this machine only",
+    )
+
+
+def continuous_of(args: argparse.Namespace) -> Continuous:
+    """Return what the options ask for; UsageError for what cannot be meant. Commands without the options ask for nothing."""
+    rotate_mb, keep_mb = getattr(args, "rotate_mb", 0.0), getattr(args, "keep_mb", 0.0)
+    if min(rotate_mb, keep_mb) < 0:
+        raise UsageError("--rotate-mb and --keep-mb must not be negative")
+    if keep_mb and not rotate_mb:
+        raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
+    if rotate_mb and getattr(args, "on_dark", "warn") != "warn":
+        raise UsageError(
+            f"--rotate-mb with --on-dark {args.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
+            remedy="record without parts, or use --on-dark warn",
+        )
+    from pans.runtime.record.parts_writer import PartLimits
+
+    limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None
+    return Continuous(limits, getattr(args, "state", None), getattr(args, "metrics", ""))

@@ -1,0 +1,70 @@
+"""What goes into a live run and what comes out of it, as plain facts.
+
+Owns no behaviour; units are in the names. Light to import: the command line fills these in before anything is loaded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.instrument.calibration import MAX_AGE_H
+
+if TYPE_CHECKING:
+    from pans.runtime.instrument.dark_rate import DarkReport
+    from pans.runtime.timing.ledger import TimingLedger
+
+    from .tally import RunTally
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """What to run: `shots` per decision, how many cycles (0: until `seconds` have passed or the device stops).
+
+    `started_ns` is the time from which "armed after" counts, on time.perf_counter_ns (0: from the call of run_live).
+    """
+
+    shots: int = 1
+    n_cycles: int = 0
+    seconds: float = 0.0
+    deadline_us: float = 0.0
+    lease_ms: int = 1000
+    realtime: bool = True
+    started_ns: int = 0
+    core: int | None = None  # that the loop is bound to, and kept awake
+
+
+@dataclass(frozen=True, slots=True)
+class DarkSettings:
+    """What to do about calibration and dark counts; `policy` is one of dark_guard.POLICIES."""
+
+    calibration: Path | None = None
+    max_age_h: float = MAX_AGE_H
+    policy: str = "warn"
+    warns: bool = False  # about a calibration that is missing or old
+
+
+@dataclass(slots=True)
+class RunResult:
+    """Everything a report needs; figures are measured, none is inferred from the configuration."""
+
+    tally: RunTally
+    timing: TimingLedger
+    dark: DarkReport
+    stream: dict[str, int]
+    decoder: dict[str, int]
+    clock: dict[str, Any]
+    realtime: dict[str, Any]
+    device: dict[str, Any]
+    slot_jitter_us: float
+    wrong_patterns: int
+    armed_after_s: float
+    seconds: float
+    ended: str
+    link_lost: bool
+    reconnects: int = 0
+    late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
+    lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
+    decisions_sha256: str = ""
+    events: list[dict[str, Any]] = field(default_factory=list)
