@@ -1,6 +1,6 @@
 """`pans bench decide`: every back end's speed beside its error, and the limits beside both, in one run.
 
-Owns the rows of decisions and of sliding windows. Every back end decides the same varied inputs; scores are compared with float64,
+Owns the rows of decisions and of streams of packed words. Every back end decides the same varied inputs; scores are compared with float64,
 decisions with the float64 decisions, and accuracy where the inputs have labels.
 """
 
@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.layers import read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.core.sliding import SlidingCounts, SlidingScores, SlidingTable, log_evidence
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider
 from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.decide.table import CountTableDecider, TableDecider
+from pans.runtime.decide.table import TableDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 
@@ -40,7 +39,7 @@ BACKENDS = ("table", "count-table", "sparse", "int8", "onnx", "int8-onnx", "floa
 
 
 def bench_decide(options: BenchOptions) -> list[Row]:
-    """Return the rows of every bundle (the shipped one unless others are given), then of streams and windows."""
+    """Return the rows of every bundle (the shipped one unless others are given), then of streams."""
     paths = options.bundles or (Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans")),)
     rows: list[Row] = []
     for number, path in enumerate(paths):
@@ -51,7 +50,7 @@ def bench_decide(options: BenchOptions) -> list[Row]:
             continue
         rows += _bundle_rows(bundle, inputs, BATCH // 10 if options.quick else BATCH)
         if bundle.table is not None:
-            rows += _stream_rows(bundle) + _window_rows(bundle)
+            rows += _stream_rows(bundle)
     return rows
 
 
@@ -249,49 +248,3 @@ def _stream_rows(bundle: Bundle) -> list[Row]:
                 name = f"the same look-up in C, unchecked, {place}"
                 rows.append({"name": name, **figures, "rate": round(1e9 / figures["ns"])})
     return rows
-
-
-def _window_rows(bundle: Bundle) -> list[Row]:
-    rng = np.random.default_rng(3)
-    n = 1 << 21
-    words = rng.integers(0, 1 << bundle.n_features, n).astype(np.uint16)
-    out = np.empty(n, np.uint16)
-    rows: list[Row] = []
-    table = TableDecider(bundle)
-    windows: list[tuple[str, Any]] = [("table, K = 1", SlidingTable(table, 1))]
-    for shots in (2, 3):
-        rows_max = 1 << 20
-        if bundle.head_onnx is not None and (shots + 1) ** bundle.n_features <= rows_max:
-            windows.append(
-                (f"table of counts, K = {shots}", SlidingTable(CountTableDecider(bundle, shots, rows_max), shots))
-            )
-    windows += [
-        (f"class-score sums, K = {shots}", SlidingScores(log_evidence(table.scores_batch(_all(bundle), 1)), shots))
-        for shots in (5, 100)
-    ]
-    for name, window in windows:
-        figures = per_item_ns(cpu_time(partial(window.push, words, out)), n)
-        rows.append(
-            {
-                "name": f"sliding window, {name}",
-                **figures,
-                "rate": round(1e9 / figures["ns"]),
-                "checksum": int(out.sum(dtype=np.int64)),
-            }
-        )
-    packed = rng.integers(0, 256, (n // 4, 16), dtype=np.uint8)
-    for channels in (64, 128):
-        counts = SlidingCounts(channels, 16, 16)
-        figures = per_item_ns(cpu_time(partial(counts.push, packed)), len(packed))
-        rows.append(
-            {
-                "name": f"sliding counts of {channels} channels, K = 16, every 16th",
-                **figures,
-                "rate": round(1e9 / figures["ns"]),
-            }
-        )
-    return rows
-
-
-def _all(bundle: Bundle) -> NDArray[np.int64]:
-    return (np.arange(1 << bundle.n_features)[:, None] >> np.arange(bundle.n_features)) & 1

@@ -36,30 +36,6 @@ def label_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[Any]) ->
     return -1
 
 
-@njit(cache=True, nogil=True)
-def label_checked_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[Any]) -> int:
-    """As `label_words`, for tables whose size is a power of two: looks for words beyond it first, 1024 at a time.
-
-    Without a way out of the loop the compiler takes several words at once. The words before the first bad piece are labelled.
-    """
-    mask = np.uint64(labels.size - 1)
-    for start in range(0, words.size, 1024):
-        part, result = words[start : start + 1024], out[start : start + 1024]
-        seen = part[0]
-        for i in range(part.size):
-            seen |= part[i]
-        if np.uint64(seen) & ~mask:
-            return label_words(labels, part, result) + start
-        for i in range(part.size):
-            result[i] = labels[part[i]]
-    return -1
-
-
-def warm_up(label_dtype: Any = np.uint8, word_dtype: Any = np.uint64) -> None:
-    """Compile (or load from the cache) the kernel for these dtypes, so that no deadline pays for it."""
-    label_checked_words(np.zeros(2, dtype=label_dtype), np.zeros(1, dtype=word_dtype), np.zeros(1, dtype=label_dtype))
-
-
 # A chain of layers is two arrays. `meta` int64: number of layers L, then L + 1 sizes (d_f, then padded widths), then L flags
 # "rectified", and for float32 two more: patterns per group (0: no groups) and where in `numbers` the groups stand. `numbers` float32:
 # the first matrix row by row (n_in, n_out), the others column by column, then all biases, then the groups: the first layer's sums for

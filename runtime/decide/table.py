@@ -6,8 +6,7 @@ that it was made from: no decision differs, ever.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -37,9 +36,6 @@ class TableDecider:
         self.radix: NDArray[np.int64] = 1 << np.arange(self.n_features, dtype=np.int64)
         self.labels: NDArray[Any]  # (2**d_f,), uint8 up to 256 classes, else uint16
         self.probabilities: NDArray[np.float32]  # (2**d_f,), of the winning class
-        self._words_kernel: Callable[[NDArray[Any], NDArray[Any]], int] | None = (
-            None  # made when the first stream comes
-        )
         wide, self.probabilities = softmax_winners(bundle.table)
         self.labels = wide.astype(np.uint8) if self.n_classes <= 256 else wide
         binary = ((bundle.golden_means == 0) | (bundle.golden_means == 1)).all(axis=1)
@@ -64,9 +60,9 @@ class TableDecider:
         if result.shape != words.shape or result.dtype != self.labels.dtype:
             allowed = f"{self.labels.dtype} {words.shape}"
             raise UsageError(f"out is {result.dtype} {result.shape}, allowed: {allowed}")
-        if self._words_kernel is None:
-            self._words_kernel = words_kernel(self.labels)
-        bad = self._words_kernel(words, result)
+        from .kernels import label_words  # numba is loaded only for those who have words in bulk
+
+        bad = label_words(self.labels, words, result)
         if bad >= 0:
             raise UsageError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
         return result
@@ -88,28 +84,6 @@ class TableDecider:
         if shots != 1:
             raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx")
         return checked_counts(counts, shots, self.n_features) @ self.radix
-
-
-def words_kernel(labels: NDArray[Any]) -> Callable[[NDArray[Any], NDArray[Any]], int]:
-    """Return what labels words (n,) into out (n,) with a table of 2^d_f labels; it returns -1, or where the first word beyond it stands.
-
-    Tables that fit into vector registers are looked up there, where the processor can.
-    """
-    from . import vectors as decide_vectors
-    from .kernels import label_checked_words
-
-    plain = partial(label_checked_words, labels)
-    if not decide_vectors.AVAILABLE or labels.dtype != np.uint8 or len(labels) > decide_vectors.ENTRIES:
-        return plain
-    held = np.zeros(decide_vectors.ENTRIES, np.uint8)
-    held[: len(labels)] = labels
-    fast = partial(decide_vectors.label_words_in_registers, held, len(labels))
-
-    def label(words: NDArray[Any], out: NDArray[Any]) -> int:
-        whole = words.flags.c_contiguous and out.flags.c_contiguous
-        return int(fast(words, out) if whole else plain(words, out))
-
-    return label
 
 
 class CountTableDecider:

@@ -83,6 +83,14 @@ def softmax_winners(scores: NDArray[np.floating[Any]]) -> Verdicts:
     return Verdicts(labels, probabilities)
 
 
+def log_evidence(scores: NDArray[np.floating[Any]], floor: float = 1e-6) -> NDArray[np.float64]:
+    """Return log posteriors of scores (rows, classes) by a stable log-sum-exp in float64, saturated at log(floor)."""
+    wide = scores.astype(np.float64)
+    wide -= wide.max(axis=1, keepdims=True)
+    logs = wide - np.log(np.exp(wide).sum(axis=1, keepdims=True))
+    return np.maximum(logs, math.log(floor))
+
+
 def verdicts_of(decider: Decider, counts: NDArray[Any], shots: int) -> Verdicts:
     """Decide many objects, integers (n, d_f), with any back end, each as it would decide it alone where it can."""
     own = getattr(decider, "verdicts", None)

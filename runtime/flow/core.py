@@ -20,10 +20,9 @@ from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.decision import NO_LABEL, Action, Decision, DecisionFlag, Output, Passage, joined
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.sliding import log_evidence
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
-from pans.runtime.decide.verdict import Verdict, softmax_winner
+from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status

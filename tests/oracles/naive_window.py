@@ -29,12 +29,3 @@ def count_visits(
         else:
             found[visit, window] = (counts, right, wrong + 1)
     return {key: (counts, shots * n_features - right - wrong, wrong) for key, (counts, right, wrong) in found.items()}
-
-
-def sliding_counts(frames: list[list[int]], shots: int) -> list[list[int] | None]:
-    """Clicks per channel of the window that ends with each frame; None while it fills."""
-    found: list[list[int] | None] = []
-    for end in range(1, len(frames) + 1):
-        window = frames[end - shots : end] if end >= shots else None
-        found.append(None if window is None else [sum(frame[c] for frame in window) for c in range(len(frames[0]))])
-    return found

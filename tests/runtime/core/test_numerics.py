@@ -1,7 +1,6 @@
 """The hard numerical cases of the runtime against mpmath and exact rationals, with the worst error that is allowed.
 
-Click probabilities have theirs in test_clicks.py, evidence and fixed-point sums in test_sliding.py, rounding of the heads in
-test_decide_mlp.py.
+Click probabilities have theirs in instrument/test_click_law.py, rounding of the heads in decide/test_mlp.py.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
-from pans.runtime.decide.verdict import softmax_winner, softmax_winners
+from pans.runtime.decide.verdict import log_evidence, softmax_winner, softmax_winners
 from pans.runtime.intervals import binomial_tail, wilson_interval
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire import messages as wire
@@ -169,3 +168,18 @@ def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
                 term = mpmath.mpf(float(weight[h, i])) * (mpmath.mpf(float(shift[i])) - m * scale)
                 total, size = total + term, size + abs(term)
             assert abs(mpmath.mpf(float(constant[h])) - total) <= 16 * size * mpmath.mpf(2) ** -52
+
+
+def test_log_evidence_against_mpmath() -> None:
+    """Worst error over scores up to 700 apart: 2 units in the last place of the largest logarithm."""
+    rng = np.random.default_rng(1)
+    scores = np.concatenate([rng.normal(size=(50, 10)) * scale for scale in (1e-8, 1.0, 30.0, 300.0)])
+    found = log_evidence(scores, floor=1e-300)
+    worst = 0.0
+    with mpmath.workdps(60):
+        for row, logs in zip(scores, found):
+            total = mpmath.log(sum(mpmath.exp(mpmath.mpf(float(s))) for s in row))
+            for score, log in zip(row, logs):
+                exact = max(mpmath.mpf(float(score)) - total, mpmath.log(mpmath.mpf(10) ** -300))
+                worst = max(worst, float(abs(exact - mpmath.mpf(float(log))) / max(1, abs(exact))))
+    assert worst <= 4.5e-16

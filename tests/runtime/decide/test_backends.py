@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,9 +15,9 @@ import numpy as np
 import pytest
 
 from pans.runtime.bundle.model import Bundle, make_bundle, word_means
-from pans.runtime.decide import kernels as decide_kernels
 from pans.runtime.decide import names as backend_names_module
 from pans.runtime.decide.backends import TableDecider, make_decider, softmax_winner
+from pans.runtime.decide.kernels import label_words
 from pans.runtime.decide.onnx import OnnxDecider
 from pans.runtime.decide.verdict import choice_of
 from pans.runtime.errors import DamagedFileError, UsageError
@@ -160,30 +159,16 @@ def test_words_in_bulk(classes: int) -> None:
             decider.decide_words(words)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.uncompiled
 @pytest.mark.parametrize("label_dtype", [np.uint8, np.uint16])
-def test_the_kernel_as_its_oracle(compiled: bool, label_dtype: Any) -> None:
-    kernel = decide_kernels.label_words
-    if not compiled:
-        kernel = getattr(kernel, "py_func", kernel)
+def test_the_kernel_as_its_oracle(label_dtype: Any) -> None:
     rng = np.random.default_rng(2)
     labels = rng.integers(0, 250, size=32).astype(label_dtype)
     for highest in (32, 40, 1 << 63):
         words = rng.integers(0, highest, size=50).astype(np.uint64)
         out, wanted = np.zeros(50, dtype=label_dtype), [0] * 50
-        assert kernel(labels, words, out) == naive.label_words(labels.tolist(), words.tolist(), wanted)
+        assert label_words(labels, words, out) == naive.label_words(labels.tolist(), words.tolist(), wanted)
         assert out.tolist() == wanted
-
-
-def test_the_kernel_without_the_compiler() -> None:
-    code = (
-        "import numpy as np; from pans.runtime.decide.kernels import label_words, warm_up; warm_up();"
-        "out = np.zeros(3, np.uint8); l = np.array([5, 6], np.uint8);"
-        "print(label_words(l, np.array([1, 0, 2], np.uint64), out), out.tolist(), hasattr(label_words, 'py_func'))"
-    )
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["2", "[6,", "5,", "0]", "False"]
 
 
 def test_the_table_refuses_what_it_cannot_answer() -> None:
