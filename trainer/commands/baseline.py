@@ -1,8 +1,6 @@
 """`pans baseline direct|compressive|e2e`: the alternatives to PANS, at equal photons.
 
-Owns the arguments, the walk over photon levels and how the answer looks; the work is in the baseline_*.py modules. Every row
-holds clicks, photons and illumination, the spread over trials and the error from having few objects, for all test objects
-and for the first 200 (those of the paper's tables). All figures are SIMULATED.
+Owns the arguments and how the answer looks; the rows come from the package baselines. All figures are SIMULATED.
 """
 
 from __future__ import annotations
@@ -19,12 +17,13 @@ from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
 from pans.trainer.baselines.options import METHODS, BaselineOptions
 
+from .arguments import add_data_dir, add_threads, torch_with, usage_errors
+
 if TYPE_CHECKING:
     from pans.trainer.baselines.common import Report
     from pans.trainer.tasks.registry import Task
 
 DEFAULT_PHOTONS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0)
-NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -63,10 +62,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="of bayes, on a counting detector: bits that the readouts know of the label, and Fisher's ratio",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
-    parser.add_argument(
-        "--threads", type=int, default=1, metavar="T", help="of torch (default 1); changes the rounding"
-    )
-    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+    add_threads(parser)
+    add_data_dir(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -75,12 +72,13 @@ def _run(args: argparse.Namespace) -> int:
 
     _check(args)
     if not (args.paradigm == "direct" and args.method == "bayes"):
-        _torch().set_num_threads(args.threads)
-    task = _shortened(load_task(args.task, args.data_dir), args.train_objects, args.objects)
+        torch_with(args.threads, "a trained baseline")
+    whole = load_task(args.task, args.data_dir)
+    task = replace(whole, train=whole.train.first(args.train_objects), test=whole.test.first(args.objects))
     rows: list[dict[str, Any]] = []
     code = EXIT_FINE
     try:
-        with _progress() as report:
+        with usage_errors(), _progress() as report:
             for row in baseline_rows(task, _options(args), args.photons, report):
                 say(_line(row))
                 rows.append(row)
@@ -121,13 +119,6 @@ def _check(args: argparse.Namespace) -> None:
 
 def _options(args: argparse.Namespace) -> BaselineOptions:
     return BaselineOptions(**{field.name: getattr(args, field.name) for field in fields(BaselineOptions)})
-
-
-def _shortened(task: Task, n_train: int | None, n_test: int | None) -> Task:
-    def first(objects: Any, n: int | None) -> Any:
-        return type(objects)(objects.images[:n], objects.labels[:n])
-
-    return replace(task, train=first(task.train, n_train), test=first(task.test, n_test))
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -178,16 +169,6 @@ def _lines_of_progress() -> Report:
         last[0] = quarter
 
     return show
-
-
-def _torch() -> Any:
-    try:
-        import torch
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            "a trained baseline needs the package torch, which is not installed", remedy=NEEDS_TORCH
-        ) from error
-    return torch
 
 
 BASELINE = Command(

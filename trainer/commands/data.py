@@ -18,7 +18,7 @@ from pans.runtime.errors import PansError, UsageError
 from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.registry import Objects, draw_task, load_task
 
-from .evaluate import add_data_dir
+from .arguments import add_data_dir
 
 PARTS = ("test", "train")
 
@@ -49,7 +49,7 @@ def _scene(args: argparse.Namespace) -> int:
     if args.objects is not None and args.objects < 1:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
     classes, objects = _objects(args.names[0], args)
-    part = objects if args.objects is None else Objects(objects.images[: args.objects], objects.labels[: args.objects])
+    part = objects.first(args.objects)
     data = io.BytesIO()
     np.savez_compressed(data, images=part.images, labels=part.labels.astype(np.int16), classes=np.array(classes))
     replace_file(args.out, data.getvalue())

@@ -17,7 +17,7 @@ from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
 from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
 
-NEEDS = "pip install 'pans-runtime[train,sweep]'"
+from .arguments import add_data_dir, add_threads, needing, torch_with
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -37,21 +37,18 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--epochs", type=int, default=30, metavar="E", help="of a trial (default 30)")
     parser.add_argument("--hidden", type=int, default=128, metavar="H", help="hidden units of the head (default 128)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trainings (default 0)")
-    parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
-    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+    add_threads(parser, "")
+    add_data_dir(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
-    try:
+    with needing("a sweep", "train,sweep"):
         import optuna
-        import torch
-    except ModuleNotFoundError as error:
-        raise UsageError(f"a sweep needs the package {error.name}, which is not installed", remedy=NEEDS) from error
+    torch_with(args.threads, "a sweep")
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.tasks.registry import load_task
     from pans.trainer.train.loop import train
 
-    torch.set_num_threads(args.threads)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     profile = load_profile(args.profile)
     base = _base(args)

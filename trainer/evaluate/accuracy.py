@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
-from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
 from pans.runtime.instrument.profile import Profile
@@ -59,14 +58,12 @@ def light_of(
 ) -> Light:
     """Show the patterns of `bundle` on `images` (n, height, width) through `profile`, or look at them through its passive optics.
 
-    `eta` scales the light.
-
-    `dark` replaces the profile's dark photoelectrons per exposure.
+    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure. ValueError for images of another shape.
     """
     if images.shape[1:] != bundle.image_shape:
-        raise UsageError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
+        raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
-        raise UsageError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
+        raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
     if bundle.analyser is None:
         exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
     else:
@@ -101,9 +98,9 @@ def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
     """Return P(decided class | object), float64 (n, classes), by enumeration of all (shots + 1)**d_f count vectors."""
     outcomes = (shots + 1) ** bundle.n_features
     if outcomes > EXACT_OUTCOMES_MAX:
-        raise UsageError(
-            f"{shots} shots of {bundle.n_features} patterns have {outcomes} outcomes, allowed: {EXACT_OUTCOMES_MAX}",
-            remedy="use --trials instead of --exact",
+        raise ValueError(
+            f"{shots} shots of {bundle.n_features} patterns have {outcomes} outcomes, allowed: {EXACT_OUTCOMES_MAX} "
+            "(sample trials instead)"
         )
     digits = (shots + 1) ** np.arange(bundle.n_features)
     counts = (np.arange(outcomes)[:, None] // digits) % (shots + 1)
@@ -144,7 +141,7 @@ def evaluate_sampled(
 ) -> Measured:
     """Sample `trials` independent decisions per object, each from `shots` shots."""
     if trials < 1:
-        raise UsageError(f"--trials is {trials}, allowed: 1 or more")
+        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     decider = make_decider(bundle, shots=shots)
     rng = np.random.default_rng(seed)
     right = np.zeros(len(labels))
@@ -181,7 +178,7 @@ def evaluate_pictures(
 ) -> MeasuredPictures:
     """Give back `trials` pictures of every object from `shots` shots and compare them with its image, uint8 (n, height, width)."""
     if trials < 1:
-        raise UsageError(f"--trials is {trials}, allowed: 1 or more")
+        raise ValueError(f"trials is {trials}, allowed: 1 or more")
     decider = PictureDecider(bundle)
     rng = np.random.default_rng(seed)
     likes, of_trial, squares, clicks = np.zeros(len(images)), np.empty(trials), 0.0, 0

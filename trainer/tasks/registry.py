@@ -44,6 +44,11 @@ class Objects:
     def __len__(self) -> int:
         return len(self.labels)
 
+    def first(self, count: int | None) -> Objects:
+        """Return the first `count` objects, or all of them."""
+        behind = None if self.behind is None else self.behind[:count]
+        return Objects(self.images[:count], self.labels[:count], behind)
+
     @property
     def pictures(self) -> NDArray[np.uint8]:
         """What a task of pictures wants back: the images, or what lies behind them."""

@@ -8,9 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from pans.runtime.bundle.model import make_bundle
+from pans.runtime.bundle.model import make_bundle, write_bundle
+from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.evaluate import Conditions, evaluate
 from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of, outcome_probabilities
 
 RNG = np.random.default_rng(0)
@@ -112,14 +114,57 @@ def test_light_and_dark_options():
 def test_impossible_requests_are_refused():
     model = bundle()
     light = light_of(model, PROFILE, IMAGES)
-    with pytest.raises(UsageError, match="allowed"):
+    with pytest.raises(ValueError, match="allowed"):
         light_of(model, PROFILE, IMAGES[:, :3])
-    with pytest.raises(UsageError, match="eta"):
+    with pytest.raises(ValueError, match="eta"):
         light_of(model, PROFILE, IMAGES, eta=-1.0)
-    with pytest.raises(UsageError, match="trials"):
+    with pytest.raises(ValueError, match="trials"):
         evaluate_sampled(model, light, LABELS, trials=0)
-    with pytest.raises(UsageError, match="outcomes"):
+    with pytest.raises(ValueError, match="outcomes"):
         evaluate_exactly(model, light, LABELS, shots=40)
+
+
+@pytest.fixture
+def own_task(tmp_path):
+    path = tmp_path / "own.npz"
+    np.savez(path, images=IMAGES, labels=LABELS, classes=np.array(["a", "b", "c"]))
+    return str(path)
+
+
+def test_a_bundle_is_judged_by_one_call(own_task, tmp_path):
+    model = head_bundle()
+    write_bundle(model, tmp_path / "small.pans")
+    exact = evaluate_exactly(model, light_of(model, PROFILE, IMAGES), LABELS)
+    for given in (model, tmp_path / "small.pans"):  # never trained on this file: all its objects are held out
+        assert evaluate(given, task=own_task) == exact
+    assert evaluate(model, task=own_task, exact=False).trials == 30
+    doubled = Conditions(profile="ideal", eta=2.0, dark=0.1, seed=3)
+    light = light_of(model, load_profile("ideal"), IMAGES[:7], eta=2.0, dark=0.1)
+    wanted = evaluate_sampled(model, light, LABELS[:7], shots=2, trials=5, seed=3)
+    assert evaluate(model, task=own_task, shots=2, trials=5, objects=7, conditions=doubled) == wanted
+
+
+def test_one_call_refuses_what_it_cannot_judge(own_task):
+    with pytest.raises(ValueError, match="objects is 0"):
+        evaluate(bundle(), task=own_task, objects=0)
+    with pytest.raises(ValueError, match="decides among 3 classes"):
+        evaluate(bundle(), task="barcode")
+    with pytest.raises(UsageError, match="neither"):
+        evaluate(bundle())  # its provenance names no task that can be found
+
+
+def test_the_command_says_what_was_asked_wrongly(own_task, tmp_path, capsys):
+    path = tmp_path / "small.pans"
+    write_bundle(bundle(), path)
+    words = ["evaluate", str(path), "--task", own_task]
+    for more, said in (
+        (["--exact", "--shots", "40"], "outcomes"),
+        (["--trials", "0"], "trials is 0"),
+        (["--eta", "-1"], "eta is -1"),
+        (["--objects", "0"], "--objects is 0"),
+    ):
+        assert main([*words, *more]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_evaluation_loads_no_torch():

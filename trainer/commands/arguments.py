@@ -1,0 +1,55 @@
+"""What several of the trainer's commands share: their common options, the check for torch, and errors of the user's input."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pans.runtime.errors import UsageError
+
+
+def add_data_dir(parser: argparse.ArgumentParser) -> None:
+    """Add --data-dir to a command that may need a public set."""
+    parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
+
+
+def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
+    """Add --threads, the number of threads of torch."""
+    parser.add_argument("--threads", type=int, default=1, metavar="T", help=f"of torch (default 1){consequence}")
+
+
+def torch_with(threads: int, what: str = "training") -> Any:
+    """Return torch, set to that many threads; UsageError where it is not installed."""
+    if not 1 <= threads <= 1024:
+        raise UsageError(f"--threads is {threads}, allowed: 1 to 1024")
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"{what} needs the package torch, which is not installed", remedy="pip install 'pans-runtime[train]'"
+        ) from error
+    torch.set_num_threads(threads)
+    return torch
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Turn a ValueError of the numeric code into a UsageError: what the user asked for cannot be computed."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+@contextmanager
+def needing(option: str, extra: str) -> Iterator[None]:
+    """Turn a missing package into a UsageError that names the `option` which needs it, and the `extra` that holds it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"{option} needs the package {error.name}, which is not installed",
+            remedy=f"pip install 'pans-runtime[{extra}]'",
+        ) from error

@@ -1,0 +1,129 @@
+"""From a bundle and a task's name to figures: what `pans evaluate` and a notebook call.
+
+Owns the choice of profile, held-out objects and trials; the figures are those of `accuracy`. SIMULATED.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.tasks.registry import Objects, Task, load_task
+
+from .accuracy import (
+    EXACT_OUTCOMES_MAX,
+    Measured,
+    MeasuredPictures,
+    evaluate_exactly,
+    evaluate_pictures,
+    evaluate_sampled,
+    light_of,
+)
+
+DEFAULT_PROFILE = "oled-qcmos"
+DEFAULT_TRIALS = 30  # as many as the paper's experiment repeats
+PICTURE_TRIALS = 3  # a picture is hundreds of numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the objects are shown: by default through the profile that the bundle was trained for, as it is."""
+
+    profile: str | None = None
+    eta: float = 1.0  # all light times this
+    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
+    seed: int = 0  # of the trials
+    data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """The objects that a bundle is judged on, and the profile through which it sees them."""
+
+    task: Task
+    objects: Objects
+    profile: Profile
+
+
+def evaluate(
+    bundle: Bundle | str | Path,
+    *,
+    task: str | None = None,
+    shots: int = 1,
+    trials: int | None = None,
+    exact: bool = True,
+    objects: int | None = None,
+    data_dir: str | Path | None = None,
+    conditions: Conditions = Conditions(),
+) -> Measured | MeasuredPictures:
+    """Return what `bundle` (or the .pans file at that path) decides on held-out objects, per decision of `shots` shots.
+
+    `task` and `objects` (the first so many) are by default what the bundle was trained on, and all. With `trials` decisions are
+    sampled; without, they are exact expectations, or, where not `exact` and for pictures, a default number of trials.
+    ValueError where the outcomes are too many to enumerate or an argument is out of range.
+    """
+    model = bundle if isinstance(bundle, Bundle) else load_bundle(bundle)[0]
+    held_out = held_out_of(model, task, objects, data_dir, conditions)
+    if trials is None and (not exact or model.picture_shape is not None):
+        trials = default_trials(model)
+    return measure(model, held_out, shots=shots, trials=trials, conditions=conditions)
+
+
+def default_trials(bundle: Bundle) -> int:
+    """Return how often every object is decided on unless told otherwise: 30 times, pictures 3 times."""
+    return DEFAULT_TRIALS if bundle.picture_shape is None else PICTURE_TRIALS
+
+
+def held_out_of(
+    bundle: Bundle, task: str | None, count: int | None, data_dir: str | Path | None, conditions: Conditions
+) -> HeldOut:
+    """Return the first `count` held-out objects (None: all) of `task`, by default what `bundle` was trained on.
+
+    All objects of a file without a test part are held out, unless the bundle was trained on that very file.
+    """
+    told = bundle.provenance
+    if count is not None and count < 1:
+        raise ValueError(f"objects is {count}, allowed: 1 or more")
+    data_seed = int(told.get("data_seed", 0)) if conditions.data_seed is None else conditions.data_seed
+    found = load_task(task or str(told.get("task_argument", bundle.task)), data_dir, data_seed=data_seed)
+    if bundle.picture_shape not in (None, found.image_shape):
+        raise ValueError(
+            f"{bundle.name} gives back pictures of {bundle.picture_shape}, the task has {found.image_shape}"
+        )
+    if bundle.picture_shape is None and found.classes != bundle.classes:
+        raise ValueError(
+            f"{bundle.name} decides among {len(bundle.classes)} classes ({', '.join(bundle.classes[:3])}, ...), the task "
+            f"{found.name} has {len(found.classes)} ({', '.join(found.classes[:3])}, ...)"
+        )
+    whole = found.split_here and told.get("data_sha256") != found.sha256
+    profile = load_profile(conditions.profile or str(told.get("profile", DEFAULT_PROFILE)))
+    return HeldOut(found, (found.everything() if whole else found.test).first(count), profile)
+
+
+def measure(
+    bundle: Bundle,
+    held_out: HeldOut,
+    *,
+    shots: int = 1,
+    trials: int | None = None,
+    conditions: Conditions = Conditions(),
+) -> Measured | MeasuredPictures:
+    """Return what `bundle` decides on the objects: from `trials` decisions per object, or exact without (not of pictures)."""
+    objects = held_out.objects
+    light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
+    if bundle.picture_shape is not None:
+        if trials is None:
+            raise ValueError("pictures are compared by trials, there is no exact expectation")
+        return evaluate_pictures(bundle, light, objects.images, shots=shots, trials=trials, seed=conditions.seed)
+    if trials is None:
+        return evaluate_exactly(bundle, light, objects.labels, shots=shots)
+    return evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=conditions.seed)
+
+
+def trials_needed(bundle: Bundle, shots: int = 1) -> int | None:
+    """Return None where the exact expectation can be had, else a number of trials: 30, of pictures one."""
+    if bundle.picture_shape is not None:
+        return 1
+    return DEFAULT_TRIALS if (shots + 1) ** bundle.n_features > EXACT_OUTCOMES_MAX else None
