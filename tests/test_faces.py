@@ -1,0 +1,22 @@
+"""What importing a package loads: faces stay light, and the lean half never meets a heavy library."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from tree import ROOT
+
+LIGHT = sorted(
+    f"pans.{path.parent.relative_to(ROOT).as_posix().replace('/', '.')}" for path in ROOT.glob("runtime/*/__init__.py")
+)
+SLOW_TO_LOAD = ("numba", "onnxruntime", "torch", "matplotlib", "h5py", "serial", "usb", "rich")
+
+
+@pytest.mark.parametrize("package", [*LIGHT, "pans.runtime.cli", "pans.trainer", "pans.firmware_sim"])
+def test_a_face_loads_no_slow_library(package: str) -> None:
+    name = "pans" if package == "pans.runtime.api" else package
+    code = f"import sys, {name}; print(*(name for name in {SLOW_TO_LOAD!r} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
