@@ -19,7 +19,7 @@ from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.flow.make import recorded_flow_core
 from pans.runtime.flow.matching import abort_reason
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 from pans.runtime.record.sent_plan import sent_plan
 from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
 

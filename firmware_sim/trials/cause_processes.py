@@ -34,7 +34,7 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live.config import RunConfig
 from pans.runtime.live.loop import run_live
 from pans.runtime.live.run import LiveRun, Observers
-from pans.runtime.record.recorder import Recorder
+from pans.runtime.record import Recorder
 
 from .causes import HOG_PRIORITY, HOST_CORE, INSTRUMENT_CORE, Injection
 

@@ -29,7 +29,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 
 from .scheduling_probe import Canary
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from pans.runtime.errors import PansError
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 
 from .flow_causes import (
     MACHINE,

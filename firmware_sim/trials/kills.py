@@ -42,7 +42,7 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live.config import RunConfig
 from pans.runtime.live.loop import run_live
 from pans.runtime.live.run import LiveRun, Observers
-from pans.runtime.record.recorder import Recorder, read_recording
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
 

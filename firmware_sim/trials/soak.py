@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.errors import PansError
+from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
-from pans.runtime.record.recorder import read_recording
-from pans.runtime.record.replay import replay
 from pans.runtime.report.verify import verify_folder
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"

@@ -30,7 +30,7 @@ from pans.runtime.live.config import RunConfig
 from pans.runtime.live.loop import run_live
 from pans.runtime.live.reconnect import Recovery
 from pans.runtime.live.run import LiveRun, Observers
-from pans.runtime.record.recorder import Recorder
+from pans.runtime.record import Recorder
 
 from .rows import BenchOptions, Row, table_text
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.reconnect import Recovery
     from pans.runtime.live.run import LiveCore
-    from pans.runtime.record.parts_writer import AnyRecorder
+    from pans.runtime.record import AnyRecorder
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ from pans.runtime.container import replace_file
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import ClickList, click_list, is_dark
-from pans.runtime.record.recorder import Recording, read_recording
 from pans.runtime.record.sent_plan import recorded_plan
 
 FORMATS = ("csv", "photon-hdf5")

@@ -115,7 +115,7 @@ def continuous_of(args: argparse.Namespace) -> Continuous:
             f"--rotate-mb with --on-dark {args.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
             remedy="record without parts, or use --on-dark warn",
         )
-    from pans.runtime.record.parts_writer import PartLimits
+    from pans.runtime.record.part_keeper import PartLimits
 
     limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None
     return Continuous(limits, getattr(args, "state", None), getattr(args, "metrics", ""))

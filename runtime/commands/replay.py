@@ -12,10 +12,9 @@ from typing import Any
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.pictures import PictureLog
-from pans.runtime.record.recording import read_recording
-from pans.runtime.record.replay import replay
 from pans.runtime.report.words import passage_words
 
 

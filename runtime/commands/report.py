@@ -12,7 +12,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import EXIT_FINE, Command, emit
 from pans.runtime.container import replace_file
 from pans.runtime.errors import UsageError
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 from pans.runtime.report.verify import file_kind
 
 

@@ -1,9 +1,9 @@
 """Running for days: recordings in parts, a state file, metrics, and how a signal ends the run.
 
-Owns what lives as long as a run does, and the handlers of signals while it does; each thing itself is in parts_writer.py, state_file.py and
-metrics.py. `Attendants` are started before the loop asks for real-time privileges, so that none of their threads inherits them. A
-signal becomes a word that the loop reads at the end of its turn, so that nothing is cut in its middle; while the loop does not look
-(setting up, waiting for a lost device, the second time) the signal interrupts as Ctrl-C does.
+Owns what lives as long as a run does, and the handlers of signals while it does. `Attendants` are started before the loop asks for
+real-time privileges, so that none of their threads inherits them. A signal becomes a word that the loop reads at the end of its turn, so
+that nothing is cut in its middle; while the loop does not look (setting up, waiting for a lost device, the second time) the signal
+interrupts as Ctrl-C does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:  # the options must not load what a run needs
-    from pans.runtime.record.parts_writer import AnyRecorder, PartLimits
+    from pans.runtime.record import AnyRecorder
+    from pans.runtime.record.part_keeper import PartLimits
 
     from .run import LiveRun
 
@@ -38,8 +39,7 @@ class Continuous:
 
 def open_recorder(path: Path, header: Mapping[str, Any], bundle: bytes, limits: PartLimits | None) -> AnyRecorder:
     """Begin the recording, in parts where they are asked for."""
-    from pans.runtime.record.parts_writer import PartedRecorder
-    from pans.runtime.record.recorder import Recorder
+    from pans.runtime.record import PartedRecorder, Recorder
 
     if limits is None:
         return Recorder(path, header, bundle=bundle, overwrite=True)

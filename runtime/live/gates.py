@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, LinkError, UsageError
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.clock import ClockModel
 from pans.runtime.wire.commands import Gate, pack_gate
 from pans.runtime.wire.messages import Opcode

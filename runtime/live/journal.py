@@ -10,7 +10,7 @@ from collections import Counter
 from typing import Any
 
 from pans.runtime.link.connection import Connection
-from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.record import AnyRecorder
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts

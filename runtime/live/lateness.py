@@ -11,7 +11,7 @@ from typing import Any
 from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
-from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.attribution import Incidents, LateWork
 from pans.runtime.timing.evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
 from pans.runtime.wire.messages import Status

@@ -24,7 +24,7 @@ from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection, check_device
-from pans.runtime.record.parts_writer import AnyRecorder
+from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.cpu import kept_awake
 from pans.runtime.timing.ledger import arm_realtime
 

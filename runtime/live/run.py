@@ -19,7 +19,8 @@ from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
-from pans.runtime.record.parts_writer import AnyRecorder, PartedRecorder, repeated_setup
+from pans.runtime.record import AnyRecorder, PartedRecorder
+from pans.runtime.record.parted_recorder import repeated_setup
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.frame import Messages
@@ -321,7 +322,7 @@ class LiveRun:
         recorder = self._recorder
         if not isinstance(recorder, PartedRecorder):
             return
-        for event in recorder.news():
+        for event in recorder.keeper.news():
             self.journal.event(event)
         if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place, self._setup, now_ns)

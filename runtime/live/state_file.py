@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
-from pans.runtime.record.parts_writer import PartedRecorder
+from pans.runtime.record import PartedRecorder
 
 if TYPE_CHECKING:
-    from pans.runtime.record.parts_writer import AnyRecorder
+    from pans.runtime.record import AnyRecorder
 
     from .run import LiveRun
 

@@ -23,7 +23,7 @@ from pans.runtime.wire.messages import (
 )
 from pans.runtime.wire.tracker import StreamTracker
 
-from .recorder import Recording
+from .recording import Recording
 
 STREAM = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 

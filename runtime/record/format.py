@@ -15,7 +15,6 @@ from pans.runtime.container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
 FORMAT_VERSION = 2
-READABLE_VERSIONS = (1, 2)  # they differ in DECISIONS blocks alone: record_log.py
 MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
 RUN_ROWS_MAX = 1 << 31

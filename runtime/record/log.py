@@ -1,17 +1,16 @@
 """The decision log on disk and its hash: what a decision needs in bytes, and the way back to the rows.
 
-Owns both forms that DECISIONS blocks have had (docs/reference/formats.md): the rows as they are (format version 1)
-and the compact form (version 2).
-Never touches a file and never decides. In the compact form each different verdict stands once and is named by its number; what else a
-row holds goes up in equal steps, so that a run of decisions needs its first row and the steps: 2 bytes for a decision of a fast, regular
-stream, not 52. Nothing is left out: the rows come back bit for bit. The hash does not depend on how the rows were cut into blocks.
+Owns the form of DECISIONS blocks (docs/reference/formats.md). Never touches a file and never decides. Each different verdict stands once
+and is named by its number; what else a row holds goes up in equal steps, so that a run of decisions needs its first row and the steps:
+2 bytes for a decision of a fast, regular stream, not 52. Nothing is left out: the rows come back bit for bit. The hash does not depend
+on how the rows were cut into blocks.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,26 +50,6 @@ _HEAD = struct.Struct("<III")  # runs, verdicts, decisions
 _FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # for record_kernels.SLOTS_PER_VERDICT
 
 
-class LogHash(Protocol):
-    """The hash of a decision log that grows."""
-
-    def update(self, rows: NDArray[np.void]) -> None:
-        """Take the next rows, DECISION_DTYPE (n,)."""
-
-    def hexdigest(self) -> str:
-        """Return the SHA-256 (hex) of all rows so far."""
-
-
-class LogReader(Protocol):
-    """DECISIONS blocks of one recording, in their order."""
-
-    def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
-        """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when its parts do not fit together."""
-
-    def hexdigest(self) -> str:
-        """Return the SHA-256 (hex) of all rows so far."""
-
-
 class LogEncoder:
     """Rows in, blocks and their hash out; all memory is allocated here, before arming."""
 
@@ -78,7 +57,7 @@ class LogEncoder:
         from . import kernels  # numba: only who writes or replays decisions needs it
 
         self._encode = kernels.encode_rows
-        self._hash = _CompactHash()
+        self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
         self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
         self._keys = np.zeros((LONG_VERDICT, 3), np.uint64)
@@ -113,13 +92,13 @@ class LogEncoder:
         return parts
 
 
-class CompactReader:
-    """DECISIONS blocks of format version 2."""
+class LogReader:
+    """DECISIONS blocks of one recording, in their order."""
 
     def __init__(self) -> None:
         self._known: NDArray[np.void] = np.zeros(LONG_VERDICT, VERDICT_DTYPE)
         self._n_known = 0
-        self._hash = _CompactHash()
+        self._hash = _LogHash()
 
     def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
         """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when its parts do not fit together."""
@@ -141,39 +120,6 @@ class CompactReader:
         return self._hash.hexdigest()
 
 
-class RowReader:
-    """DECISIONS blocks of format version 1: rows, and the SHA-256 of their bytes; also the hash of such a log that is replayed."""
-
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-
-    def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
-        """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when it ends within a row."""
-        if len(payload) % DECISION_DTYPE.itemsize:
-            wanted = f"a multiple of {DECISION_DTYPE.itemsize}"
-            raise DamagedFileError(f"{where} has {len(payload)} bytes, allowed: {wanted}")
-        self._hash.update(payload)
-        return np.frombuffer(payload, DECISION_DTYPE)
-
-    def update(self, rows: NDArray[np.void]) -> None:
-        """Take the next rows, DECISION_DTYPE (n,)."""
-        self._hash.update(np.ascontiguousarray(rows, DECISION_DTYPE).tobytes())
-
-    def hexdigest(self) -> str:
-        """Return the SHA-256 (hex) of all rows so far."""
-        return self._hash.hexdigest()
-
-
-def log_reader(version: int) -> LogReader:
-    """Return what reads the decisions of a recording of this format version."""
-    return RowReader() if version == 1 else CompactReader()
-
-
-def log_hash(version: int) -> LogHash:
-    """Return what hashes decisions as a recording of this format version does: for a replay."""
-    return RowReader() if version == 1 else LogEncoder()
-
-
 def decision_log_sha256(records: NDArray[np.void]) -> str:
     """Return the SHA-256 (hex) of decisions, DECISION_DTYPE (n,), in their order: what replay compares."""
     log = LogEncoder()
@@ -181,7 +127,7 @@ def decision_log_sha256(records: NDArray[np.void]) -> str:
     return log.hexdigest()
 
 
-class _CompactHash:
+class _LogHash:
     """SHA-256 over the three hashes of verdicts, codes and whole runs; a run that goes on in the next block is hashed when it ends."""
 
     def __init__(self) -> None:

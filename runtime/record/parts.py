@@ -1,6 +1,6 @@
 """Reading recordings that come in parts: a part's place in the run, the chain from one to the next, a folder of them.
 
-Owns the questions across files; blocks are recording.py's, what one file promises is verify.py's, and writing parts rotate.py's.
+Owns the questions across files; blocks are recording.py's, what one file promises is verify.py's, and writing parts parted_recorder.py's.
 `verify_folder` returns one verdict on the chain; a deleted beginning is no fault, a hole is.
 """
 
@@ -13,7 +13,8 @@ from typing import Any
 
 from pans.runtime.errors import DamagedFileError, UsageError
 
-from .parts_writer import PART_EVENT, chained
+from .part_keeper import chained
+from .parted_recorder import PART_EVENT
 from .recording import Recording
 
 

@@ -1,6 +1,6 @@
 """Append-only recordings: everything a run saw and decided, in one file that survives a power cut.
 
-Owns the writing, in bounded batches; reading is in recording.py and offered here too. Never decides what is worth keeping
+Owns the writing, in bounded batches; reading is recording.py's. Never decides what is worth keeping
 and never converts a time. `Recorder.close` returns the SHA-256 of the decision log, which a replay must give again.
 """
 
@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -25,65 +24,13 @@ from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
+from .buffers import BUFFER_ROWS, ByteBuffer, RowBuffer
 from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind
-from .log import BLOCK_ROWS, LogEncoder, decision_log_sha256
-from .recording import Recording, read_recording
-
-__all__ = [
-    "TIMING_DTYPE",
-    "Kind",
-    "Recorder",
-    "Recording",
-    "decision_log_sha256",
-    "read_recording",
-]
+from .log import BLOCK_ROWS, LogEncoder
 
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
-_BUFFER_ROWS = 4096
 _COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
-
-
-class _Rows:
-    """A preallocated table of `_BUFFER_ROWS` rows that is emptied into a block."""
-
-    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
-        self.kind = kind
-        self.rows = np.zeros(_BUFFER_ROWS, dtype=dtype)
-        self.used = 0
-
-    def add(self, row: Sequence[Any]) -> bool:
-        """Store one row; True when the table is full."""
-        self.rows[self.used] = row
-        self.used += 1
-        return self.used == len(self.rows)
-
-    def take(self) -> bytes:
-        data = self.rows[: self.used].tobytes()
-        self.used = 0
-        return data
-
-
-class _Bytes:
-    """A preallocated byte buffer that is emptied into a block."""
-
-    def __init__(self, kind: Kind, size: int) -> None:
-        self.kind = kind
-        self.data = bytearray(size)
-        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
-        self.used = 0
-
-    def room(self) -> int:
-        return len(self.data) - self.used
-
-    def add(self, piece: bytes | bytearray | memoryview) -> None:
-        self.data[self.used : self.used + len(piece)] = piece
-        self.used += len(piece)
-
-    def take(self) -> bytes:
-        data = bytes(memoryview(self.data)[: self.used])
-        self.used = 0
-        return data
 
 
 class Recorder:
@@ -101,11 +48,11 @@ class Recorder:
         """
         self.path = Path(path)
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
-        self._messages = _Bytes(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
-        self._commands = _Bytes(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
-        self._events = _Bytes(Kind.EVENTS, _EVENT_BUFFER_BYTES)
-        self._decisions = _Rows(Kind.DECISIONS, DECISION_DTYPE)
-        self._timings = _Rows(Kind.TIMINGS, TIMING_DTYPE)
+        self._messages = ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
+        self._commands = ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._events = ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
+        self._decisions = RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
+        self._timings = RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
         self._log = LogEncoder()
         from .kernels import pack_messages  # numba is loaded only by who records
 
@@ -126,25 +73,16 @@ class Recorder:
         self.sync()
         sync_folder(self.path.parent)
 
-    @classmethod
-    def open(
-        cls, path: str | Path, header: Mapping[str, Any], *, bundle: bytes = b"", overwrite: bool = False
-    ) -> Recorder:
-        """Start a recording at `path`; the same as calling the class."""
-        return cls(path, header, bundle=bundle, overwrite=overwrite)
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         if self._file.closed:
             return
         try:
             self.flush()
         except PansError:
-            if error is None:
+            if error[1] is None:
                 raise
         finally:
             self._file.close()
@@ -211,8 +149,8 @@ class Recorder:
 
     def add_clock(self, samples: NDArray[np.void]) -> None:
         """Write clock samples, CLOCK_DTYPE (n,) of clock.py; rare, hence not buffered."""
-        for start in range(0, len(samples), _BUFFER_ROWS):
-            part = np.ascontiguousarray(samples[start : start + _BUFFER_ROWS], dtype=CLOCK_DTYPE)
+        for start in range(0, len(samples), BUFFER_ROWS):
+            part = np.ascontiguousarray(samples[start : start + BUFFER_ROWS], dtype=CLOCK_DTYPE)
             self._write_block(Kind.CLOCK, part.tobytes())
 
     def flush(self) -> None:
@@ -223,7 +161,7 @@ class Recorder:
         """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
         self._flush(self._commands, self._messages, self._decisions)
 
-    def _flush(self, *buffers: _Rows | _Bytes) -> None:
+    def _flush(self, *buffers: RowBuffer | ByteBuffer) -> None:
         n_decisions = self._decisions.used
         blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
         if blocks:
@@ -248,7 +186,7 @@ class Recorder:
         self._file.close()
         return digest
 
-    def _add_bytes(self, buffer: _Bytes, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+    def _add_bytes(self, buffer: ByteBuffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         if len(data) > MESSAGE_MAX_BYTES:
             raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
         needed = MESSAGE.size + len(data)
@@ -261,13 +199,13 @@ class Recorder:
         buffer.used += MESSAGE.size
         buffer.add(data)
 
-    def _empty(self, buffer: _Rows | _Bytes) -> None:
+    def _empty(self, buffer: RowBuffer | ByteBuffer) -> None:
         if buffer.used:
             n_decisions = self._decisions.used if buffer is self._decisions else 0
             self._write(self._block_of(buffer))
             self._n_decisions += n_decisions
 
-    def _block_of(self, buffer: _Rows | _Bytes) -> bytes:
+    def _block_of(self, buffer: RowBuffer | ByteBuffer) -> bytes:
         """Empty a buffer into a block, which must be written next."""
         if buffer is self._decisions:
             rows = self._decisions.rows[: self._decisions.used]

@@ -22,8 +22,8 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
-from .format import LIMITS, MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind
-from .log import LogReader, log_reader
+from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, TIMING_DTYPE, Kind
+from .log import LogReader
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +61,13 @@ class Recording:
         return self._pairs(Kind.COMMANDS)
 
     def decisions(self) -> NDArray[np.void]:
-        """Return all decisions, DECISION_DTYPE (n,), whichever form they stand in."""
+        """Return all decisions, DECISION_DTYPE (n,)."""
         parts = list(self.iter_decisions())
         return np.concatenate(parts) if parts else np.zeros(0, dtype=DECISION_DTYPE)
 
     def iter_decisions(self) -> Iterator[NDArray[np.void]]:
         """Yield the decisions block by block, DECISION_DTYPE (n,); memory holds one block."""
-        reader = log_reader(self.version)
+        reader = LogReader()
         for block in self.iter_blocks(Kind.DECISIONS):
             yield reader.rows(block.payload, f"{self.path}: block {block.index}")
 
@@ -121,7 +121,7 @@ def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
 
 def _start(file: Any, where: str) -> tuple[int, int]:
     """Read the prologue: the format version and the checksum that seeds the first block."""
-    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, where)
+    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, (FORMAT_VERSION,), where)
 
 
 def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
@@ -146,10 +146,7 @@ class _Scan:
         self.end_offset = 0
         self.n_decisions = 0
         self.version = 0
-        self.log: LogReader = log_reader(1)
-
-    def begin(self, version: int) -> None:
-        self.version, self.log = version, log_reader(version)
+        self.log = LogReader()
 
     def take(self, block: Block) -> None:
         where = f"{self.path}: block {block.index}"
@@ -192,8 +189,7 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             try:
-                version, chain = _start(file, str(path))
-                scan.begin(version)
+                scan.version, chain = _start(file, str(path))
                 for block in _blocks(file, chain, str(path)):
                     scan.take(block)
             except DamagedFileError as error:

@@ -27,7 +27,7 @@ from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
-from .log import log_hash
+from .log import LogEncoder
 from .parts import place_of
 from .pictures import PictureLog
 from .recording import Recording
@@ -74,7 +74,7 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None)
     if pictures is not None:
         decider = pictures.over(decider)
     core = _core(config, plan, decider, bundle, shots, arms[0][1].n_cycles)
-    log, n_decisions = log_hash(recording.version), 0
+    log, n_decisions = LogEncoder(), 0
     for decisions in _decisions(core, arms, recording):
         log.update(np.array(decisions, DECISION_DTYPE))
         n_decisions += len(decisions)

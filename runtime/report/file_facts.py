@@ -19,7 +19,7 @@ from pans.runtime.bundle.optics import Analyser
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.record.recorder import Recording, read_recording
+from pans.runtime.record import Recording, read_recording
 
 from .verify import file_kind
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.flow.matching import abort_reason
-from pans.runtime.record.recording import Recording
+from pans.runtime.record import Recording
 
 from . import figures as draw
 from .page import Page

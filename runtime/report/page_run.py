@@ -18,8 +18,8 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.intervals import wilson_interval
+from pans.runtime.record import Recording
 from pans.runtime.record.exposures import Exposures, is_dark, iter_exposures
-from pans.runtime.record.recorder import Recording
 from pans.runtime.record.sent_plan import recorded_plan
 
 from . import figures as draw

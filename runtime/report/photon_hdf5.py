@@ -22,8 +22,8 @@ import numpy as np
 from pans.runtime import __version__
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
+from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList
-from pans.runtime.record.recorder import Recording
 
 FORMAT_NAME, FORMAT_VERSION = "Photon-HDF5", "0.5"
 FORMAT_URL = "http://photon-hdf5.org/"

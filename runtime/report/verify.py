@@ -22,9 +22,9 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
 from pans.runtime.record.parts import chain_violations, first_decision, parts_in
-from pans.runtime.record.recorder import Recording, read_recording
 
 _COMPARE_FEATURES_MAX = 16
 _ABSTAIN_CAUSES = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE

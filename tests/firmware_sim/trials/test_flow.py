@@ -31,7 +31,7 @@ from pans.firmware_sim.trials.flow_causes import (
 from pans.firmware_sim.trials.scheduling_probe import MAX_GAPS, Canary, Gap, Watched
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.record.recorder import TIMING_DTYPE
+from pans.runtime.record.format import TIMING_DTYPE
 from pans.trainer.export.tape_bundle import tape_bundle
 
 US = 1_000

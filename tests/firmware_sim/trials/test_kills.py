@@ -9,7 +9,7 @@ import pytest
 
 from pans.firmware_sim.trials import kills as killrun
 from pans.runtime.live.run import LiveRun
-from pans.runtime.record.recorder import Recorder
+from pans.runtime.record import Recorder
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL and forkserver are not there")
 

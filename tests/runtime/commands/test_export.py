@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from pans.runtime.cli import main
+from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
-from pans.runtime.record.recorder import read_recording
 from pans.runtime.record.sent_plan import recorded_plan
 
 # what the format's definition calls mandatory, and that a photon's detector is named

@@ -16,7 +16,7 @@ from pans.runtime.bundle.quantise import quantise_patterns
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile, shipped_profiles
-from pans.runtime.record.recorder import Recorder, read_recording
+from pans.runtime.record import Recorder, read_recording
 
 
 def toy_bundle(**changes: Any) -> Bundle:

@@ -12,8 +12,8 @@ from pages import page_of, words_of
 
 from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.cli import main
+from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
-from pans.runtime.record.recorder import read_recording
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.page import Page, flat
 from pans.runtime.report.page_run import count_rates

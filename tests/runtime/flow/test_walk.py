@@ -16,7 +16,7 @@ from pans.runtime.core.decision import Output, joined
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.link.connection import Connection
-from pans.runtime.record.recorder import Recorder, read_recording
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Messages, pack_body

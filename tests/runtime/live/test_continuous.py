@@ -21,8 +21,8 @@ from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 from pans.runtime.live.metrics import FIGURES, MetricsServer, parse_address
 from pans.runtime.live.state_file import FORMAT, StateFile, picture_of
+from pans.runtime.record import read_recording
 from pans.runtime.record.parts import parts_in
-from pans.runtime.record.recorder import read_recording
 from pans.runtime.report.verify import verify_folder
 
 

@@ -23,7 +23,7 @@ from pans.runtime.live.config import RunConfig
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.live.loop import run_live
 from pans.runtime.live.run import LiveRun, Observers
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.trainer.export.tape_bundle import exact_table, tape_bundle
 

@@ -21,7 +21,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
 from pans.runtime.live.config import RunConfig, RunResult
 from pans.runtime.live.loop import run_live
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 
 PROFILE = load_profile("oled-qcmos")
 

@@ -18,7 +18,9 @@ import pytest
 from pans.runtime.bundle.model import bundle_bytes, make_bundle
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
-from pans.runtime.record.recorder import TIMING_DTYPE, Kind, Recorder, Recording, decision_log_sha256, read_recording
+from pans.runtime.record import Recorder, Recording, read_recording
+from pans.runtime.record.format import TIMING_DTYPE, Kind
+from pans.runtime.record.log import decision_log_sha256
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
 HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}
@@ -29,7 +31,7 @@ def decision(index: int) -> tuple[Any, ...]:
 
 
 def write_recording(path: Path, decisions: int = 5, bundle: bytes = b"") -> str:
-    with Recorder.open(path, HEADER, bundle=bundle) as recorder:
+    with Recorder(path, HEADER, bundle=bundle) as recorder:
         recorder.add_command(10, b"arm")
         for index in range(decisions):
             recorder.add_message(100 + index, bytes([index % 256]) * (index % 7))
@@ -248,20 +250,20 @@ def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
     write_recording(path)
     before = path.read_bytes()
     with pytest.raises(UsageError, match="exists already"):
-        Recorder.open(path, HEADER)
+        Recorder(path, HEADER)
     assert path.read_bytes() == before
-    with Recorder.open(path, HEADER, overwrite=True) as recorder:
+    with Recorder(path, HEADER, overwrite=True) as recorder:
         recorder.close({})
     assert facts(read_recording(path)) == (0, True)
     with pytest.raises(UsageError, match="cannot be written"):
-        Recorder.open(tmp_path / "no" / "folder.pansrec", HEADER)
+        Recorder(tmp_path / "no" / "folder.pansrec", HEADER)
     with pytest.raises(UsageError, match="cannot be read"):
         read_recording(tmp_path / "none.pansrec")
 
 
 def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
-    recorder = Recorder.open(path, HEADER)
+    recorder = Recorder(path, HEADER)
 
     def broken_run() -> None:
         with recorder:
@@ -277,7 +279,7 @@ def test_an_exception_leaves_an_incomplete_recording_with_all_that_was_added(tmp
 
 def test_what_is_flushed_is_readable_while_recording_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "a.pansrec"
-    with Recorder.open(path, HEADER) as recorder:
+    with Recorder(path, HEADER) as recorder:
         recorder.add_decision(decision(0))
         assert facts(read_recording(path)) == (0, False)
         recorder.flush()
@@ -292,7 +294,7 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     sizes = [*rng.integers(0, 3000, size=400).tolist(), 1 << 20, 262_144 - 12, 262_145, 0]
     messages = [(i, bytes([i % 251]) * size) for i, size in enumerate(sizes)]
-    with Recorder.open(path, HEADER) as recorder:
+    with Recorder(path, HEADER) as recorder:
         for host_ns, data in messages:
             recorder.add_message(host_ns, memoryview(data))
         for index in range(10_000):
@@ -305,7 +307,7 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
     assert found.decisions()["index"].tolist() == list(range(10_000))
     assert [event["index"] for event in found.events()] == list(range(10_000))
     assert max(len(block.payload) for block in found.iter_blocks()) <= (1 << 20) + 12
-    with Recorder.open(tmp_path / "b.pansrec", HEADER) as recorder:
+    with Recorder(tmp_path / "b.pansrec", HEADER) as recorder:
         with pytest.raises(UsageError, match="message of 1048577"):
             recorder.add_message(0, bytes((1 << 20) + 1))
         with pytest.raises(UsageError, match="an event of"):
@@ -314,7 +316,7 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
 
 def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.pansrec"
-    recorder = Recorder.open(path, HEADER)
+    recorder = Recorder(path, HEADER)
     recorder.add_decision(decision(0))
     recorder.flush()
 
@@ -345,7 +347,7 @@ def test_a_full_disk_ends_the_recording_at_a_whole_block(tmp_path: Path, monkeyp
 
 def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.pansrec"
-    with Recorder.open(path, HEADER) as recorder:
+    with Recorder(path, HEADER) as recorder:
         real = recorder._file
 
         class Trickle:
@@ -384,19 +386,19 @@ def test_the_bundle_travels_along(tmp_path: Path) -> None:
 def test_a_header_that_json_cannot_hold_makes_no_file(tmp_path: Path) -> None:
     for strange in (float("nan"), np.float32(1.0), {1: 2}):
         with pytest.raises((ValueError, TypeError)):
-            Recorder.open(tmp_path / "a.pansrec", {"value": strange})
+            Recorder(tmp_path / "a.pansrec", {"value": strange})
     assert os.listdir(tmp_path) == []
 
 
 def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
     wanted = np.array([decision(i) for i in range(50_000)], dtype=DECISION_DTYPE)
     one, many = tmp_path / "one.pansrec", tmp_path / "many.pansrec"
-    with Recorder.open(one, HEADER) as recorder:
+    with Recorder(one, HEADER) as recorder:
         for row in wanted[:10].tolist():
             recorder.add_decision(row)
         recorder.add_decisions(wanted[10:])
         digest = recorder.close({})
-    with Recorder.open(many, HEADER) as recorder:
+    with Recorder(many, HEADER) as recorder:
         recorder.add_decisions(wanted)
         assert recorder.close({}) == digest == decision_log_sha256(wanted)
     for path in (one, many):

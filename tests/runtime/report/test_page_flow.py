@@ -11,7 +11,7 @@ import pytest
 from pages import page_of, words_of
 
 from pans.runtime.cli import main
-from pans.runtime.record.recorder import read_recording
+from pans.runtime.record import read_recording
 from pans.runtime.report.page_flow import _late_numbers, _pulses, _spread
 
 pytest.importorskip("matplotlib", reason="needs the plot extra")

@@ -21,10 +21,9 @@ from pans.runtime.live.config import RunConfig, RunResult
 from pans.runtime.live.loop import run_live
 from pans.runtime.live.reconnect import Recovery
 from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.record import PartedRecorder, read_recording, replay
+from pans.runtime.record.part_keeper import PartLimits, index_path, part_path
 from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in
-from pans.runtime.record.parts_writer import PartedRecorder, PartLimits, index_path, part_path
-from pans.runtime.record.recorder import read_recording
-from pans.runtime.record.replay import replay
 from pans.runtime.report.verify import verify_folder
 
 KIB = 1024
@@ -44,8 +43,8 @@ def record(
     with PartedRecorder(folder / "run.pansrec", header, limits, bundle=bundle_bytes(bundle)) as recorder:
 
         def wait(run: LiveRun, output: Any) -> None:
-            if recorder._now.size_bytes >= limits.rotate_bytes and recorder._ready.empty():
-                recorder._ready.put(recorder._ready.get(timeout=20))
+            if recorder.open_part.size_bytes >= limits.rotate_bytes and recorder.keeper.ready.empty():
+                recorder.keeper.ready.put(recorder.keeper.ready.get(timeout=20))
 
         observers, recovery = Observers(wait, prepared), Recovery.of(link, url, 10.0)
         with pytest.MonkeyPatch.context() as patch:
@@ -167,7 +166,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     link_states = []
 
     def prepared(run: LiveRun) -> None:
-        file = run._recorder._now._file  # type: ignore[union-attr]
+        file = run._recorder.open_part._file  # type: ignore[union-attr]
 
         class Full:
             closed = False
@@ -182,7 +181,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
                 self.closed = True
                 file.close()
 
-        run._recorder._now._file = Full()  # type: ignore[union-attr]
+        run._recorder.open_part._file = Full()  # type: ignore[union-attr]
         link_states.append(run)
 
     with pytest.raises(RecordingError, match="No space left on device"):

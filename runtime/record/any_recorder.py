@@ -1,0 +1,46 @@
+"""What a run needs of a recorder, whether it writes one file or parts.
+
+Owns the interface alone; recorder.py and parted_recorder.py implement it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.wire.frame import Messages
+
+
+class AnyRecorder(Protocol):
+    """A recording that is being written: adding buffers, `flush` writes, `close` ends it and returns the hash of its decisions."""
+
+    path: Path
+    watch_write: Callable[[int, int], None] | None
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *error: Any) -> None: ...
+
+    def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None: ...
+
+    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None: ...
+
+    def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None: ...
+
+    def add_decision(self, record: Sequence[Any]) -> None: ...
+
+    def add_timing(self, record: Sequence[Any]) -> None: ...
+
+    def add_event(self, event: Mapping[str, Any]) -> None: ...
+
+    def add_clock(self, samples: NDArray[np.void]) -> None: ...
+
+    def flush_decisions(self) -> None: ...
+
+    def flush(self) -> None: ...
+
+    def close(self, summary: Mapping[str, Any]) -> str: ...

@@ -1,0 +1,57 @@
+"""What a recorder holds back: rows and bytes in memory allocated beforehand, emptied into blocks.
+
+Owns the memory; never touches a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .format import Kind
+
+BUFFER_ROWS = 4096
+
+
+class RowBuffer:
+    """A preallocated table of `BUFFER_ROWS` rows that is emptied into a block."""
+
+    def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
+        self.kind = kind
+        self.rows = np.zeros(BUFFER_ROWS, dtype=dtype)
+        self.used = 0
+
+    def add(self, row: Sequence[Any]) -> bool:
+        """Store one row; True when the table is full."""
+        self.rows[self.used] = row
+        self.used += 1
+        return self.used == len(self.rows)
+
+    def take(self) -> bytes:
+        data = self.rows[: self.used].tobytes()
+        self.used = 0
+        return data
+
+
+class ByteBuffer:
+    """A preallocated byte buffer that is emptied into a block."""
+
+    def __init__(self, kind: Kind, size: int) -> None:
+        self.kind = kind
+        self.data = bytearray(size)
+        self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
+        self.used = 0
+
+    def room(self) -> int:
+        return len(self.data) - self.used
+
+    def add(self, piece: bytes | bytearray | memoryview) -> None:
+        self.data[self.used : self.used + len(piece)] = piece
+        self.used += len(piece)
+
+    def take(self) -> bytes:
+        data = bytes(memoryview(self.data)[: self.used])
+        self.used = 0
+        return data

@@ -1,0 +1,167 @@
+"""A recording in parts: each one whole and replayable by itself, chained to the one before.
+
+Owns when a part is full and how the next one begins; blocks and files are recorder.py's, the folder is part_keeper.py's, and the place
+in the stream at which a part may begin is the core's (`follower.part`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan_codec import plan_chunks
+from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
+from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.messages import Opcode, encode_command
+
+from .part_keeper import PartFacts, PartKeeper, PartLimits, chained, part_path
+from .recorder import Recorder
+
+PART_EVENT = "part"
+
+
+def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
+    """Return the plan and ARM as frames of session `nonce`: with them at its beginning a part can be replayed by itself."""
+    bodies = [(Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan)] + [(Opcode.ARM, pack_arm(arm))]
+    return [encode_command(number, opcode, body, nonce) for number, (opcode, body) in enumerate(bodies, 1)]
+
+
+class PartedRecorder:
+    """Has the Recorder's calls, on the part that is open; `next_part` goes on in another one. One thread at a time, its own aside."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        header: Mapping[str, Any],
+        limits: PartLimits,
+        *,
+        bundle: bytes = b"",
+        overwrite: bool = False,
+    ) -> None:
+        """Begin part 1 beside `path` (see `part_path`); UsageError if parts are there already, unless `overwrite`: then they go."""
+        self.path, self.limits = Path(path), limits
+        self.watch_write: Callable[[int, int], None] | None = None
+        self.parts = 0
+        self._first_decision, self._chain = 0, ""
+        self.keeper = PartKeeper(self.path, header, limits, bundle, overwrite)
+        self.open_part = self.keeper.start()
+        self._begin({"decisions": 0}, ())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        try:
+            self.open_part.__exit__(*error)
+        finally:
+            self.keeper.close()
+
+    # -- the Recorder's calls ------------------------------------------------------------------------------------------
+
+    def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """See `Recorder`."""
+        self.open_part.add_message(host_ns, data)
+
+    def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None:
+        """See `Recorder`."""
+        self.open_part.add_messages(host_ns, messages, first, count)
+
+    def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """See `Recorder`."""
+        self.open_part.add_command(host_ns, data)
+
+    def add_decision(self, record: Sequence[Any]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_decision(record)
+
+    def add_decisions(self, rows: NDArray[np.void]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_decisions(rows)
+
+    def add_timing(self, record: Sequence[Any]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_timing(record)
+
+    def add_event(self, event: Mapping[str, Any]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_event(event)
+
+    def add_clock(self, samples: NDArray[np.void]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_clock(samples)
+
+    def flush_decisions(self) -> None:
+        """See `Recorder`."""
+        self.open_part.flush_decisions()
+
+    def flush(self) -> None:
+        """See `Recorder`."""
+        self.open_part.flush()
+
+    def close(self, summary: Mapping[str, Any]) -> str:
+        """Close the last part with `summary`, wait for the others, write the index; return the hash over all logs (`chained`)."""
+        facts = self._facts(self.open_part, self.open_part.close(summary))
+        self.keeper.settle(facts)
+        self.keeper.close()
+        return facts.chain_sha256
+
+    # -- parts ---------------------------------------------------------------------------------------------------------
+
+    @property
+    def open_path(self) -> Path:
+        """The part that is being written."""
+        return part_path(self.path, self.parts)
+
+    @property
+    def wants_part(self) -> bool:
+        """Whether the open part is full and the next one is ready to be written."""
+        return self.open_part.size_bytes >= self.limits.rotate_bytes and not self.keeper.ready.empty()
+
+    def next_part(self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int) -> None:
+        """Go on in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
+        made, full = self.keeper.ready.get_nowait(), self.open_part
+        full.flush()
+        facts = self._facts(full, full.written[1])
+        self._first_decision, self._chain = facts.first_decision + facts.decisions, facts.chain_sha256
+        made.path = made.path.rename(part_path(self.path, self.parts + 1))
+        self.open_part = made
+        self._begin(place, commands, host_ns, facts)
+        full.watch_write = None  # from here on it is written by the keeper, which delays nobody
+        self.keeper.finish(full, facts, self.open_path)
+
+    def _begin(
+        self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int = 0, before: PartFacts | None = None
+    ) -> None:
+        self.parts += 1
+        part = self.open_part
+        part.watch_write = self._told
+        part.add_event(
+            {
+                "kind": PART_EVENT,
+                "number": self.parts,
+                "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                "first_decision": self._first_decision,
+                "before": None if before is None else asdict(before),
+                "place": dict(place),
+            }
+        )
+        for data in commands:
+            part.add_command(host_ns, data)
+        part.flush()
+        self.keeper.prepare(self.parts + 1)
+
+    def _told(self, began_ns: int, ended_ns: int) -> None:
+        if self.watch_write is not None:
+            self.watch_write(began_ns, ended_ns)
+
+    def _facts(self, part: Recorder, digest: str) -> PartFacts:
+        decisions = part.written[0]
+        chain = chained(self._chain, digest)
+        return PartFacts(self.open_path.name, part.size_bytes, self._first_decision, decisions, digest, chain)
