@@ -1,21 +1,16 @@
 """Many simulated calibrations against their truths: how often do the 95 % intervals cover, and how far off is the photon level?
 
-    python -m pans.firmware_sim.trials.calibration [--trials 2000] [--case NAME] [--seed 1] [--json]
-
 Owns the simulated instruments: brightness and dark rate differ from the profile's by random factors, clicks are drawn exposure
 by exposure by the simulator's kernels (SIMULATED; afterpulsing, crosstalk, dead time and read noise as the profile says), and
 counted and estimated by the code behind `pans calibrate`. Cases without a profile have so few clicks that Wald's interval would
-fail. Exit code 1 when an interval of a photon level covers less than 94 % or more than 96 %.
+fail. It fails when an interval of a photon level covers less than 94 % or more than 96 %.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +33,8 @@ from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probabi
 from pans.runtime.instrument.estimate import CountModel, Counts, Interval, fit_light
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
+
+from . import Report, Trial, option, rows_report
 
 COVER = (0.94, 0.96)
 BLOCK = 1 << 16
@@ -149,29 +146,20 @@ def case_row(name: str, trials: int, seed: int) -> dict[str, Any]:
     }
 
 
-def main() -> int:
-    """Run all cases from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.calibration", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--trials", type=int, default=2000, help="simulated calibrations per case (default 2000)")
-    parser.add_argument("--case", choices=sorted(CASES), help="one case only")
-    parser.add_argument("--seed", type=int, default=1, help="of all instruments and clicks (default 1)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args()
-    rows = [case_row(name, args.trials, args.seed) for name in ([args.case] if args.case else CASES)]
-    if args.json:
-        print(json.dumps({"rows": rows, "seed": args.seed, "simulated": True}))
-    else:
-        print("SIMULATED")
-        for row in rows:
-            print(
-                "  ".join(
-                    f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
-                )
-            )
-    return 0 if all(row["fine"] for row in rows) else 1
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How many calibrations of which cases."""
+
+    trials: int = option(2000, "simulated calibrations per case (default 2000)")
+    case: str | None = option(None, "one case only", choices=sorted(CASES))
+    seed: int = option(1, "of all instruments and clicks (default 1)")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def run(settings: Settings) -> Report:
+    """Run all cases, or one."""
+    names = [settings.case] if settings.case else list(CASES)
+    rows = [case_row(name, settings.trials, settings.seed) for name in names]
+    return rows_report(rows, all(row["fine"] for row in rows), seed=settings.seed, simulated=True)
+
+
+TRIAL = Trial(Settings, run)

@@ -1,8 +1,7 @@
-"""The processes of blamerun.py: an instrument with a script of faults, a host that disturbs itself, a hog that takes its core.
+"""The processes of causes.py: an instrument with a script of faults, a host that disturbs itself, and a hog that takes its core.
 
-Owns what each does when the script says so; never compares. Started by blamerun.py as
-`python -m pans.firmware_sim.trials.cause_processes ROLE ...`;
-each says one JSON line when it is ready and reads the start time (time.perf_counter_ns, common to all processes) from its input.
+Owns the script's form and what each process does when it is time; never compares. Each runs as a `Child` with its role as the first
+word, says one JSON object when it is ready and reads the start time (time.perf_counter_ns, common to all processes) from its input.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pans.firmware_sim.ports.faulty import FaultyDevice, Schedule
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
@@ -36,16 +35,26 @@ from pans.runtime.live.loop import run_live
 from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record import Recorder
 
-from .causes import HOG_PRIORITY, HOST_CORE, INSTRUMENT_CORE, Injection
+from .processes import say, sleep_until
 
+HOST_CORE, INSTRUMENT_CORE = 0, 1
+HOG_PRIORITY = 60  # above all that runs here but the process that keeps the script
 EXPOSURE_US = 250.0
 DEADLINE_US = 10_000.0
-HEAP_OBJECTS = 1_500_000
-PIPE_BYTES = 4096
-F_SETPIPE_SZ = 1031
+HEAP_OBJECTS = 1_500_000  # a collection over them takes tens of milliseconds, as long as the other causes
+PIPE_BYTES = 4096  # one page, the least that Linux gives
 AFTER_S = 1.0
 DISK_PRIORITY = 15  # the host's loop has 10
 NEVER = 1 << 62
+
+
+class Injection(NamedTuple):
+    """One cause: begins `at_ns` after the start and lasts `length_ns`; `variant` counts within its kind."""
+
+    kind: str
+    at_ns: int
+    length_ns: int
+    variant: int
 
 
 def setup() -> tuple[Profile, Bundle, Plan]:
@@ -56,12 +65,18 @@ def setup() -> tuple[Profile, Bundle, Plan]:
 
 
 def read_script(path: str) -> list[Injection]:
-    """Return the script that blamerun.py has written."""
+    """Return the script that causes.py has written."""
     return [Injection(*entry) for entry in json.loads(Path(path).read_text())]
 
 
+def _spin(length_ns: int) -> None:
+    until = time.perf_counter_ns() + length_ns
+    while time.perf_counter_ns() < until:
+        pass
+
+
 def _ready(**facts: Any) -> int:
-    print(json.dumps(facts), flush=True)
+    say(**facts)
     return int(sys.stdin.readline())
 
 
@@ -92,7 +107,7 @@ def instrument(script_path: str, listen: str, seed: str) -> None:
     assert isinstance(device, FaultyDevice)
     device._schedules.clear()
     port = open_port(listen)
-    print(json.dumps({"url": port.url}), flush=True)
+    say(url=port.url)
     started: list[bool] = []
 
     def stopped() -> bool:
@@ -127,7 +142,7 @@ class PipedFile:
 
         self._file = file
         reader, self._writer = os.pipe()
-        fcntl.fcntl(self._writer, F_SETPIPE_SZ, PIPE_BYTES)
+        fcntl.fcntl(self._writer, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self.process = subprocess.Popen(["cat"], stdin=reader, stdout=file.fileno())
         os.close(reader)
         # A disk needs no processor: whoever stands in for one must not wait for it.
@@ -169,9 +184,7 @@ class Disturber:
         if due is not None and due.variant % 2:
             time.sleep(due.length_ns * 1e-9)
         elif due is not None:
-            until = time.perf_counter_ns() + due.length_ns
-            while time.perf_counter_ns() < until:
-                pass
+            _spin(due.length_ns)
         return self._decider.decide(counts, shots)
 
     def watch(self, run: LiveRun, output: Output) -> None:
@@ -207,15 +220,14 @@ def host(url: str, script_path: str, recording: str) -> None:
             open_link(url), profile, bundle, plan, core, config, recorder, observers=Observers(disturber.watch, prepared)
         )  # fmt: skip
         recorder.close({})
-    words = {
-        "decisions": result.tally.decisions,
-        "late": result.timing.late,
-        "late_cause": result.late_cause,
-        "lost": result.stream["lost_exposures"],
-        "ended": result.ended,
-        "granted": result.realtime,
-    }
-    print(json.dumps(words), flush=True)
+    say(
+        decisions=result.tally.decisions,
+        late=result.timing.late,
+        late_cause=result.late_cause,
+        lost=result.stream["lost_exposures"],
+        ended=result.ended,
+        granted=result.realtime,
+    )
 
 
 # ---- the hog ----
@@ -228,10 +240,8 @@ def hog(script_path: str) -> None:
     spans = [one for one in read_script(script_path) if one.kind == "host" and one.variant % 2 == 0]
     start_ns = _ready()
     for one in spans:
-        time.sleep(max(0.0, (start_ns + one.at_ns - time.perf_counter_ns()) * 1e-9))
-        until = time.perf_counter_ns() + one.length_ns
-        while time.perf_counter_ns() < until:
-            pass
+        sleep_until(start_ns + one.at_ns)
+        _spin(one.length_ns)
 
 
 if __name__ == "__main__":

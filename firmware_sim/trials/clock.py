@@ -1,25 +1,31 @@
 """The clock model against crystals and links that are known exactly: how often does the true error exceed the published uncertainty?
 
-    python -m pans.firmware_sim.trials.clock [--seconds 600] [--json]
-
 Owns the simulated crystals (drift, random wander, a sinusoid as of a room that warms and cools) and links (delay, asymmetry, exponential
-jitter, rare long queues); never reads a clock. Exit code 1 when fewer than 99.9 % of the conversions were within their uncertainty.
+jitter, rare long queues); never reads a clock. It fails when fewer than 99.9 % of the
+conversions were within their uncertainty.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pans.runtime.timing.clock import ClockModel
 
+from . import Report, Trial, option, rows_report
+
 TICK_HZ = 10_000_000
 PROBE_EVERY_NS = 97_000_000
 REQUIRED = 0.999
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How long to run."""
+
+    seconds: float = option(600.0, "of each case (default 600)")
 
 
 class ClockCase(NamedTuple):
@@ -95,26 +101,10 @@ def run_clock_case(case: ClockCase, seconds: float, seed: int) -> dict[str, Any]
     }
 
 
-def main() -> int:
-    """Run all cases from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.clock", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--seconds", type=float, default=600.0, help="of each case (default 600)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args()
-    rows = [run_clock_case(case, args.seconds, seed) for seed, case in enumerate(CASES)]
-    if args.json:
-        print(json.dumps({"rows": rows}))
-    else:
-        for row in rows:
-            print(
-                "  ".join(
-                    f"{key} {value:.5g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
-                )
-            )
-    return 0 if all(row["within"] >= REQUIRED and row["steps"] == 0 for row in rows) else 1
+def run(settings: Settings) -> Report:
+    """Run all cases."""
+    rows = [run_clock_case(case, settings.seconds, seed) for seed, case in enumerate(CASES)]
+    return rows_report(rows, all(row["within"] >= REQUIRED and row["steps"] == 0 for row in rows))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Settings, run)

@@ -1,18 +1,14 @@
 """The dark-count watch against a simulated detector: false alarms, delay to a doubled rate, and what an estimated rate costs.
 
-    python -m pans.firmware_sim.trials.dark_counts [--exposures 100000000] [--changes 2000] [--seed 1] [--json]
-
 Owns the measurement; the clicks are drawn by the simulator's own generator (SIMULATED), the watch is the runtime's, exposure by
 exposure. The optimum beside the delay is exact: the mean delay, from the worst state, of the CUSUM that knows both rates and
-has the same false-alarm rate (no test has a shorter one: Moustakides 1986). Exit code 1 when a bar is missed: false alarms
+has the same false-alarm rate (no test has a shorter one: Moustakides 1986). It fails when a bar is missed: false alarms
 within a factor 1.5 of the stated rate, delay at most 1.25 times the optimum.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +19,8 @@ from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.cusum_design import design_cusum
 from pans.runtime.intervals import wilson_interval
+
+from . import Report, Trial, option, rows_report
 
 BATCH = 1 << 20
 FACTOR, DELAY_FACTOR = 1.5, 1.25
@@ -165,35 +163,26 @@ def estimate_rows(case: DarkCase, clicks: int, exposures: int, changes: int, see
     return rows
 
 
-def main() -> int:
-    """Run all cases from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.dark_counts", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--exposures", type=int, default=100_000_000, help="dark exposures per row of false alarms")
-    parser.add_argument("--changes", type=int, default=2000, help="changes per row of delays (default 2000)")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulated detector (default 1)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args()
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much to draw."""
+
+    exposures: int = option(100_000_000, "dark exposures per row of false alarms")
+    changes: int = option(2000, "changes per row of delays (default 2000)")
+    seed: int = option(1, "of the simulated detector (default 1)")
+
+
+def run(settings: Settings) -> Report:
+    """Run all cases."""
     rows: list[dict[str, Any]] = []
+    exposures, changes, seed = settings.exposures, settings.changes, settings.seed
     for case in CASES:
-        rows.append(false_alarm_row(case, args.exposures, args.seed))
-        rows += delay_rows(case, args.changes if case.channels == 1 else args.changes // 10, args.seed)
+        rows.append(false_alarm_row(case, exposures, seed))
+        rows += delay_rows(case, changes if case.channels == 1 else changes // 10, seed)
         if case.channels == 1:
             for clicks in ESTIMATES:
-                rows += estimate_rows(case, clicks, args.exposures, args.changes // 4, args.seed)
-    if args.json:
-        print(json.dumps({"rows": rows, "seed": args.seed, "simulated": True}))
-    else:
-        print("SIMULATED\n" + "\n".join(_line(row) for row in rows))
-    return 0 if all(row.get("fine", True) for row in rows) else 1
+                rows += estimate_rows(case, clicks, exposures, changes // 4, seed)
+    return rows_report(rows, all(row.get("fine", True) for row in rows), seed=seed, simulated=True)
 
 
-def _line(row: dict[str, Any]) -> str:
-    return "  ".join(
-        f"{key} {value:.5g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
-    )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Settings, run)

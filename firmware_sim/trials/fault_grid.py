@@ -1,17 +1,12 @@
 """The fault grid: whole runs in virtual time under every fault, judged by the checkers (checkers.py).
 
-    python -m pans.firmware_sim.trials.fault_grid [--frames 10000000] [--seeds 20] [--jobs 2] [--faults loss,all] [--json]
-
 Owns the choice of runs and their report; the host in them is the real one (`run_live`). Each fault runs alone and all together, with
-each seed; even seeds measure sequentially, odd ones in parallel. A failure prints the command that repeats it. Exit code 1 then.
+each seed; even seeds measure sequentially, odd ones in parallel. A failure prints the command that repeats it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -28,6 +23,7 @@ from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
+from pans.runtime.cli import say
 from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
@@ -38,6 +34,7 @@ from pans.runtime.live.reconnect import Recovery
 from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.wire.commands import Gate
 
+from . import Report, Trial, option, row_text
 from .checkers import Checker, WatchedInstrument
 
 SHOTS = 1
@@ -56,6 +53,17 @@ GRID_ALL = (
     "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"
 )
 MEMORY_SLACK_KB = 16_384
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much of the grid to run."""
+
+    frames: int = option(10_000_000, "stream messages in all (default ten million)")
+    seeds: int = option(20, "seeds per case (default 20)")
+    seed: int | None = option(None, "this seed only", type=int)
+    jobs: int = option(os.cpu_count() or 1, "processes (default: one per core)")
+    faults: str = option(",".join(CASES), f"cases, of {', '.join(CASES)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +212,7 @@ def resident_kb() -> int:
 
 
 def run_grid(cases: Sequence[str], seeds: int, frames: int, jobs: int) -> list[GridResult]:
-    """Run every case with every seed, about `frames` messages in all, on `jobs` processes; report each on stderr."""
+    """Run every case with every seed, about `frames` messages in all, on `jobs` processes; report each failure on stderr."""
     work = [(case, seed) for seed in range(seeds) for case in cases]
     each = -(-frames // len(work))
     results = []
@@ -212,75 +220,50 @@ def run_grid(cases: Sequence[str], seeds: int, frames: int, jobs: int) -> list[G
         for result in pool.map(run_case, *zip(*work), [each] * len(work)):
             results.append(result)
             if result.violations:
-                again = f"python -m pans.firmware_sim.trials.fault_grid --faults {result.case} --seed {result.seed} --frames {each}"
-                print(
-                    f"FAILED {result.case} seed {result.seed}: {result.violations[0]}\n  again: {again}",
-                    file=sys.stderr,
-                )
+                again = f"pans trials fault-grid --faults {result.case} --seed {result.seed} --frames {each}"
+                say(f"FAILED {result.case} seed {result.seed}: {result.violations[0]}\n  again: {again}")
     return results
 
 
-def table(results: Sequence[GridResult]) -> list[dict[str, Any]]:
-    """Add up the runs of each case."""
-    rows = []
-    for case in dict.fromkeys(result.case for result in results):
-        runs = [result for result in results if result.case == case]
-        checked = {key: sum(run.checked[key] for run in runs) for key in runs[0].checked}
-        rows.append(
-            {
-                "name": case,
-                "runs": len(runs),
-                "frames": sum(run.frames for run in runs),
-                "delivered": checked["blocks_delivered"],
-                "reported_lost": checked["blocks_lost"] + checked["blocks_lost_open_end"],
-                "decisions": checked["decisions"],
-                "flagged": checked["decisions_flagged"],
-                "gates_executed": checked["gates_executed"],
-                "gates_refused": checked["gates_refused"],
-                "reconnects": sum(run.reconnects for run in runs),
-                "memory_kb_max": max(run.memory_kb for run in runs),
-                "virtual_s": round(sum(run.virtual_s for run in runs)),
-                "violations": sum(len(run.violations) for run in runs),
-            }
-        )
-    return rows
+def case_row(case: str, runs: Sequence[GridResult]) -> dict[str, Any]:
+    """Add up the runs of one case."""
+
+    def total(key: str) -> int:
+        return sum(run.checked[key] for run in runs)
+
+    return {
+        "name": case,
+        "runs": len(runs),
+        "frames": sum(run.frames for run in runs),
+        "delivered": total("blocks_delivered"),
+        "reported_lost": total("blocks_lost") + total("blocks_lost_open_end"),
+        "decisions": total("decisions"),
+        "flagged": total("decisions_flagged"),
+        "gates_executed": total("gates_executed"),
+        "gates_refused": total("gates_refused"),
+        "reconnects": sum(run.reconnects for run in runs),
+        "memory_kb_max": max(run.memory_kb for run in runs),
+        "virtual_s": round(sum(run.virtual_s for run in runs)),
+        "violations": sum(len(run.violations) for run in runs),
+    }
 
 
-def main() -> int:
-    """Run the grid from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.fault_grid", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--frames", type=int, default=10_000_000, help="stream messages in all (default ten million)")
-    parser.add_argument("--seeds", type=int, default=20, help="seeds per case (default 20)")
-    parser.add_argument("--seed", type=int, help="this seed only")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
-    parser.add_argument("--faults", default=",".join(CASES), help=f"cases, of {', '.join(CASES)}")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args()
+def run(settings: Settings) -> Report:
+    """Run the grid, or one seed of it in this process."""
     started = time.perf_counter()
-    cases = args.faults.split(",")
-    if args.seed is not None:
-        results = [run_case(case, args.seed, args.frames) for case in cases]
+    cases = settings.faults.split(",")
+    if settings.seed is not None:
+        results = [run_case(case, settings.seed, settings.frames) for case in cases]
     else:
-        results = run_grid(cases, args.seeds, args.frames, args.jobs)
-    rows = table(results)
-    failures = [asdict(result) for result in results if result.violations]
-    total = sum(result.frames for result in results)
-    if args.json:
-        print(
-            json.dumps({"frames": total, "seconds": time.perf_counter() - started, "rows": rows, "failures": failures})
-        )
-    else:
-        for row in rows:
-            print("  ".join(f"{key} {value}" for key, value in row.items()))
-        for failure in failures:
-            print(f"FAILED {failure['case']} seed {failure['seed']}: " + "; ".join(failure["violations"]))
-        print(
-            f"{total} frames in {time.perf_counter() - started:.0f} s: {'FAILED' if failures else 'nothing was found'}"
-        )
-    return 1 if failures else 0
+        results = run_grid(cases, settings.seeds, settings.frames, settings.jobs)
+    rows = [case_row(case, [one for one in results if one.case == case]) for case in dict.fromkeys(cases)]
+    failures = [result for result in results if result.violations]
+    total, seconds = sum(result.frames for result in results), time.perf_counter() - started
+    words = [row_text(row) for row in rows]
+    words += [f"FAILED {one.case} seed {one.seed}: " + "; ".join(one.violations) for one in failures]
+    words.append(f"{total} frames in {seconds:.0f} s: {'FAILED' if failures else 'nothing was found'}")
+    figures = {"frames": total, "seconds": seconds, "rows": rows, "failures": [asdict(one) for one in failures]}
+    return Report(figures, not failures, "\n".join(words))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Settings, run)

@@ -1,10 +1,9 @@
-"""Cells in flow at real pace, watched by canaries: every late decision with its cause, and whether the machine was there at all.
+"""Cells in flow at real pace, watched by scheduling probes: every late decision with its cause, and whether the cores were there at all.
 
-    python -m pans.firmware_sim.trials.flow --bundle cells.pans --scene cells.toml --flow flow.toml [--seconds 600] [--gate-class NAME] ...
-
-Owns the processes, what they are asked and the report; which gap explains which decision is flowcause.py's, the gaps are canary.py's. Host
-and instrument are the ordinary programs (`pans run`, `pans simulate`) at real pace, SIMULATED light. Linux, with the right to SCHED_FIFO.
-Exit code 1 when a bar is missed: too many late, missed or doubled decisions, or a late one that the machine's gaps do not explain.
+Owns the processes, what they are asked and the report; which gap explains which decision is flow_attribution.py's. Host and instrument
+are the ordinary programs (`pans run`, `pans simulate`) at real pace, SIMULATED light; each core has a probe, which notes each time when
+it woke later than its period. Linux, with the right to SCHED_FIFO. It fails when a bar is missed: too many late, missed or doubled
+decisions, or a late one that the machine's gaps do not explain.
 """
 
 from __future__ import annotations
@@ -13,37 +12,39 @@ import argparse
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pans.runtime.errors import PansError
+from pans.runtime.cli import say
+from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record import read_recording
 
-from .flow_causes import (
+from . import Report, Trial, option
+from .flow_attribution import (
     MACHINE,
     OURS,
     PARTLY,
     LateDecision,
     attribute,
     gap_figures,
+    late_entry,
     late_table,
-    told,
     verdict_of,
     worked_off,
 )
-from .scheduling_probe import EVERY_US, Canary, Watched
+from .processes import has_real_time, processor_s, real_time_programs, start_command, stolen_s, tail
+from .scheduling_probe import EVERY_US, ProbeLog, SchedulingProbe
 
 BARS = {"late": 1e-4, "missed": 0.005, "doubled": 0.001}
 TOLD = 200  # late decisions that the machine does not explain, in the report; all of them are in the recording
 LONGER_S = 120.0
 LATE_EXIT = 4  # of `pans run`: finished, with late or lost work
 PROGRESS_S = 10.0
-KERNEL_PARENT = 2  # kthreadd
 KEPT = (
     "decisions", "accuracy", "accuracy_ci", "missed", "missed_ci", "doubled", "doubled_ci", "purity", "yield",
     "clicks_mean", "photons_mean", "aborted", "gates", "passages", "latency_us", "late", "late_blame", "late_cause",
@@ -51,69 +52,86 @@ KEPT = (
 )  # fmt: skip
 
 
-class Job(NamedTuple):
+def _cores(text: str) -> tuple[int, int] | None:
+    if text == "none":
+        return None
+    host, simulator = (int(core) for core in text.split(","))
+    if not {host, simulator} <= os.sched_getaffinity(0):
+        raise argparse.ArgumentTypeError(f"{text}: this process may use the cores {sorted(os.sched_getaffinity(0))}")
+    return host, simulator
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
     """What to run: as the options of the two programs; `pin` the cores of host and instrument, None to leave them free."""
 
-    bundle: Path
-    profile: str
-    scene: str
-    flow: str
-    seconds: float
-    seed: int
-    link: str
-    gate_classes: tuple[str, ...] = ()
-    deadline_us: float = 0.0
-    pin: tuple[int, int] | None = (0, 1)
-    more: tuple[str, ...] = ()  # further words for `pans run`
-    canary_us: int = EVERY_US  # how often the canaries wake, and how late they must be to note it
-    awake: bool = False  # bind the loops alone, and keep their cores awake
+    bundle: Path = option(MISSING, "a bundle trained for the profile and the scene", type=Path)  # noqa: RUF009
+    profile: str = option("wdm-snspd", "hardware profile (default wdm-snspd)")
+    scene: str = option("cells-in-flow", "what passes by (default: the shipped cells-in-flow)")
+    flow: str = option("cells", "settings of the flow: cells or a TOML file (default cells)")
+    seconds: float = option(600.0, "of instrument time, which is real time (default 600)")
+    seed: int = option(5, "of the simulated instrument (default 5)")
+    link: str = option("tcp", "between the two (default tcp)", choices=("tcp", "pty"))
+    gate_classes: tuple[str, ...] = option(
+        (), "to pulse for (repeatable, or a,b)", flag="--gate-class", action="append", metavar="NAME"
+    )
+    deadline_us: float = option(0.0, "from leaving to the decision (default: the profile's)")
+    pin: tuple[int, int] | None = option(
+        (0, 1), "cores of the two, or none (default 0,1)", type=_cores, metavar="HOST,SIM"
+    )
+    more: tuple[str, ...] = option((), "after --: further words for `pans run`", flag="more", nargs="*")
+    canary_us: int = option(EVERY_US, f"period of the scheduling probes, and how late is a gap (default {EVERY_US})")
+    awake: bool = option(
+        False, "bind the two loops alone to their cores, and keep these awake (--core)", action="store_true"
+    )
+    folder: Path | None = option(None, "where to leave recording and summary (default: nowhere)", type=Path)  # noqa: RUF009
 
 
 class Outcome(NamedTuple):
-    """What came of a job: the summary of `pans run`, its recording, what the canaries saw, processor time per second of the two."""
+    """What came of a job: the summary of `pans run`, its recording, what the probes saw, processor time per second of the two."""
 
     summary: dict[str, Any]
     recording: Path
-    watched: tuple[Watched, ...]
+    logs: tuple[ProbeLog, ...]
     busy: dict[str, float]
-    stolen_s: dict[int, float]  # by core, as the hypervisor tells in /proc/stat, while the canaries were there
+    stolen_s: dict[int, float]  # by core, as the hypervisor tells in /proc/stat, while the probes were there
     others: tuple[str, ...]  # further programs of real-time priority on this computer: then it was not quiet
 
 
 def carry_out(job: Job, folder: Path) -> Outcome:
-    """Run host, instrument and a canary per core to their ends; RuntimeError when one of them fails."""
+    """Run host, instrument and a probe per core to their ends; RuntimeError when one of them fails."""
     cores = sorted(os.sched_getaffinity(0) if job.pin is None else set(job.pin))
-    canaries: list[Canary] = []
-    simulator = _start(
+    probes: list[SchedulingProbe] = []
+    simulator = start_command(
         ["simulate", "--profile", job.profile, "--scene", job.scene, "--seed", str(job.seed), "--until-stdin-closes",
          "--listen", "pty" if job.link == "pty" else "tcp:127.0.0.1:0", *_awake_on(job, 1)],
-        _bound_to(job, 1),
         folder / "simulator.txt",
+        _bound_to(job, 1),
     )  # fmt: skip
     host: subprocess.Popen[str] | None = None
     try:
         assert simulator.stdout is not None
         url = simulator.stdout.readline().strip()
         if not url:
-            raise RuntimeError(f"the simulator ended with {simulator.wait()}: {_tail(folder / 'simulator.txt')}")
-        canaries = [Canary(core, every_us=job.canary_us, late_us=job.canary_us) for core in cores]
-        stolen_s = _stolen_s(cores)
+            raise RuntimeError(f"the simulator ended with {simulator.wait()}: {tail(folder / 'simulator.txt')}")
+        probes = [SchedulingProbe(core, every_us=job.canary_us) for core in cores]
+        stolen_before = stolen_s(cores)
         words = ["run", str(job.bundle), "--device", url, "--profile", job.profile, "--flow", job.flow]
         words += ["--seconds", str(job.seconds), "--out", str(folder / "out"), "--json"]
         words += [word for name in job.gate_classes for word in ("--gate-class", name)]
         words += ["--deadline-us", str(job.deadline_us)] if job.deadline_us else []
-        host = _start([*words, *_awake_on(job, 0), *job.more], _bound_to(job, 0), folder / "host.txt")
-        busy, others = _wait(host, simulator, job.seconds, {canary.process.pid for canary in canaries})
+        host = start_command([*words, *_awake_on(job, 0), *job.more], folder / "host.txt", _bound_to(job, 0))
+        busy, others = _wait(host, simulator, job.seconds, {probe.pid for probe in probes})
         out, _ = host.communicate()
         if host.returncode not in (0, LATE_EXIT):
-            raise RuntimeError(f"the host ended with {host.returncode}: {_tail(folder / 'host.txt')}")
-        stolen_s = {core: since - stolen_s[core] for core, since in _stolen_s(cores).items()}
-        watched = tuple(canary.end() for canary in canaries)
+            raise RuntimeError(f"the host ended with {host.returncode}: {tail(folder / 'host.txt')}")
+        stolen = {core: since - stolen_before[core] for core, since in stolen_s(cores).items()}
+        logs = tuple(probe.end() for probe in probes)
         summary = json.loads(out)
-        return Outcome(summary, Path(summary["recording"]), watched, busy, stolen_s, others)
+        return Outcome(summary, Path(summary["recording"]), logs, busy, stolen, others)
     finally:
-        for canary in canaries:
-            canary.kill()
+        for probe in probes:
+            probe.kill()
         for process in (host, simulator):
             if process is not None:
                 process.kill()
@@ -130,24 +148,8 @@ def _bound_to(job: Job, which: int) -> int | None:
     return None if job.awake or job.pin is None else job.pin[which]
 
 
-def _start(words: list[str], core: int | None, errors: Path) -> subprocess.Popen[str]:
-    """Start a command of the package, on a core of its own if one is named."""
-    pinned = "" if core is None else f"import os; os.sched_setaffinity(0, {{{core}}}); "
-    command = f"{pinned}import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with errors.open("wb") as file:
-        return subprocess.Popen(
-            [sys.executable, "-c", command, *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=file,
-            env=environment,
-            text=True,
-        )
-
-
 def _wait(
-    host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds: float, canaries: set[int]
+    host: subprocess.Popen[str], simulator: subprocess.Popen[str], seconds: float, probes: set[int]
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Wait for the host's end; return what `Outcome` calls `busy`, between a fifth of the run and its end, and `others`."""
     others: set[str] = set()
@@ -158,12 +160,12 @@ def _wait(
         if elapsed > seconds + LONGER_S:
             raise RuntimeError(f"the host did not end within {elapsed:.0f} s")
         try:
-            samples.append((elapsed, _processor_s(host.pid), _processor_s(simulator.pid)))
+            samples.append((elapsed, processor_s(host.pid), processor_s(simulator.pid)))
         except OSError:  # it has just ended
             break
-        others |= real_time_programs(canaries | {host.pid, simulator.pid})
+        others |= real_time_programs(probes | {host.pid, simulator.pid})
         if len(samples) % round(PROGRESS_S) == 0:
-            print(f"{elapsed:6.0f} s", file=sys.stderr, flush=True)
+            say(f"{elapsed:6.0f} s")
         time.sleep(min(1.0, max(seconds / 10, 0.05)))
     host.wait()
     last = samples[-2] if len(samples) > 1 else samples[-1]
@@ -171,36 +173,6 @@ def _wait(
     lasted = max(last[0] - first[0], 1e-9)
     busy = {"host": (last[1] - first[1]) / lasted, "simulator": (last[2] - first[2]) / lasted}
     return busy, tuple(sorted(others))
-
-
-def _processor_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def real_time_programs(known: set[int]) -> set[str]:
-    """Return the programs of real-time priority now, but for those of the pids `known` and for threads of the kernel: "name (priority)"."""
-    found = set()
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            name, _, rest = path.read_text().partition("(")[2].rpartition(")")
-        except OSError:  # it has just ended
-            continue
-        fields = rest.split()
-        parent, priority = int(fields[1]), int(fields[37])
-        if priority and parent not in (0, KERNEL_PARENT) and int(path.parent.name) not in known:
-            found.add(f"{name} ({priority})")
-    return found
-
-
-def _stolen_s(cores: list[int]) -> dict[int, float]:
-    lines = [line.split() for line in Path("/proc/stat").read_text().splitlines() if line.startswith("cpu")]
-    ticks = {line[0]: int(line[8]) for line in lines}
-    return {core: ticks[f"cpu{core}"] / os.sysconf("SC_CLK_TCK") for core in cores}
-
-
-def _tail(path: Path) -> str:
-    return path.read_text(errors="replace")[-500:].strip()
 
 
 # ---- what came of it ----
@@ -212,18 +184,19 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
     timings, events = recording.timings(), list(recording.events())
     late_numbers = [int(event["decision"]) for event in events if event["kind"] == "late"]
     verdicts = [event for event in events if event["kind"] == "blame" and event["what"] == "late"]
-    gaps = [gap for watched in outcome.watched for gap in watched.gaps]
+    gaps = [gap for log in outcome.logs for gap in log.gaps]
     deadline_us = job.deadline_us or load_profile(job.profile).timing.decision_deadline_us
     found = attribute(timings, late_numbers, gaps, round(deadline_us * 1000))
     whose = Counter(late.whose for late in found)
     begin_ns = int(timings["device_end_ns"][0]) if len(timings) else 0
     end_ns = int(timings["decided_ns"][-1]) if len(timings) else 1
-    entries = [told(late, verdict_of(late.number, verdicts)) for late in found]
+    entries = [late_entry(late, verdict_of(late.number, verdicts)) for late in found]
     unexplained = [entry for entry in entries if entry["whose"] != MACHINE]
+    facts = {key: value for key, value in asdict(job).items() if key != "folder"}
     summary = {key: outcome.summary[key] for key in KEPT if key in outcome.summary}
     result = {
         "simulated": True,
-        "job": {key: str(value) if isinstance(value, Path) else value for key, value in job._asdict().items()},
+        "job": {key: str(value) if isinstance(value, Path) else value for key, value in facts.items()},
         "deadline_us": deadline_us,
         "seconds": (end_ns - begin_ns) / 1e9,
         "decisions": len(timings),
@@ -235,8 +208,8 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
         "machine_queued": sum(late.queued for late in found if late.whose == MACHINE),
         "named": late_table(found, verdicts),
         "gaps": [
-            gap_figures(watched, begin_ns, end_ns) | {"stolen_ms": 1000 * outcome.stolen_s[watched.core]}
-            for watched in outcome.watched
+            gap_figures(log, begin_ns, end_ns) | {"stolen_ms": 1000 * outcome.stolen_s[log.core]}
+            for log in outcome.logs
         ],
         "busy": outcome.busy,
         "other_real_time_programs": list(outcome.others),
@@ -287,7 +260,7 @@ def show(result: dict[str, Any]) -> str:
         lines.append(
             f"core {gaps['core']} away per second: {rates}; largest {gaps['largest_ms']:.2f} ms, in all {gaps['away_ms']:.0f} ms "
             f"({gaps['queued_ms']:.0f} ms of it running something else; stolen by the hypervisor's own count {gaps['stolen_ms']:.0f} ms); "
-            f"its canary took {gaps['canary_share_of_core']:.1%}"
+            f"its probe took {gaps['canary_share_of_core']:.1%}"
         )
     lines += [
         f"{key}: {run[key]}" for key in ("accuracy", "missed", "doubled", "purity", "yield", "gates") if key in run
@@ -302,70 +275,17 @@ def show(result: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"BROKEN: {text}" for text in result["broken"])])
 
 
-def main() -> int:
-    """Run and judge from the command line."""
-    args = _parser().parse_args()
-    if not hasattr(os, "sched_setscheduler") or len(os.sched_getaffinity(0)) < 2:
-        print("this needs Linux and two cores: one each for host and instrument", file=sys.stderr)
-        return 2
-    classes = tuple(name for names in args.gate_class for name in names.split(","))
+def run(job: Job) -> Report:
+    """Run and judge."""
+    if not has_real_time():
+        raise UsageError("this needs Linux and two cores: one each for host and instrument")
+    classes = tuple(name for names in job.gate_classes for name in names.split(","))
     with tempfile.TemporaryDirectory() as scratch:
-        folder = args.folder or Path(scratch)
+        folder = job.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
-        job = Job(
-            args.bundle, args.profile, args.scene, args.flow, args.seconds, args.seed, args.link,
-            classes, args.deadline_us, args.pin, tuple(args.more), args.canary_us, args.awake,
-        )  # fmt: skip
-        try:
-            result = report(job, carry_out(job, folder))
-        except (PansError, RuntimeError) as error:
-            print(f"flowrun: {error}", file=sys.stderr)
-            return 2
-    if args.json:
-        args.json.write_text(json.dumps(result) + "\n")
-    print(show(result))
-    return 1 if result["broken"] else 0
+        job = replace(job, gate_classes=classes, more=tuple(job.more))
+        figures = report(job, carry_out(job, folder))
+    return Report(figures, not figures["broken"], show(figures))
 
 
-def _cores(text: str) -> tuple[int, int] | None:
-    if text == "none":
-        return None
-    host, simulator = (int(core) for core in text.split(","))
-    if not {host, simulator} <= os.sched_getaffinity(0):
-        raise argparse.ArgumentTypeError(f"{text}: this process may use the cores {sorted(os.sched_getaffinity(0))}")
-    return host, simulator
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m pans.firmware_sim.trials.flow", description=__doc__.split("\n")[0])
-    parser.add_argument("--bundle", type=Path, required=True, help="a bundle trained for the profile and the scene")
-    parser.add_argument("--profile", default="wdm-snspd", help="hardware profile (default wdm-snspd)")
-    parser.add_argument("--scene", default="cells-in-flow", help="what passes by (default: the shipped cells-in-flow)")
-    parser.add_argument("--flow", default="cells", help="settings of the flow: cells or a TOML file (default cells)")
-    parser.add_argument(
-        "--seconds", type=float, default=600.0, help="of instrument time, which is real time (default 600)"
-    )
-    parser.add_argument(
-        "--gate-class", action="append", default=[], metavar="NAME", help="to pulse for (repeatable, or a,b)"
-    )
-    parser.add_argument(
-        "--deadline-us", type=float, default=0.0, help="from leaving to the decision (default: the profile's)"
-    )
-    parser.add_argument("--seed", type=int, default=5, help="of the simulated instrument (default 5)")
-    parser.add_argument("--link", default="tcp", choices=("tcp", "pty"), help="between the two (default tcp)")
-    parser.add_argument(
-        "--awake", action="store_true", help="bind the two loops alone to their cores, and keep these awake (--core)"
-    )
-    parser.add_argument(
-        "--pin", type=_cores, default="0,1", metavar="HOST,SIM", help="cores of the two, or none (default 0,1)"
-    )
-    parser.add_argument("--canary-us", type=int, default=EVERY_US, help=f"period of the canaries (default {EVERY_US})")
-    parser.add_argument("--folder", type=Path, help="where to leave recording and summary (default: nowhere)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as one JSON object")
-    parser.add_argument("more", nargs="*", help="after --: further words for `pans run`")
-    parser.epilog = "Each core has a canary, which notes each time when it woke later than its period."
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Job, run, json_to_file=True)

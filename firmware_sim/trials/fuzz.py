@@ -1,4 +1,4 @@
-"""`pans fuzz`: bytes and frames that nobody would send, at the decoder, the instrument and the host's session and core.
+"""Bytes and frames that nobody would send (`pans fuzz`), at the decoder, the instrument and the host's session and core.
 
 Owns the making of strange input and the limits that must hold; never changes what it tests. Random bytes go to the decoder and through the
 whole instrument; structured frames have a right CRC and strange contents. After every batch the limits are checked: held bytes, queued
@@ -7,7 +7,6 @@ commands, remembered pulses, uploaded pixels. A crash, a hang or a broken limit 
 
 from __future__ import annotations
 
-import argparse
 import random
 import struct
 import time
@@ -22,7 +21,7 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
 from pans.firmware_sim.scene.still import Scene, load_scene
 from pans.firmware_sim.testing import small_setup
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.cli import say
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import load_profile
@@ -31,30 +30,16 @@ from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
+from . import Report, Trial, option
+
 BATCH_BYTES = 1 << 16
 BATCH_FRAMES = 200
-MAX_CALL_S = (
-    5.0  # of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second
-)
+# Of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second.
+MAX_CALL_S = 5.0
 NONCE = 0x5EED
 EDGES = (
-    0,
-    1,
-    2,
-    3,
-    0x7F,
-    0x80,
-    0xFF,
-    0x100,
-    0x7FFF,
-    0xFFFF,
-    0x10000,
-    0x7FFFFFFF,
-    0x80000000,
-    0xFFFFFFFF,
-    1 << 62,
-    (1 << 64) - 1,
-)
+    0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1,
+)  # fmt: skip
 HOST_TYPES = (MessageType.HELLO, MessageType.PING, MessageType.COMMAND, MessageType.GRANT)
 DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
 
@@ -348,31 +333,35 @@ def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:
     return counts, ""
 
 
-def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--bytes", type=int, default=100_000_000, help="random bytes (default 100 million)")
-    parser.add_argument("--frames", type=int, default=1_000_000, help="structured frames (default one million)")
-    parser.add_argument("--seed", type=int, default=1, help="the first seed (default 1)")
-    parser.add_argument("--parts", type=int, default=20, help="seeds that the work is divided over (default 20)")
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much to throw, divided over how many seeds."""
+
+    bytes: int = option(100_000_000, "random bytes (default 100 million)")
+    frames: int = option(1_000_000, "structured frames (default one million)")
+    seed: int = option(1, "the first seed (default 1)")
+    parts: int = option(20, "seeds that the work is divided over (default 20)")
 
 
-def _run(args: argparse.Namespace) -> int:
+def run(settings: Settings) -> Report:
+    """Throw it, seed by seed, until something is found."""
     started = time.perf_counter()
     total: dict[str, float] = {}
-    for seed in range(args.seed, args.seed + args.parts):
-        counts, failure = fuzz(seed, -(-args.bytes // args.parts), -(-args.frames // args.parts))
+    parts = settings.parts
+    for seed in range(settings.seed, settings.seed + parts):
+        counts, failure = fuzz(seed, -(-settings.bytes // parts), -(-settings.frames // parts))
         for name, value in asdict(counts).items():
             total[name] = max(total.get(name, 0), value) if name == "slowest_call_s" else total.get(name, 0) + value
         if failure:
             say(failure)
             say(f"pans fuzz: seed {seed} failed after {counts.bytes} bytes and {counts.frames} frames")
-            emit(args, {**total, "failed_seed": seed})
-            return EXIT_ALERT
+            return Report({**total, "failed_seed": seed}, False, "")
     seconds = time.perf_counter() - started
     words = ", ".join(
         f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in total.items()
     )
-    emit(args, {**total, "failed_seed": None, "seconds": seconds}, f"nothing was found in {seconds:.0f} s: {words}")
-    return EXIT_FINE
+    figures = {**total, "failed_seed": None, "seconds": seconds}
+    return Report(figures, True, f"nothing was found in {seconds:.0f} s: {words}")
 
 
-FUZZ = Command("throw strange bytes and frames at decoder, instrument and host", _configure, _run)
+TRIAL = Trial(Settings, run)

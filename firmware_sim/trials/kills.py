@@ -1,27 +1,24 @@
 """Hosts that are killed: does the light go off within a lease, and is everything on record that was acted upon?
 
-    python -m pans.firmware_sim.trials.kills lease [--kills 100]       SIGKILL while the projector is lit, at a random moment
-    python -m pans.firmware_sim.trials.kills recorder [--kills 200]    SIGKILL while it records, at a random moment
+    lease      SIGKILL while the projector is lit, at a random moment
+    recorder   SIGKILL while it records, at a random moment
 
 Owns the killing and the judgement; host and instrument are the ordinary ones. Real time passes here: each kill takes about a second.
-A host is a process of its own (`run_live` with a recorder), started from a server that has everything imported. Exit code 1 when a
-promise was broken.
+A host is a process of its own (`run_live` with a recorder), started from a server that has everything imported.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import os
 import random
-import select
 import signal
 import struct
-import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +43,16 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
 
+from . import Report, Trial, option, row_text
+from .processes import PATIENCE_S, wait_until
+
 LEASE_MS = 200
-PATIENCE_S = 30.0
+WALL_SLACK_MS = 50.0  # the simulator is woken by the operating system; in device ticks there is no slack
 ACT_EVERY = 5  # decisions
 ACTED = struct.Struct("<Q")
 
 
-class DarkWatch(Instrument):
+class LightLog(Instrument):
     """An instrument that notes when its light goes on and off, in device ticks and on the wall."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -112,7 +112,7 @@ def lease_kills(kills: int, seed: int = 1) -> dict[str, Any]:
     dice = random.Random(seed)
     profile, _, _ = small_setup("sequential")
     clock = DeviceClock(profile.clock.tick_hz)
-    device = DarkWatch(profile, load_scene("uniform"), power_on_tick=clock.tick_at(time.perf_counter_ns()))
+    device = LightLog(profile, load_scene("uniform"), power_on_tick=clock.tick_at(time.perf_counter_ns()))
     port, stopped = TcpPort("127.0.0.1", 0), threading.Event()
     server = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     server.start()
@@ -121,11 +121,11 @@ def lease_kills(kills: int, seed: int = 1) -> dict[str, Any]:
         for number in range(kills):
             process = context.Process(target=lit_host, args=(port.url,))
             process.start()
-            _wait(lambda: device.projector_lit)
+            wait_until(lambda: device.projector_lit)
             time.sleep(dice.random() * LEASE_MS / 500)  # up to two leases, so that it has been renewed several times
             killed = time.perf_counter()
             _kill(process)
-            _wait(lambda: not device.projector_lit)
+            wait_until(lambda: not device.projector_lit)
             state, reason, tick, dark = device.changes[-1]
             lit_ms.append((dark - killed) * 1000)
             lease_ticks = LEASE_MS * profile.clock.tick_hz // 1000
@@ -149,23 +149,21 @@ def lease_kills(kills: int, seed: int = 1) -> dict[str, Any]:
     }
 
 
-WALL_SLACK_MS = 50.0  # the simulator is woken by the operating system; in device ticks there is no slack
-
-
 def recorder_kills(kills: int, folder: Path, seed: int = 1, longest_s: float = 0.6) -> dict[str, Any]:
     """Kill that many recording hosts; return how much was readable each time, and what was missing."""
     dice, context = random.Random(seed), _context()
     broken, decisions, acted_on, torn = [], [], 0, 0
     for number in range(kills):
         path = folder / f"kill-{number}.pansrec"
-        reader, writer = os.pipe()
-        process = context.Process(target=_recording_child, args=(str(path), _Pipe(writer), number))
+        reader, writer = context.Pipe(duplex=False)
+        process = context.Process(target=_recording_child, args=(str(path), writer, number))
         process.start()
-        os.close(writer)
-        select.select([reader], [], [], PATIENCE_S)  # until it has acted for the first time
+        writer.close()
+        reader.poll(PATIENCE_S)  # until it has acted for the first time
         time.sleep(dice.random() * longest_s)
         _kill(process)
-        last = _last_acted(reader)
+        with reader:
+            last = _last_acted(reader.fileno())
         problem, count, cut = judge_recording(path, last)
         decisions.append(count)
         acted_on += last >= 0
@@ -204,66 +202,37 @@ def judge_recording(path: Path, last_acted: int) -> tuple[str, int, bool]:
     return "", len(rows), recording.end_offset < recording.size
 
 
-class _Pipe:
-    """A file descriptor that travels to another process."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __reduce__(self) -> Any:
-        from multiprocessing.reduction import DupFd
-
-        return _Pipe._back, (DupFd(self.number),)
-
-    @staticmethod
-    def _back(duplicate: Any) -> _Pipe:
-        return _Pipe(duplicate.detach())
-
-
-def _recording_child(path: str, pipe: _Pipe, seed: int) -> None:
-    recording_host(path, pipe.number, seed)
+def _recording_child(path: str, pipe: Connection, seed: int) -> None:
+    recording_host(path, pipe.fileno(), seed)
 
 
 def _last_acted(reader: int) -> int:
     data = b""
     while piece := os.read(reader, 1 << 16):
         data = (data + piece)[-(ACTED.size * 2) :]
-    os.close(reader)
     whole = len(data) // ACTED.size * ACTED.size
     return int(ACTED.unpack(data[whole - ACTED.size : whole])[0]) if whole else -1
 
 
-def _wait(condition: Any) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            raise RuntimeError(f"nothing happened for {PATIENCE_S} s")
-        time.sleep(0.001)
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Whom to kill, and how often."""
+
+    what: str = option(
+        "lease", "the host whose light must go off, or the one that records", flag="what", choices=("lease", "recorder")
+    )
+    kills: int | None = option(None, "how many (default: 100 for lease, 200 for recorder)", type=int)
+    seed: int = option(1, "of the moments (default 1)")
 
 
-def main() -> int:
-    """Kill hosts from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.kills", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("what", choices=("lease", "recorder"))
-    parser.add_argument("--kills", type=int, help="how many (default: 100 for lease, 200 for recorder)")
-    parser.add_argument("--seed", type=int, default=1, help="of the moments (default 1)")
-    args = parser.parse_args()
-    os.environ["PYTHONWARNINGS"] = (
-        "ignore::RuntimeWarning"  # children look at __main__, which is this module under another name
-    )
-    if args.what == "lease":
-        result = lease_kills(args.kills or 100, args.seed)
+def run(settings: Settings) -> Report:
+    """Kill hosts."""
+    if settings.what == "lease":
+        figures = lease_kills(settings.kills or 100, settings.seed)
     else:
         with tempfile.TemporaryDirectory() as folder:
-            result = recorder_kills(args.kills or 200, Path(folder), args.seed)
-    print(json.dumps(result))
-    return 1 if result["broken"] else 0
+            figures = recorder_kills(settings.kills or 200, Path(folder), settings.seed)
+    return Report(figures, not figures["broken"], row_text(figures))
 
 
-if __name__ == "__main__":
-    # Children must find these functions under the module's own name, not under __main__.
-    from . import kills as killrun
-
-    sys.exit(killrun.main())
+TRIAL = Trial(Settings, run)

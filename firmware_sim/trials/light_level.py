@@ -1,18 +1,14 @@
 """The light watch on simulated decisions: false alarms, and how soon an efficiency that is a tenth lower is found.
 
-    python -m pans.firmware_sim.trials.light_level [--runs 200] [--seed 1] [--json]
-
 Owns the measurement (SIMULATED): clicks of the shipped bundle's patterns, on a twentieth of their light, on the shipped images
-in random order, at an efficiency that stays, drops by a tenth at once, or falls slowly. Exit code 1 when drops take longer than
+in random order, at an efficiency that stays, drops by a tenth at once, or falls slowly. It fails when drops take longer than
 stated (mean over the runs, and nine in ten within twice as long).
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.resources
-import json
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +22,8 @@ from pans.runtime.core.plan import exposure_us
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import load_profile
+
+from . import Report, Trial, option, rows_report
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"
 CHUNK = 10_000
@@ -106,29 +104,23 @@ def change_row(name: str, slow: bool, runs: int, seed: int) -> dict[str, Any]:
     }
 
 
-def main() -> int:
-    """Run all rows from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.light_level", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--runs", type=int, default=200, help="changes per row (default 200)")
-    parser.add_argument("--decisions", type=int, default=10_000_000, help="without a change (default 10 million)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    args = parser.parse_args()
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How much to draw."""
+
+    runs: int = option(200, "changes per row (default 200)")
+    decisions: int = option(10_000_000, "without a change (default 10 million)")
+    seed: int = option(1, "of objects and clicks (default 1)")
+
+
+def run(settings: Settings) -> Report:
+    """Run all rows."""
     rows = [
-        change_row("a tenth at once", False, args.runs, args.seed),
-        change_row("a tenth in 5000 decisions", True, args.runs, args.seed),
-        false_alarm_row(args.seed, args.decisions),
+        change_row("a tenth at once", False, settings.runs, settings.seed),
+        change_row("a tenth in 5000 decisions", True, settings.runs, settings.seed),
+        false_alarm_row(settings.seed, settings.decisions),
     ]
-    if args.json:
-        print(json.dumps({"rows": rows, "simulated": True}))
-    else:
-        print("SIMULATED")
-        for row in rows:
-            print("  ".join(f"{k} {v:.5g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
-    return 0 if all(row["fine"] for row in rows) else 1
+    return rows_report(rows, all(row["fine"] for row in rows), simulated=True)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Settings, run)

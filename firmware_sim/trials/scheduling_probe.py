@@ -1,37 +1,34 @@
-"""A canary on a core: a process above everybody else there, which wakes at a fixed pace and notes when it was kept from waking.
+"""A scheduling probe: a process of high priority on a core, which wakes at a fixed pace and notes when it was kept from waking.
 
-    python -m pans.firmware_sim.trials.scheduling_probe --core 0 [--priority 30] [--every-us 200] [--late-us 200]
-
-Owns the watching and its process; never says whose fault a gap is. Two things keep a process of the highest priority from a core: the
-hypervisor runs somebody else (its timer then fires late), or the kernel lets others run before it (it then stands in the queue: real-time
-throttling, the share that kernels from 6.12 on keep for ordinary programs). Runs until SIGTERM (or until its parent is gone), then prints
-one JSON object. Linux, with the right to SCHED_FIFO. Times are those of time.perf_counter_ns, common to all processes.
+Owns the probe, both ends of it; never says who is to blame for a gap (the field's tool of this kind is cyclictest). Two things keep a
+process of the highest priority from a core: the hypervisor runs somebody else (its timer then fires late), or the kernel lets others run
+before it (it then waits in the run queue: real-time throttling, the share that kernels from 6.12 on keep for ordinary programs). It
+runs as a `Child` until SIGTERM (or until its parent is gone), then says one JSON object. Linux, with the right to SCHED_FIFO. Times are
+those of time.perf_counter_ns, common to all processes.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import os
 import signal
-import subprocess
 import sys
 import time
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
+
+from .processes import Child, say
 
 PRIORITY = 30  # above the simulated instrument (20) and the host's loop (10)
-EVERY_US, LATE_US = 200, 200
+EVERY_US = 200  # takes some 4 % of a core, and sees gaps of a fifth of the shortest deadline (1 ms)
 MAX_GAPS = 1_000_000
-LOOK_EVERY = 100  # wake-ups: at the parent, and at how long it has stood in the queue
-READY_S, GOODBYE_S = 20.0, 10.0
+CHECK_EVERY = 100  # wake-ups: whether the parent is there, and for how long it has waited in the run queue
 
 
 class Gap(NamedTuple):
-    """A core was away: the canary went to sleep at `seen_ns`, should have been awake at `begin_ns`, and was at `end_ns`.
+    """A core was away: the probe went to sleep at `seen_ns`, should have been awake at `begin_ns`, and was at `end_ns`.
 
     The core was certainly away from `begin_ns` to `end_ns`; it may have been since `seen_ns`, one period before at the most. Of this
-    time the canary stood in the queue for at most `queued_ns`, while the core ran something else; for the rest nothing ran here.
+    time the probe waited in the run queue for at most `queued_ns`, while the core ran something else; for the rest nothing ran here.
     """
 
     core: int
@@ -51,8 +48,8 @@ class Gap(NamedTuple):
         return 2 * self.queued_ns > self.length_ns
 
 
-class Watched(NamedTuple):
-    """What a canary saw: `gaps` in the order of time, how often it woke, and the share of its core that it took."""
+class ProbeLog(NamedTuple):
+    """What a probe saw: `gaps` in the order of time, how often it woke, and the share of its core that it took."""
 
     core: int
     gaps: tuple[Gap, ...]
@@ -60,32 +57,29 @@ class Watched(NamedTuple):
     own_share: float
 
 
-class Canary:
-    """A canary's process, from construction to `end`; `priority` of SCHED_FIFO, a wake-up every `every_us`."""
+class SchedulingProbe:
+    """A probe's process, from construction to `end`; `priority` of SCHED_FIFO, a wake-up every `every_us`, a gap beyond `late_us`."""
 
-    def __init__(self, core: int, priority: int = PRIORITY, every_us: int = EVERY_US, late_us: int = LATE_US) -> None:
+    def __init__(
+        self, core: int, priority: int = PRIORITY, every_us: int = EVERY_US, late_us: int | None = None
+    ) -> None:
         self.core = core
-        numbers = {"core": core, "priority": priority, "every-us": every_us, "late-us": late_us}
-        words = [word for name, value in numbers.items() for word in (f"--{name}", str(value))]
-        command = [sys.executable, "-m", "pans.firmware_sim.trials.scheduling_probe", *words]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        if self.process.stdout.readline().strip() != "ready":
-            raise RuntimeError(f"the canary on core {core} ended with {self.process.wait(READY_S)}")
+        late_us = every_us if late_us is None else late_us
+        self._child = Child("scheduling_probe", core, priority, every_us, late_us)
+        self.pid = self._child.process.pid
+        self._child.said()  # it is ready
 
-    def end(self) -> Watched:
-        """Let it stop and tell."""
-        self.process.send_signal(signal.SIGTERM)
-        text, _ = self.process.communicate(timeout=GOODBYE_S)
-        told = json.loads(text)
-        gaps = tuple(Gap(self.core, *gap) for gap in told["gaps"])
-        return Watched(self.core, gaps, int(told["wakes"]), float(told["own_share"]))
+    def end(self) -> ProbeLog:
+        """Let it stop and say what it saw."""
+        self._child.process.send_signal(signal.SIGTERM)
+        said = self._child.said()
+        self._child.end()
+        gaps = tuple(Gap(self.core, *gap) for gap in said["gaps"])
+        return ProbeLog(self.core, gaps, int(said["wakes"]), float(said["own_share"]))
 
     def kill(self) -> None:
-        """End it unheard, if it is still there."""
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+        """End it without a word, if it is still there."""
+        self._child.kill()
 
 
 def watch(every_ns: int, late_ns: int, gaps: list[tuple[int, int, int, int]]) -> int:
@@ -108,7 +102,7 @@ def watch(every_ns: int, late_ns: int, gaps: list[tuple[int, int, int, int]]) ->
                 due = now + every_ns - (now - due) % every_ns
             else:
                 due += every_ns
-            if wakes % LOOK_EVERY == 0:
+            if wakes % CHECK_EVERY == 0:
                 queued = _queued_ns(counters)
                 if os.getppid() != parent:
                     return wakes
@@ -124,31 +118,21 @@ def _leave(signum: int, frame: object) -> NoReturn:
     raise SystemExit(0)
 
 
-def main() -> int:
-    """Watch a core from the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pans.firmware_sim.trials.scheduling_probe", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--core", type=int, required=True, help="to sit on")
-    parser.add_argument("--priority", type=int, default=PRIORITY, help=f"of SCHED_FIFO (default {PRIORITY})")
-    parser.add_argument("--every-us", type=int, default=EVERY_US, help=f"how often to wake (default {EVERY_US})")
-    parser.add_argument("--late-us", type=int, default=LATE_US, help=f"later than this is a gap (default {LATE_US})")
-    args = parser.parse_args()
-    os.sched_setaffinity(0, {args.core})
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(args.priority))
+def main(core: int, priority: int, every_us: int, late_us: int) -> None:
+    """Watch a core; the process of `SchedulingProbe`."""
+    os.sched_setaffinity(0, {core})
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     gc.freeze()
     gc.disable()
     gaps: list[tuple[int, int, int, int]] = []
     signal.signal(signal.SIGTERM, _leave)
-    print("ready", flush=True)
+    say(ready=True)
     began_ns, began_cpu_ns = time.perf_counter_ns(), time.process_time_ns()
-    wakes = watch(args.every_us * 1000, args.late_us * 1000, gaps)
+    wakes = watch(every_us * 1000, late_us * 1000, gaps)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     share = (time.process_time_ns() - began_cpu_ns) / (time.perf_counter_ns() - began_ns)
-    told: dict[str, Any] = {"gaps": gaps, "wakes": wakes, "own_share": share}
-    print(json.dumps(told), flush=True)
-    return 0
+    say(gaps=gaps, wakes=wakes, own_share=share)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main(*(int(word) for word in sys.argv[1:]))

@@ -1,33 +1,34 @@
 """A run for a long time in real time, with faults on, watched from outside; then SIGTERM: does it stay flat and end well?
 
-    python -m pans.firmware_sim.trials.soak [--minutes 30] [--seed 1] [--folder DIR] [--json]
-
 Owns the run's command line, the samples and the judgement; host and instrument are the ordinary programs. Memory, handles and threads are
-read from /proc by this process, not asked of the one that is judged. Exit code 1 when a promise was broken.
+read from /proc by this process, not asked of the one that is judged.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.resources
 import json
 import os
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 import urllib.request
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_folder
+
+from . import Report, Trial, option
+from .processes import start_command, wait_until
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"
 FAULTS = (
@@ -38,6 +39,7 @@ ROTATE_MB, KEEP_MB = 0.5, 3.0
 SAMPLES = 180
 WARM_UP_SHARE = 0.2  # of the run: caches and histories fill
 READY_S, GOODBYE_S = 120.0, 60.0
+KEPT = ("ended", "decisions", "accuracy", "late", "late_cause", "lost", "lost_cause", "reconnects", "verdict")
 FLAT_RSS_BYTES = 4 << 20  # growth over the judged time, at the upper end of the slope's interval
 FLAT_HANDLES = FLAT_THREADS = 2  # a scrape or a reconnection may be under way
 
@@ -50,9 +52,7 @@ def soak(minutes: float, seed: int, folder: Path) -> dict[str, Any]:
     words = ["run", str(bundle), "--device", device, "--trials", "5", "--out", str(folder / "out"), "--json"]
     words += ["--rotate-mb", str(ROTATE_MB), "--keep-mb", str(KEEP_MB), "--state", str(state)]
     words += ["--metrics", f"127.0.0.1:{port}", "--reconnect-s", "20"]
-    command = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
-    with open(folder / "stderr.txt", "wb") as errors:
-        process = subprocess.Popen([sys.executable, "-c", command, *words], stdout=subprocess.PIPE, stderr=errors)
+    process = start_command(words, folder / "stderr.txt")
     samples: list[dict[str, Any]] = []
     try:
         _wait_until_running(process, state)
@@ -60,7 +60,7 @@ def soak(minutes: float, seed: int, folder: Path) -> dict[str, Any]:
         while (elapsed := time.monotonic() - started) < minutes * 60 and process.poll() is None:
             samples.append(_sample(process.pid, state, port, folder / "out", elapsed))
             if len(samples) % 6 == 1:
-                print(_line(samples[-1]), file=sys.stderr, flush=True)
+                say(_line(samples[-1]))
             time.sleep(min(minutes * 60 / SAMPLES, max(minutes * 60 - elapsed, 0.0)))
         asked = time.monotonic()
         process.send_signal(signal.SIGTERM)
@@ -115,20 +115,7 @@ def judged(
         "parts_kept": len(paths),
         "kept_bytes": kept,
         "decisions_kept": sum(read_recording(path).n_decisions for path in paths),
-        "run": {
-            key: summary.get(key)
-            for key in (
-                "ended",
-                "decisions",
-                "accuracy",
-                "late",
-                "late_cause",
-                "lost",
-                "lost_cause",
-                "reconnects",
-                "verdict",
-            )
-        },
+        "run": {key: summary.get(key) for key in KEPT},
         "broken": broken,
     }
 
@@ -176,12 +163,13 @@ def _scrape(port: int) -> bool:
         return False
 
 
-def _wait_until_running(process: subprocess.Popen[bytes], state: Path) -> None:
-    deadline = time.monotonic() + READY_S
-    while not state.exists() or json.loads(state.read_text())["state"] != "running":
-        if process.poll() is not None or time.monotonic() > deadline:
+def _wait_until_running(process: subprocess.Popen[str], state: Path) -> None:
+    def running() -> bool:
+        if process.poll() is not None:
             raise RuntimeError(f"the run did not start (exit code {process.poll()})")
-        time.sleep(0.2)
+        return state.exists() and json.loads(state.read_text())["state"] == "running"
+
+    wait_until(running, READY_S, 0.2)
 
 
 def _free_port() -> int:
@@ -214,21 +202,22 @@ def show(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
-    """Soak from the command line."""
-    parser = argparse.ArgumentParser(prog="python -m pans.firmware_sim.trials.soak", description=__doc__.split("\n")[0])
-    parser.add_argument("--minutes", type=float, default=30.0, help="how long (default 30)")
-    parser.add_argument("--seed", type=int, default=1, help="of the instrument and its faults (default 1)")
-    parser.add_argument("--folder", type=Path, help="where to leave the recording and the state (default: nowhere)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object, all samples in it")
-    args = parser.parse_args()
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How long to run, and where."""
+
+    minutes: float = option(30.0, "how long (default 30)")
+    seed: int = option(1, "of the instrument and its faults (default 1)")
+    folder: Path | None = option(None, "where to leave the recording and the state (default: nowhere)", type=Path)  # noqa: RUF009
+
+
+def run(settings: Settings) -> Report:
+    """Run, watch and judge."""
     with tempfile.TemporaryDirectory() as scratch:
-        folder = args.folder or Path(scratch)
+        folder = settings.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
-        result = soak(args.minutes, args.seed, folder)
-    print(json.dumps(result) if args.json else show(result))
-    return 1 if result["broken"] else 0
+        figures = soak(settings.minutes, settings.seed, folder)
+    return Report(figures, not figures["broken"], show(figures))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+TRIAL = Trial(Settings, run)

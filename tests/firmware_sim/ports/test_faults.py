@@ -1,5 +1,5 @@
 """Faults by seed, the checkers' eyes, and whole runs under faults. Whole runs are short here; the long ones are
-`python -m pans.firmware_sim.trials.fault_grid`."""
+`pans trials fault-grid`."""
 
 from __future__ import annotations
 

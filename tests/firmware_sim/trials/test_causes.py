@@ -1,4 +1,4 @@
-"""The judging halves of blamerun.py and soakrun.py; what they run takes minutes of real time."""
+"""The judging halves of causes.py and soak.py; what they run takes minutes of real time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pans.firmware_sim.trials.causes import DISK_HOLD_MS, KINDS, Injection, compare, make_script, report, show
+from pans.firmware_sim.trials.cause_processes import Injection
+from pans.firmware_sim.trials.causes import DISK_HOLD_MS, KINDS, compare, make_script, report, show
 from pans.firmware_sim.trials.soak import slope_of
 
 MS = 1_000_000

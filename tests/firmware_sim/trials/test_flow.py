@@ -1,4 +1,4 @@
-"""Late decisions against gaps of the machine: the attribution on gaps made up, a real canary, and one short run of everything."""
+"""Late decisions against gaps of the machine: the attribution on gaps made up, a real probe, and one short run of everything."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pans.firmware_sim.trials.flow import Job, broken_bars, carry_out, real_time_programs, report, show
-from pans.firmware_sim.trials.flow_causes import (
+from pans.firmware_sim.trials.flow import Job, broken_bars, carry_out, report, show
+from pans.firmware_sim.trials.flow_attribution import (
     CATCH_UP,
     MACHINE,
     ON_TIME_SHARE,
@@ -28,7 +28,8 @@ from pans.firmware_sim.trials.flow_causes import (
     verdict_of,
     worked_off,
 )
-from pans.firmware_sim.trials.scheduling_probe import MAX_GAPS, Canary, Gap, Watched
+from pans.firmware_sim.trials.processes import real_time_programs
+from pans.firmware_sim.trials.scheduling_probe import MAX_GAPS, Gap, ProbeLog, SchedulingProbe
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record.format import TIMING_DTYPE
@@ -155,10 +156,10 @@ def test_the_attribution_is_what_its_words_say(
 
 
 def test_figures_of_the_gaps_are_those_of_the_run() -> None:
-    watched = Watched(
+    log = ProbeLog(
         1, (gap(0, 900), gap(2000, 2400), gap(10_000, 11_200, queued_us=1100), gap(2_000_000, 2_009_000)), 7, 0.03
     )
-    figures = gap_figures(watched, 1000 * US, 1_001_000 * US)
+    figures = gap_figures(log, 1000 * US, 1_001_000 * US)
     assert figures["per_s_above_ms"] == {"0.2": 2.0, "0.3": 2.0, "0.5": 1.0, "1.0": 1.0, "3.0": 0.0}
     assert (figures["largest_ms"], figures["away_ms"], figures["queued_ms"]) == (1.2, 1.6, 1.2)
 
@@ -192,20 +193,20 @@ def test_each_bar_that_is_missed_is_said() -> None:
 
 
 @needs_real_time
-def test_a_canary_that_is_kept_from_its_core_notes_from_when_to_when() -> None:
-    canary = Canary(max(os.sched_getaffinity(0)))
+def test_a_probe_that_is_kept_from_its_core_notes_from_when_to_when() -> None:
+    probe = SchedulingProbe(max(os.sched_getaffinity(0)))
     try:
         time.sleep(0.1)
-        os.kill(canary.process.pid, signal.SIGSTOP)
+        os.kill(probe.pid, signal.SIGSTOP)
         stopped_ns = time.perf_counter_ns()
         time.sleep(0.08)
         continued_ns = time.perf_counter_ns()
-        os.kill(canary.process.pid, signal.SIGCONT)
+        os.kill(probe.pid, signal.SIGCONT)
         time.sleep(0.1)
         programs = real_time_programs({os.getpid()})
-        watched = canary.end()
+        watched = probe.end()
     finally:
-        canary.kill()
+        probe.kill()
     assert any(name.endswith("(30)") for name in programs)
     longest = max(watched.gaps, key=lambda one: one.length_ns)
     assert longest.seen_ns < stopped_ns

@@ -85,7 +85,7 @@ def test_before_the_first_probe_nothing_is_converted() -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_coverage_under_drift_wander_jitter_and_asymmetry(case: object) -> None:
-    """A short form of `python -m pans.firmware_sim.trials.clock`."""
+    """A short form of `pans trials clock`."""
     row = run_clock_case(case, 40.0, 7)  # type: ignore[arg-type]
     assert row["within"] >= REQUIRED
     assert row["steps"] == 0

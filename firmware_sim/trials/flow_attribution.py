@@ -1,8 +1,8 @@
 """Late decisions against the gaps of the machine: which of them would have been on time if the cores had been there.
 
-Owns the attribution, a pure function of the recording's rows, its verdicts and what the canaries saw; flowrun.py makes these. A decision
-about an object that left at `end_ns`, made at `decided_ns`, is looked at from the time on at which nothing was waiting: when the last
-decision on time before it had been made (`ON_TIME_SHARE` of the deadline), or `end_ns` if that was later. A gap counts
+Owns the attribution, a pure function of the recording's rows, its verdicts and what the scheduling probes saw (flow.py runs them). A
+decision about an object that left at `end_ns`, made at `decided_ns`, is examined from the time on at which nothing was waiting: when the
+last decision on time before it had been made (`ON_TIME_SHARE` of the deadline), or `end_ns` if that was later. A gap counts
 
     that overlaps this time and had not been over for longer than CATCH_UP times its own length when the object left (what came
     meanwhile is to be caught up by then);
@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .scheduling_probe import Gap, Watched
+from .scheduling_probe import Gap, ProbeLog
 
 NS_PER_US, NS_PER_S = 1_000, 1_000_000_000
 MACHINE, PARTLY, OURS = "machine", "partly", "ours"
-ON_TIME_SHARE = 0.5
-CATCH_UP = 3
+ON_TIME_SHARE = 0.5  # a decision that took less had nothing waiting before it
+CATCH_UP = 3  # a host that is busy for three quarters of the time works off a gap in three times its length
 STEPS_MS = (0.2, 0.3, 0.5, 1.0, 3.0)
 
 
@@ -106,19 +106,19 @@ def worked_off(late: LateDecision, busy_share: float) -> bool:
     return late.whose == PARTLY and late.away_ns * (1 + min(busy_share, 1.0)) >= late.late_ns
 
 
-def gap_figures(watched: Watched, begin_ns: int, end_ns: int) -> dict[str, Any]:
+def gap_figures(log: ProbeLog, begin_ns: int, end_ns: int) -> dict[str, Any]:
     """Return how often and for how long the core was away between the two times."""
     seconds = (end_ns - begin_ns) / NS_PER_S
-    gaps = [gap for gap in watched.gaps if gap.end_ns > begin_ns and gap.begin_ns < end_ns]
+    gaps = [gap for gap in log.gaps if gap.end_ns > begin_ns and gap.begin_ns < end_ns]
     lengths_ms = [gap.length_ns / 1e6 for gap in gaps]
     return {
-        "core": watched.core,
+        "core": log.core,
         "per_s_above_ms": {str(step): sum(length > step for length in lengths_ms) / seconds for step in STEPS_MS},
         "largest_ms": max(lengths_ms, default=0.0),
         "away_ms": sum(lengths_ms),
         "queued_ms": sum(gap.length_ns for gap in gaps if gap.queued) / 1e6,
-        "canary_share_of_core": watched.own_share,
-        "canary_wakes_per_s": watched.wakes / seconds,
+        "canary_share_of_core": log.own_share,
+        "canary_wakes_per_s": log.wakes / seconds,
     }
 
 
@@ -136,7 +136,7 @@ def late_table(found: Iterable[LateDecision], verdicts: Sequence[Mapping[str, An
     return {cause: {whose: counts[whose] for whose in (MACHINE, PARTLY, OURS)} for cause, counts in table.items()}
 
 
-def told(late: LateDecision, verdict: Mapping[str, Any]) -> dict[str, Any]:
+def late_entry(late: LateDecision, verdict: Mapping[str, Any]) -> dict[str, Any]:
     """Return one late decision for people and files, in microseconds."""
     return {
         "decision": late.number,

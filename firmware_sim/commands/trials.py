@@ -1,0 +1,93 @@
+"""`pans trials` and `pans fuzz`: long checks with a verdict, found in the table of pans.firmware_sim.trials.
+
+Owns the options, made from a trial's settings, and the exit code: 0 when every bar was met, 1 when one was missed. Only the module of
+the trial that is run is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+from pans.firmware_sim.trials import TRIALS, Report, load_trial
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.errors import PansError
+
+
+def add_options(parser: argparse.ArgumentParser, settings: type[Any]) -> None:
+    """Add one option for each field of `settings`; a field without `--` in its flag is an argument by place."""
+    for one in fields(settings):
+        words = dict(one.metadata)
+        flag = words.pop("flag", "--" + one.name.replace("_", "-"))
+        if flag.startswith("--"):
+            words["dest"] = one.name
+            if one.default is MISSING:
+                words["required"] = True
+            elif words.get("action") != "store_true":
+                words.setdefault("default", one.default)
+        if not {"type", "action", "choices"} & set(words):
+            words["type"] = type(one.default)
+        parser.add_argument(flag, **words)
+
+
+def run_trial(name: str, args: argparse.Namespace) -> int:
+    """Run the trial `name` with the options in `args`, print its report and return the exit code."""
+    trial = load_trial(name)
+    settings = trial.settings(**{one.name: getattr(args, one.name) for one in fields(trial.settings)})
+    try:
+        report: Report = trial.run(settings)
+    except RuntimeError as error:  # a process of the trial did not do its part: nothing was measured
+        raise PansError(f"{name}: {error}") from error
+    if isinstance(args.json, Path):
+        args.json.write_text(json.dumps(report.figures) + "\n")
+        args.json = False
+    emit(args, report.figures, report.words)
+    return EXIT_FINE if report.passed else EXIT_ALERT
+
+
+class _TrialParser(argparse.ArgumentParser):
+    """The parser of one trial; its module is imported when its options are asked for."""
+
+    name = ""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        trial = load_trial(self.name)
+        add_options(self, trial.settings)
+        to_file = {"nargs": "?", "type": Path, "const": True, "metavar": "FILE"}
+        json_words: dict[str, Any] = to_file if trial.json_to_file else {"action": "store_true"}
+        where = "to FILE, or on stdout" if trial.json_to_file else "on stdout"
+        self.add_argument("--json", default=argparse.SUPPRESS, help=f"write one JSON object {where}", **json_words)
+        self.add_argument(
+            "--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error"
+        )
+        return super().parse_known_args(args, namespace)
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    chosen = parser.add_subparsers(dest="name", metavar="NAME", parser_class=_TrialParser)
+    for name, entry in TRIALS.items():
+        chosen.add_parser(name, help=f"{entry.summary} ({entry.takes})", description=entry.summary).name = name
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.name is not None:
+        return run_trial(args.name, args)
+    rows = [{"name": name, "summary": entry.summary, "takes": entry.takes} for name, entry in TRIALS.items()]
+    text = "\n".join(f"  {row['name']:<12} {row['takes']:<8} {row['summary']}" for row in rows)
+    emit(
+        args,
+        {"rows": rows},
+        f"{text}\n\n`pans trials NAME --help` lists a trial's options; each ends with 1 when a bar is missed.",
+    )
+    return EXIT_FINE
+
+
+def _configure_fuzz(parser: argparse.ArgumentParser) -> None:
+    add_options(parser, load_trial("fuzz").settings)
+
+
+TRIALS_COMMAND = Command("run a long check of the whole system; without a name, list them", _configure, _run)
+FUZZ = Command(TRIALS["fuzz"].summary, _configure_fuzz, lambda args: run_trial("fuzz", args))
