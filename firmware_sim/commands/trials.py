@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser, settings: type[Any]) -> None:
             if one.default is MISSING:
                 words["required"] = True
             elif words.get("action") != "store_true":
-                words.setdefault("default", one.default)
+                words["default"] = list(one.default) if words.get("action") == "append" else one.default
         if not {"type", "action", "choices"} & set(words):
             words["type"] = type(one.default)
         parser.add_argument(flag, **words)
