@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from pans.runtime.decide.verdict import Decider, verdicts_of
 from pans.runtime.errors import UsageError
+from pans.runtime.wire import walk as place
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Frame, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType
@@ -157,20 +158,20 @@ class StreamCore:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
         core, state = self.core, self._state
         state[kernels.N_ROWS] = 0
-        state[kernels.NEXT_SEQ], state[kernels.NEXT_EXPOSURE], state[kernels.DROPS] = core.tracker.position
-        state[kernels.MESSAGES] = state[kernels.EXPOSURES] = 0
+        state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = core.tracker.position
+        state[place.MESSAGES] = state[place.EXPOSURES] = 0
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = core.windows.position
         state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
-        state[kernels.END_EXPOSURE], state[kernels.LAST_TICK] = min(core.end_exposure, (1 << 62)), core.last_tick
+        state[place.END_EXPOSURE], state[kernels.LAST_TICK] = min(core.end_exposure, (1 << 62)), core.last_tick
 
     def _store(self) -> None:
         """Copy what the kernel did back."""
         core, state = self.core, self._state.tolist()
-        if state[kernels.MESSAGES]:
+        if state[place.MESSAGES]:
             core.tracker.advance(
-                (state[kernels.NEXT_SEQ], state[kernels.NEXT_EXPOSURE]),
-                state[kernels.MESSAGES],
-                state[kernels.EXPOSURES],
+                (state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]),
+                state[place.MESSAGES],
+                state[place.EXPOSURES],
             )
             core.windows.position = (state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT])
             core.last_tick = state[kernels.LAST_TICK]

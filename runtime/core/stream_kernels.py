@@ -6,40 +6,30 @@ untouched and says so: `stream.StreamCore` gives it to `core.Core`, whose state 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pans.runtime.wire.kernels import (
-    BLOCK_HEADER,
-    BODY_HEADER,
-    MARK_BYTES,
-    block_shape,
-    block_times,
-    is_next,
-    load4,
-    load8,
-    mark_photons,
-    mark_truth,
-)
-from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH, MessageType
+from pans.runtime.wire import walk as stream
+from pans.runtime.wire.kernels import load4, load8
+from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
 from .window import DARK_CLICKS, DARK_EXPOSURES
 
-# state, int64 (N_STATE,): where the walk stands, and the facts of Core, StreamTracker and DecisionWindows that it continues
-MESSAGE, FRAME, N_ROWS, SESSION, NEXT_SEQ, NEXT_EXPOSURE, DROPS, MESSAGES, EXPOSURES = range(9)
-VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, END_EXPOSURE, LAST_TICK = range(9, 16)
-EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, N_STATE = range(16, 20)
+# state, int64 (N_STATE,): where the stream stands (stream.N_PLACE columns), where the walk stands, and what it continues of Core and
+# DecisionWindows
+MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, LAST_TICK = range(
+    stream.N_PLACE, stream.N_PLACE + 10
+)
+EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, N_STATE = range(LAST_TICK + 1, LAST_TICK + 5)
 ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_frames` returns
-MARK_SLOTS = 4096  # as many objects as core.MAX_MARKS
+MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64
 _LANE = _U(0xFF)
-_FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
-_HEADER, _BLOCK_HEADER, _MARK_BYTES = BODY_HEADER, BLOCK_HEADER, MARK_BYTES
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
 _GAP = int(DecisionFlag.GAP) | _ABSTAINED
 _NOT_FINITE = int(DecisionFlag.NOT_FINITE) | _ABSTAINED
@@ -88,6 +78,25 @@ class MarkArrays(NamedTuple):
     photons: npt.NDArray[np.float32]
 
 
+class Block(NamedTuple):
+    """An accepted block: its frames from `at` on in the buffer, the first one exposure `first`, `relative` to the visit's first.
+
+    `end_tick` is that of the first exposure's end. `truth` is that of `object`, -1 where it is not known. `top_mask` are the bits of the
+    last byte of a word that are channels.
+    """
+
+    frames: np.integer[Any]
+    word_bytes: np.integer[Any]
+    at: np.integer[Any]
+    first: np.integer[Any]
+    relative: np.integer[Any]
+    end_tick: np.integer[Any]
+    period_ticks: np.integer[Any]
+    object: np.integer[Any]
+    truth: np.integer[Any]
+    top_mask: np.integer[Any]
+
+
 @njit(cache=True, nogil=True)
 def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
@@ -102,14 +111,19 @@ def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):
         if load4(buffer, start + _U(4)) != _U(state[SESSION]):
             return ODD
         kind = buffer[start]
-        payload = start + _U(_HEADER)
-        if kind == _MARK:
+        payload = start + _U(stream.BODY_HEADER)
+        if kind == stream.MARK:
             if not _take_mark(buffer, payload, stop, state, marks):
                 return ODD
-        elif kind == _FRAMES:
+        elif kind == stream.FRAMES:
             if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
                 return ODD
-            if not _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):
+            block = _block_of(buffer, payload, state, marks, windows)
+            if tables.word_rows.size:
+                _take_words(buffer, block, state, windows, tables, rows)
+            else:
+                _take_windows(buffer, block, state, windows, tables, rows, counts_out)
+            if state[FRAME] < block.frames:
                 return ROWS_FULL
             state[FRAME] = 0
         else:
@@ -121,26 +135,23 @@ def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):
 @njit(cache=True, nogil=True)
 def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-def]
     """Remember an object's truth; False, and nothing done, when the message is not the next one."""
-    if stop - payload != _U(_MARK_BYTES) or load4(buffer, payload) != _U(state[NEXT_SEQ]):
+    if not stream.is_next_mark(buffer, payload, stop, state):
         return False
     number = np.int64(load4(buffer, payload + _U(4)))
     slot = number % MARK_SLOTS
     marks.objects[slot] = number
-    marks.truths[slot] = np.int16(mark_truth(buffer, payload))
-    mark_photons(buffer, payload, marks.photons, slot)
-    state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
-    state[MESSAGES] += 1
+    marks.truths[slot] = np.int16(stream.mark_truth(buffer, payload))
+    stream.mark_photons(buffer, payload, marks.photons, slot)
+    stream.go_on(state, 0)
     return True
 
 
 @njit(cache=True, nogil=True)
 def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Account for a block that is the next one and fits the plan; else False, and nothing done."""
-    count, word_bytes = block_shape(buffer, payload, stop)
-    first = state[NEXT_EXPOSURE]
+    count, word_bytes = stream.next_block(buffer, payload, stop, state)
+    first = state[stream.NEXT_EXPOSURE]
     if count == 0 or word_bytes < windows.lanes.size:
-        return False
-    if not is_next(buffer, payload, count, state[NEXT_SEQ], state[DROPS], first, state[END_EXPOSURE]):
         return False
     visit = first // state[VISIT_EXPOSURES]
     if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
@@ -152,119 +163,95 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
         windows.seen[:] = 0
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
-    tick, period = block_times(buffer, payload)
+    tick, period = stream.block_times(buffer, payload)
     state[OBJECT] = np.int64(load4(buffer, payload + _U(32)))
     state[LAST_TICK] = tick + (count - 1) * period + state[EXPOSURE_TICKS]
-    state[NEXT_SEQ] = (state[NEXT_SEQ] + 1) & 0xFFFFFFFF
-    state[MESSAGES] += 1
-    state[NEXT_EXPOSURE] += count
-    state[EXPOSURES] += count
+    stream.go_on(state, count)
     return True
 
 
 @njit(cache=True, nogil=True)
-def _block_facts(buffer, payload, state, marks):  # type: ignore[no-untyped-def]
-    """Of an accepted block: exposures, bytes per word, first exposure, its end tick, period, object and its truth (-1: unknown)."""
-    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
-    word_bytes = load4(buffer, payload + _U(28)) >> _U(16)
+def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untyped-def]
+    shape = load4(buffer, payload + _U(28))
     first = np.int64(load8(buffer, payload + _U(16)))
-    tick, period = block_times(buffer, payload)
+    tick, period = stream.block_times(buffer, payload)
     number = state[OBJECT]
     known = number != _NO_OBJECT and marks.objects[number % MARK_SLOTS] == number
     truth = np.int64(marks.truths[number % MARK_SLOTS]) if known else np.int64(_UNKNOWN)
-    return count, word_bytes, first, tick + state[EXPOSURE_TICKS], period, number, truth
+    return Block(
+        np.int64(shape & _U(0xFFFF)),
+        shape >> _U(16),
+        payload + _U(stream.BLOCK_HEADER),
+        first,
+        first - state[VISIT] * state[VISIT_EXPOSURES],
+        tick + state[EXPOSURE_TICKS],
+        period,
+        number,
+        truth,
+        np.int64(0xFF >> (8 * windows.lanes.size - windows.counts.shape[1])),
+    )
 
 
 @njit(cache=True, nogil=True)
-def _take_block(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Count the frames of an accepted block from state[FRAME] on; False when the rows are full before its end."""
-    if tables.word_rows.size:
-        return _take_words(buffer, payload, state, marks, windows, tables, rows)
-    return _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_out)
-
-
-@njit(cache=True, nogil=True)
-def _take_words(buffer, payload, state, marks, windows, tables, rows):  # type: ignore[no-untyped-def]
-    """K = 1 with a table: every frame with light is a window, every word a row.
+def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no-untyped-def]
+    """K = 1 with a table, frames from state[FRAME] on: every frame with light is a window, every word a row.
 
     Arrays are taken out of their tuples once: inside the loop that would count references for every frame.
     """
-    count, word_bytes, first, tick, period, number, truth = _block_facts(buffer, payload, state, marks)
     window_at, seen, tallies = windows.window_at, windows.seen, windows.tallies
     labels, probabilities, word_rows, word_crc = tables.labels, tables.probabilities, tables.word_rows, tables.word_crc
     n_features, n_lanes, crc_zero = windows.counts.shape[1], windows.lanes.size, tables.crc_zero[0]
-    top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
-    relative, n_rows, done = first - state[VISIT] * state[VISIT_EXPOSURES], state[N_ROWS], count
-    at = payload + _U(_BLOCK_HEADER) + _U(state[FRAME]) * word_bytes
-    for i in range(state[FRAME], count):
-        here, clicks, index, crc = np.int64(window_at[relative + i]), 0, 0, crc_zero
+    n_rows, done = state[N_ROWS], block.frames
+    at = block.at + _U(state[FRAME]) * block.word_bytes
+    for i in range(state[FRAME], block.frames):
+        here, clicks, index, crc = np.int64(window_at[block.relative + i]), 0, 0, crc_zero
         for p in range(n_lanes):
-            byte = np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)
+            byte = np.int64(buffer[at + _U(p)]) & (block.top_mask if p == n_lanes - 1 else 0xFF)
             clicks += ONES[byte]
             index += word_rows[p, byte]
             crc ^= word_crc[p, byte]
-        at += word_bytes
+        at += block.word_bytes
         if here < 0:
             tallies[DARK_CLICKS] += clicks
             tallies[DARK_EXPOSURES] += n_features
             continue
         seen[here, 0] = n_features
-        probability, label, flags = probabilities[index], np.int64(labels[index]), 0
-        if not probability > 0:
-            probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
-        end = tick + i * period
-        _fill(
-            rows[n_rows],
-            state[N_DECISIONS],
-            end,
-            first + i,
-            number,
-            here,
-            clicks,
-            label,
-            truth,
-            flags,
-            probability,
-            crc,
-        )
+        label, probability, flags = _look_up(labels, probabilities, index)
+        _put_row(rows[n_rows], state, block, i, here, (clicks, label, flags, probability, crc))
         n_rows += 1
-        state[N_DECISIONS] += 1
-        state[N_ABSTAINED] += flags != 0
         state[NEXT_WINDOW] = here + 1
         if n_rows == rows.size:
             done = i + 1
             break
     state[N_ROWS], state[FRAME] = n_rows, done
-    return done == count
 
 
 @njit(cache=True, nogil=True)
-def _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
-    """Any K and any back end: clicks gather in byte lanes until a window, a block or a lane is full."""
-    count, word_bytes, first, tick, period, number, truth = _block_facts(buffer, payload, state, marks)
+def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Any K and any back end, frames from state[FRAME] on: clicks gather in byte lanes until a window, a block or a lane is full."""
     window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
     lanes, whole, tallies = windows.lanes, windows.whole, windows.tallies
     labels, probabilities, radix, crc_table = tables.labels, tables.probabilities, tables.radix, tables.crc
     n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state[SHOTS]
-    top_mask = np.int64(0xFF >> (8 * n_lanes - n_features))
-    relative, n_rows, done = first - state[VISIT] * state[VISIT_EXPOSURES], state[N_ROWS], count
-    at = payload + _U(_BLOCK_HEADER) + _U(state[FRAME]) * word_bytes
+    n_rows, done = state[N_ROWS], block.frames
+    at = block.at + _U(state[FRAME]) * block.word_bytes
     window, held = np.int64(-1), 0  # `held` frames of `window` are in the lanes
-    for i in range(state[FRAME], count):
-        here = np.int64(window_at[relative + i])
+    for i in range(state[FRAME], block.frames):
+        here = np.int64(window_at[block.relative + i])
         if here < 0:
             for p in range(n_lanes):
-                tallies[DARK_CLICKS] += ONES[np.int64(buffer[at + _U(p)]) & (top_mask if p == n_lanes - 1 else 0xFF)]
+                byte = np.int64(buffer[at + _U(p)]) & (block.top_mask if p == n_lanes - 1 else 0xFF)
+                tallies[DARK_CLICKS] += ONES[byte]
             tallies[DARK_EXPOSURES] += n_features
-            at += word_bytes
+            at += block.word_bytes
             continue
         window = here
         for p in range(n_lanes):
             lane = SPREAD[buffer[at + _U(p)]]
             lanes[p] = lane if held == 0 else lanes[p] + lane
         held += 1
-        at += word_bytes
-        if relative + i != last[here]:
+        at += block.word_bytes
+        if block.relative + i != last[here]:
             if held == 255:
                 _spill(lanes, counts, seen, here, held)
                 held = 0
@@ -272,34 +259,15 @@ def _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_o
         _complete(lanes, counts, seen, here, held, whole)
         held = 0
         clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
-        flags, label, probability = 0, np.int64(_NO_LABEL), np.float32(0.0)
+        label, probability, flags = np.int64(_NO_LABEL), np.float32(0.0), 0
         if seen[here, 0] != shots * n_features:
             flags = _GAP
         elif labels.size:
-            probability, label = probabilities[index], np.int64(labels[index])
-            if not probability > 0:
-                probability, label, flags = np.float32(0.0), np.int64(_NO_LABEL), _NOT_FINITE
+            label, probability, flags = _look_up(labels, probabilities, index)
         else:
-            for feature in range(n_features):
-                counts_out[n_rows, feature] = whole[feature]
-        end, shot = tick + i * period, here * shots
-        _fill(
-            rows[n_rows],
-            state[N_DECISIONS],
-            end,
-            first + i,
-            number,
-            shot,
-            clicks,
-            label,
-            truth,
-            flags,
-            probability,
-            crc,
-        )
+            counts_out[n_rows] = whole
+        _put_row(rows[n_rows], state, block, i, here * shots, (clicks, label, flags, probability, crc))
         n_rows += 1
-        state[N_DECISIONS] += 1
-        state[N_ABSTAINED] += flags != 0
         state[NEXT_WINDOW] = here + 1
         if n_rows == rows.size:
             done = i + 1
@@ -307,7 +275,34 @@ def _take_windows(buffer, payload, state, marks, windows, tables, rows, counts_o
     if held:
         _spill(lanes, counts, seen, window, held)
     state[N_ROWS], state[FRAME] = n_rows, done
-    return done == count
+
+
+@njit(cache=True, nogil=True)
+def _look_up(labels, probabilities, index):  # type: ignore[no-untyped-def]
+    """Label, probability and flags of a row of the table."""
+    probability = probabilities[index]
+    if probability > 0:
+        return np.int64(labels[index]), probability, 0
+    return np.int64(_NO_LABEL), np.float32(0.0), _NOT_FINITE
+
+
+@njit(cache=True, nogil=True)
+def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-def]
+    """Write the decision `decided` (clicks, label, flags, probability, checksum) on a window that frame `i` ends, and count it."""
+    row["index"] = state[N_DECISIONS]
+    row["tick"] = block.end_tick + i * block.period_ticks
+    row["exposure_index"] = block.first + i
+    row["object"] = block.object
+    row["shot"] = shot
+    clicks, label, flags, probability, crc = decided
+    row["clicks"] = clicks
+    row["label"] = label
+    row["truth"] = block.truth
+    row["flags"] = flags
+    row["probability"] = probability
+    row["counts_crc"] = crc
+    state[N_DECISIONS] += 1
+    state[N_ABSTAINED] += flags != 0
 
 
 @njit(cache=True, nogil=True)
@@ -320,22 +315,6 @@ def _complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-unty
     else:
         _unpack(lanes, whole)
         seen[window, 0] = held * whole.size
-
-
-@njit(cache=True, nogil=True)
-def _fill(row, index, tick, exposure, number, shot, clicks, label, truth, flags, probability, crc):  # type: ignore[no-untyped-def]
-    """Write one row of the decision log."""
-    row["index"] = index
-    row["tick"] = tick
-    row["exposure_index"] = exposure
-    row["object"] = number
-    row["shot"] = shot
-    row["clicks"] = clicks
-    row["label"] = label
-    row["truth"] = truth
-    row["flags"] = flags
-    row["probability"] = probability
-    row["counts_crc"] = crc
 
 
 @njit(cache=True, nogil=True)

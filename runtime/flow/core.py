@@ -24,6 +24,7 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
+from pans.runtime.wire import walk as stream
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
 
@@ -184,13 +185,13 @@ class FlowCore(Follower):
         if not taken:
             return super().step_messages(messages, place)
         facts = self._facts.tolist()
-        n_marks, n_blocks = facts[walking.MARKS], facts[walking.BLOCKS]
-        position = facts[walking.NEXT_SEQ], facts[walking.NEXT_EXPOSURE]
-        self.tracker.advance(position, n_marks + n_blocks, facts[walking.EXPOSURES])
+        n_marks, n_messages = facts[walking.MARKS], facts[stream.MESSAGES]
+        position = facts[stream.NEXT_SEQ], facts[stream.NEXT_EXPOSURE]
+        self.tracker.advance(position, n_messages, facts[stream.EXPOSURES])
         if n_marks:
             for mark, photons in zip(self._new.rows[:n_marks].tolist(), self._new.photons[:n_marks].tolist()):
                 self._remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
-        if not n_blocks:
+        if n_messages == n_marks:
             return taken, Output([], [], None)
         self.last_tick, self.jitter_ticks = facts[walking.END_TICK], facts[walking.JITTER_TICKS]
         came = self._came(position[1], self.last_tick, facts[walking.PASSAGES])
@@ -200,9 +201,10 @@ class FlowCore(Follower):
         """Bring the kernel's facts up to date and let it take messages; return how many it took."""
         facts = self._facts
         watch_at = 1 << 62 if self.guard is None else self._watched[0] + WATCHED_FRAMES
-        facts[: walking.BLOCKS] = (
-            *self.tracker.position, min(self.end_exposure, 1 << 62), self.start_tick, self._exposure_ticks, self._period_ticks,
-            self._max_block, self._plan.cycle_ticks, self._dark_cycle, watch_at,
+        facts[: stream.MESSAGES] = (*self.tracker.position, min(self.end_exposure, 1 << 62))
+        facts[walking.START_TICK : walking.MARKS] = (
+            self.start_tick, self._exposure_ticks, self._period_ticks, self._max_block, self._plan.cycle_ticks, self._dark_cycle,
+            watch_at,
         )  # fmt: skip
         facts[walking.JITTER_TICKS] = self.jitter_ticks
         buffer, spans = messages

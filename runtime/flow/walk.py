@@ -1,7 +1,7 @@
 """The compiled way of a flow's messages: decoded FRAMES and MARK bodies into the ring, up to the first block of which something comes.
 
 Owns the ordinary case: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves untouched and stops there:
-`flow.FlowCore` then takes that one by itself, and both continue the same state. Never allocates.
+`FlowCore` then takes that one by itself, and both continue the same state. Never allocates.
 """
 
 from __future__ import annotations
@@ -12,38 +12,26 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pans.runtime.wire.kernels import (
-    BLOCK_HEADER,
-    BODY_HEADER,
-    LARGEST,
-    MARK_BYTES,
-    block_shape,
-    block_times,
-    is_next,
-    load4,
-    load8,
-    mark_photons,
-    mark_truth,
-)
-from pans.runtime.wire.schema import MessageType
+from pans.runtime.wire import walk as stream
+from pans.runtime.wire.kernels import load4, load8
 
 from .kernels import EMPTY_FRAMES, NEXT, put_frames, scan
 
-# facts, int64 (N_FACTS,): where the stream stands, as ingest.StreamTracker and follower.Follower know it, ...
-NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, START_TICK = range(5)
+# facts, int64 (N_FACTS,): where the stream stands (stream.N_PLACE columns), ...
 # ... what a block must be like, and when it should end, ...
-EXPOSURE_TICKS, PERIOD_TICKS, MAX_BLOCK, CYCLE_TICKS, DARK_CYCLE, WATCH_AT = range(5, 11)
+START_TICK, EXPOSURE_TICKS, PERIOD_TICKS, MAX_BLOCK, CYCLE_TICKS, DARK_CYCLE, WATCH_AT = range(
+    stream.N_PLACE, stream.N_PLACE + 7
+)
 # ... and what came of the call
-BLOCKS, EXPOSURES, MARKS, PASSAGES, END_TICK, JITTER_TICKS, N_FACTS = range(11, 18)
+MARKS, PASSAGES, END_TICK, JITTER_TICKS, N_FACTS = range(WATCH_AT + 1, WATCH_AT + 6)
 # a mark, int64 (N_MARK,); its photons stand beside it in an array of their own
 M_SEQ, M_OBJECT, M_TRUTH, M_EXPOSURE, M_TICK, M_HALF, N_MARK = range(7)
 
 _U = np.uint64
-_FRAMES, _MARK = int(MessageType.FRAMES), int(MessageType.MARK)
 
 
 class FlowArrays(NamedTuple):
-    """The ring and what follows it, see flow_kernels.py; `limits` is empty where no passages are looked for. `out` are the passages."""
+    """The ring and what follows it, see kernels.py; `limits` is empty where no passages are looked for. `out` are the passages."""
 
     words: npt.NDArray[np.uint64]
     counts: npt.NDArray[np.int16]
@@ -71,41 +59,34 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
     """
     words, counts, limits, state = flow.words, flow.counts, flow.limits, flow.state
     dark_channels = flow.dark_channels
-    facts[BLOCKS] = facts[EXPOSURES] = facts[MARKS] = facts[PASSAGES] = 0
+    facts[stream.MESSAGES] = facts[stream.EXPOSURES] = facts[MARKS] = facts[PASSAGES] = 0
     at = place
     while at < spans.shape[0]:
         start, stop = _U(spans[at, 0]), _U(spans[at, 1])
-        payload = start + _U(BODY_HEADER)
-        if load4(buffer, payload) != _U(facts[NEXT_SEQ]):
-            break
-        if buffer[start] == _MARK:
-            if stop - payload != _U(MARK_BYTES) or facts[MARKS] == marks.photons.size:
+        payload = start + _U(stream.BODY_HEADER)
+        if buffer[start] == stream.MARK:
+            if not stream.is_next_mark(buffer, payload, stop, facts) or facts[MARKS] == marks.photons.size:
                 break
-            if load8(buffer, payload + _U(12)) >= LARGEST or load8(buffer, payload + _U(20)) >= LARGEST:
+            if load8(buffer, payload + _U(12)) >= stream.LARGEST or load8(buffer, payload + _U(20)) >= stream.LARGEST:
                 break
             _take_mark(buffer, payload, marks, facts[MARKS])
             facts[MARKS] += 1
-            facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
+            stream.go_on(facts, 0)
             at += 1
             continue
-        if buffer[start] != _FRAMES:
+        if buffer[start] != stream.FRAMES:
             break
-        first = facts[NEXT_EXPOSURE]
-        count, width = block_shape(buffer, payload, stop)
+        first = facts[stream.NEXT_EXPOSURE]
+        count, width = stream.next_block(buffer, payload, stop, facts)
         if count == 0 or count > facts[MAX_BLOCK] or 8 * width < dark_channels.size:
             break
-        if not is_next(buffer, payload, count, facts[NEXT_SEQ], facts[DROPS], first, facts[END_EXPOSURE]):
-            break
-        tick, period = block_times(buffer, payload)
+        tick, period = stream.block_times(buffer, payload)
         if period != facts[PERIOD_TICKS]:
             break
-        frames_at = np.int64(payload) + BLOCK_HEADER
+        frames_at = np.int64(payload) + stream.BLOCK_HEADER
         frames = buffer[frames_at : frames_at + count * width].reshape(count, width)
         put_frames(frames, first, words, counts, facts[DARK_CYCLE], state, dark_channels, mask)
-        facts[NEXT_SEQ] = (facts[NEXT_SEQ] + 1) & 0xFFFFFFFF
-        facts[NEXT_EXPOSURE] = first + count
-        facts[BLOCKS] += 1
-        facts[EXPOSURES] += count
+        stream.go_on(facts, count)
         _note_end(tick, count, facts, slot_offsets)
         at += 1
         if not limits.size:
@@ -120,15 +101,15 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
 def _take_mark(buffer, payload, marks, number):  # type: ignore[no-untyped-def]
     row = marks.rows[number]
     row[M_SEQ], row[M_OBJECT] = np.int64(load4(buffer, payload)), np.int64(load4(buffer, payload + _U(4)))
-    row[M_TRUTH], row[M_HALF] = mark_truth(buffer, payload), np.int64(load4(buffer, payload + _U(8)) >> _U(16))
+    row[M_TRUTH], row[M_HALF] = stream.mark_truth(buffer, payload), np.int64(load4(buffer, payload + _U(8)) >> _U(16))
     row[M_EXPOSURE], row[M_TICK] = np.int64(load8(buffer, payload + _U(12))), np.int64(load8(buffer, payload + _U(20)))
-    mark_photons(buffer, payload, marks.photons, number)
+    stream.mark_photons(buffer, payload, marks.photons, number)
 
 
 @njit(cache=True, nogil=True)
 def _note_end(tick, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
     """Note when the block's last exposure ended, and by how much that is not the plan's time."""
-    last = facts[NEXT_EXPOSURE] - 1
+    last = facts[stream.NEXT_EXPOSURE] - 1
     facts[END_TICK] = tick + (count - 1) * facts[PERIOD_TICKS] + facts[EXPOSURE_TICKS]
     cycle = last // slot_offsets.size
     planned = facts[START_TICK] + cycle * facts[CYCLE_TICKS] + slot_offsets[last - cycle * slot_offsets.size]

@@ -1,0 +1,76 @@
+"""What compiled walks through a stream ask of decoded FRAMES and MARK messages: what they hold, and whether they come next.
+
+Owns the offsets of these messages (docs/reference/protocol.md) and the account of the stream's place for kernels; never allocates and
+keeps no state of its own. A walk takes messages that are in order and without loss and leaves all others to `StreamTracker`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from .kernels import load4, load8
+from .schema import BLOCK_HEADER_BYTES, HEADER, STRUCTS, MessageType
+
+# Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
+# and what the walk has taken.
+NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, MESSAGES, EXPOSURES, N_PLACE = range(7)
+FRAMES, MARK = int(MessageType.FRAMES), int(MessageType.MARK)
+BODY_HEADER, BLOCK_HEADER, MARK_BYTES = HEADER.size, BLOCK_HEADER_BYTES, STRUCTS["MARK"].size
+LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
+_U = np.uint64
+
+
+@njit(cache=True, nogil=True)
+def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
+    """Frames and bytes per frame of the FRAMES payload from `payload` to `stop`.
+
+    (0, 0) when it is not as long as it says, does not follow `place` without loss, or goes beyond the plan.
+    """
+    if stop - payload <= _U(BLOCK_HEADER):
+        return 0, 0
+    shape = load4(buffer, payload + _U(28))
+    count, width = np.int64(shape & _U(0xFFFF)), np.int64(shape >> _U(16))
+    if (
+        np.int64(stop - payload) != BLOCK_HEADER + count * width
+        or load4(buffer, payload) != _U(place[NEXT_SEQ])
+        or load4(buffer, payload + _U(4)) != _U(place[DROPS])
+        or load8(buffer, payload + _U(8)) >= LARGEST
+        or load8(buffer, payload + _U(16)) != _U(place[NEXT_EXPOSURE])
+        or place[NEXT_EXPOSURE] + count > place[END_EXPOSURE]
+    ):
+        return 0, 0
+    return count, width
+
+
+@njit(cache=True, nogil=True)
+def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
+    """Whether the payload from `payload` to `stop` is a whole MARK and follows `place` without loss."""
+    return stop - payload == _U(MARK_BYTES) and load4(buffer, payload) == _U(place[NEXT_SEQ])
+
+
+@njit(cache=True, nogil=True)
+def go_on(place, count):  # type: ignore[no-untyped-def]
+    """Account for the next message, with `count` exposures."""
+    place[NEXT_SEQ] = (place[NEXT_SEQ] + 1) & 0xFFFFFFFF
+    place[MESSAGES] += 1
+    place[NEXT_EXPOSURE] += count
+    place[EXPOSURES] += count
+
+
+@njit(cache=True, nogil=True)
+def block_times(buffer, payload):  # type: ignore[no-untyped-def]
+    """The tick at which a block's first exposure began, and the ticks from one to the next; int64."""
+    return np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
+
+
+@njit(cache=True, nogil=True)
+def mark_photons(buffer, payload, photons, place):  # type: ignore[no-untyped-def]
+    """Put a MARK's photons into `photons` float32 at `place`, bit for bit."""
+    photons[place : place + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
+
+
+@njit(cache=True, nogil=True)
+def mark_truth(buffer, payload):  # type: ignore[no-untyped-def]
+    """A MARK's truth, int64; -1: unknown."""
+    return np.int64(np.int16(np.uint16(load4(buffer, payload + _U(8)) & _U(0xFFFF))))
