@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser, settings: type[Any]) -> None:
             elif words.get("action") != "store_true":
                 words["default"] = list(one.default) if words.get("action") == "append" else one.default
         if not {"type", "action", "choices"} & set(words):
-            words["type"] = type(one.default)
+            words["type"] = str if isinstance(one.default, tuple) else type(one.default)
         parser.add_argument(flag, **words)
 
 

@@ -83,7 +83,8 @@ class Stand:
 def test_options_reach_the_trial_and_the_verdict_the_exit_code(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    words = ["trials", "clock", "a", "--often", "5", "--name", "x", "--name", "y", "--json", "--", "--further", "-w"]
+    options = ["--often", "5", "--name", "x", "--name", "y"]
+    words = ["trials", "--json", "clock", *options, "a", "--", "--further", "-w"]
     assert main(words) == 1
     given, endless = json.loads(capsys.readouterr().out)["rows"]
     assert given == {
