@@ -136,7 +136,7 @@ def _replay_problem(path: Path) -> str:
         found = replay(recording, recording.bundle())
     except PansError as error:
         return error.message
-    return "" if found == (recording.n_decisions, recording.decisions_sha256) else f"{path}: its replay differs"
+    return "" if found[:2] == (recording.n_decisions, recording.decisions_sha256) else f"{path}: its replay differs"
 
 
 def _sample(pid: int, state: Path, port: int, out: Path, elapsed_s: float) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""One `pans run`, carried out: what is prepared while the port opens, who looks on, the files it leaves, the exit code.
+"""One `pans run`, carried out: what is prepared while the port opens, who observes it, the files it leaves, the exit code.
 
-Owns the order of these; arguments are cmd_run.py's, the run itself is loop.py's. `carry_out` returns the exit code.
+Owns the order of these; arguments are run.py's, the run itself is live/loop.py's. `run_job` returns what came of it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ import argparse
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -20,6 +21,9 @@ from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_
 from .job import Job, recording_header, what_was_run
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.reconnect import Recovery
     from pans.runtime.live.run import LiveCore
     from pans.runtime.record import AnyRecorder
+    from pans.runtime.report.summary import Summary
 
 T = TypeVar("T")
 
@@ -58,10 +63,31 @@ class _Background(Generic[T]):
         return self._value[0]
 
 
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a job: its summary, truth against decision (classes, classes), and the files that it left."""
+
+    summary: Summary
+    confusion: NDArray[np.int64]
+    recording: Path | None
+    report: Path | None
+
+
 def carry_out(args: argparse.Namespace, job: Job) -> int:
-    """Run the job, leave its files and return the exit code."""
+    """Run the job, say how it went and return the exit code."""
+    from pans.runtime.report.words import closing_words
+
+    done = run_job(job, process_start_ns())
+    files = {"recording": str(done.recording), "report": str(done.report)}
+    payload = {**done.summary.as_json(), **files, "shots": job.shots, "seed": job.seed}
+    emit(args, payload, closing_words(done.summary, **files))
+    return _exit_code(done.summary)
+
+
+def run_job(job: Job, started_ns: int = 0) -> Outcome:
+    """Run the job and leave its files; `started_ns` (time.perf_counter_ns) is when it was asked for, 0: now."""
     with stop_signals(continuous=not (job.seconds or job.decisions)) as stop:
-        return _carry_out(args, job, stop)
+        return _run_job(job, started_ns or time.perf_counter_ns(), stop)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +103,6 @@ class _Prepared:
     passing: FlowRun | None
     config: RunConfig
     header: dict[str, Any]
-    recording: Path
     expected_decisions: int
 
 
@@ -113,18 +138,16 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
         core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
     config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
-    job.out.mkdir(parents=True, exist_ok=True)
+    if job.out is not None:
+        job.out.mkdir(parents=True, exist_ok=True)
     header = recording_header(job, bundle_sha256, decider, n_objects)
     header["config"]["dark"] = dark.header()
     if passing is not None:
         header["config"]["flow"] = passing.header()
-    recording = job.record or job.out / "run.pansrec"
-    expected = n_objects * job.trials
-    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, passing, config, header, recording, expected)
+    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, passing, config, header, n_objects * job.trials)
 
 
-def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
-    started_ns = process_start_ns()
+def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
     opening = _Background(lambda: open_link(job.device))
     try:
         from pans.runtime.container import read_file
@@ -142,16 +165,19 @@ def _carry_out(args: argparse.Namespace, job: Job, stop: Stop) -> int:
     if job.trace is not None:
         link = TracedLink(link, job.trace, job.device)
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
+    if job.recording is None:
+        result = _watched(job, ready, link, None, recovery, stop)
+        return _conclude(job, ready, result, _summary(job, ready, result))
     bundle_bytes = read_file(job.bundle_path)
-    with open_recorder(ready.recording, ready.header, bundle_bytes, job.continuous.limits) as recorder:
+    with open_recorder(job.recording, ready.header, bundle_bytes, job.continuous.limits) as recorder:
         result = _watched(job, ready, link, recorder, recovery, stop)
         summary = _summary(job, ready, result)
-        result.decisions_sha256 = summary["decisions_sha256"] = recorder.close(summary)
-    return _conclude(args, job, ready, result, summary)
+        summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
+    return _conclude(job, ready, result, summary)
 
 
 def _watched(
-    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder, recovery: Recovery | None, stop: Stop
+    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, stop: Stop
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
@@ -162,8 +188,8 @@ def _watched(
 
     bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder)
     title = f"{bundle.name} on {job.profile.name}"
-    view = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
-    with seen, view as watch:
+    show = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
+    with seen, show if job.shows else nullcontext() as watch:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
@@ -173,45 +199,38 @@ def _watched(
 
         def look(run: LiveRun, output: Output) -> None:
             dark.look(run, output)
-            watch(run, output)
+            if watch is not None:
+                watch(run, output)
 
         observers = Observers(look, prepared, stop)
         return run_live(link, dark.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers)
 
 
-def _summary(job: Job, ready: _Prepared, result: RunResult) -> dict[str, Any]:
+def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
     from pans.runtime.report.summary import summarise
 
     frames = job.shots * (1 if job.flow is None else job.flow.pool)
-    summary = summarise(
+    return summarise(
         result,
         illumination=ready.bundle.illumination() * frames,
         expected_decisions=ready.expected_decisions,
-        flow=None if ready.passing is None else ready.passing.summary(),
+        flow=None if ready.passing is None else ready.passing.figures(),
+        dark=ready.dark.figures(),
     )
-    ready.dark.add_to(summary)
+
+
+def _conclude(job: Job, ready: _Prepared, result: RunResult, summary: Summary) -> Outcome:
+    """Write the page and return what came of the run."""
+    from pans.runtime.report.summary_page import write_markdown
+
+    confusion, page, bundle = result.tally.confusion, None, ready.bundle
     if ready.passing is not None:
-        result.tally.confusion += ready.passing.core.matcher.confusion
-    return summary
-
-
-def _conclude(args: argparse.Namespace, job: Job, ready: _Prepared, result: RunResult, summary: dict[str, Any]) -> int:
-    """Write the page, say how it went and return the exit code."""
-    from pans.runtime.report.summary import write_markdown
-    from pans.runtime.report.words import closing_words
-
-    page, bundle = job.out / "summary.md", ready.bundle
-    facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, ready.recording, summary)
-    write_markdown(page, summary, facts, result.tally, bundle.classes)
-    payload = {
-        **summary,
-        "recording": str(ready.recording),
-        "report": str(page),
-        "shots": job.shots,
-        "seed": job.seed,
-    }
-    emit(args, payload, closing_words(payload))
-    return _exit_code(summary)
+        confusion = confusion + ready.passing.core.matcher.confusion
+    if job.out is not None:
+        page = job.out / "summary.md"
+        facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, summary)
+        write_markdown(page, summary, facts, confusion, bundle.classes)
+    return Outcome(summary, confusion, job.recording, page)
 
 
 def process_start_ns() -> int:
@@ -233,13 +252,13 @@ def _close_quietly(opening: _Background[Any]) -> None:
         say(f"pans: besides, the device could not be opened: {error}")
 
 
-def _exit_code(summary: dict[str, Any]) -> int:
-    if summary["ended"] == ASKED_TO_STOP:
+def _exit_code(summary: Summary) -> int:
+    if summary.ended == ASKED_TO_STOP:
         return EXIT_FINE  # what went wrong on the way stands in the summary
-    if summary["ended"] == INTERRUPTED:
+    if summary.ended == INTERRUPTED:
         return EXIT_INTERRUPTED
-    if summary["link_lost"]:
+    if summary.link_lost:
         return EXIT_DEVICE
-    if summary["late"] or summary["lost"]:
+    if summary.late or summary.lost:
         return EXIT_TIMING
-    return EXIT_FINE if summary["verdict"] == "PASS" else EXIT_ALERT
+    return EXIT_FINE if summary.verdict == "PASS" else EXIT_ALERT

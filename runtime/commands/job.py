@@ -6,7 +6,7 @@ Owns the keys of the recording's header; never measures and never runs anything.
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from pans.runtime.live.continuous import Continuous
 
 if TYPE_CHECKING:
     from pans.runtime.decide.verdict import Decider
+    from pans.runtime.report.summary import Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,39 +28,45 @@ class Job:
     bundle_path: Path
     device: str
     profile: Profile
-    out: Path
-    shots: int
-    trials: int
-    decisions: int
-    seconds: float
     deadline_us: float
-    order: str
-    dark_slots: int
-    backend: str
-    realtime: bool
-    core: int | None
-    record: Path | None
-    reconnect_s: float
-    trace: Path | None
-    command: str
-    flow: FlowSettings | None
-    act: str
     act_profile: Profile
-    dark: DarkSettings
-    continuous: Continuous
+    out: Path | None = (
+        None  # folder for the recording and the summary page; None: no page, and no recording but `record`
+    )
+    record: Path | None = None
+    shots: int = 1
+    trials: int = 1
+    decisions: int = 0
+    seconds: float = 0.0
+    order: str = "auto"
+    dark_slots: int = 1
+    backend: str = "auto"
+    realtime: bool = True
+    core: int | None = None
+    reconnect_s: float = 10.0
+    trace: Path | None = None
+    command: str = ""
+    flow: FlowSettings | None = None
+    act: str = "device"
+    dark: DarkSettings = field(default_factory=DarkSettings)
+    continuous: Continuous = field(default_factory=Continuous)
     seed: int | None = None  # of a simulated detector, where the command has one
+    shows: bool = True  # what is happening, on stderr
+
+    @property
+    def recording(self) -> Path | None:
+        """The recording to write, if any."""
+        return self.record if self.record or self.out is None else self.out / "run.pansrec"
 
 
-def what_was_run(
-    job: Job, name: str, bundle_sha256: str, backend: str, recording: Path, summary: dict[str, Any]
-) -> dict[str, str]:
+def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary: Summary) -> dict[str, str]:
     """The lines below the summary page's figures."""
     return {
         "bundle": f"{name} ({job.bundle_path.name}, SHA-256 {bundle_sha256[:16]}…)",
-        "device": f"{job.device} (firmware {summary['device'].get('firmware', 'unknown')})",
+        "device": f"{job.device} (firmware {summary.device.get('firmware', 'unknown')})",
         "profile": f"{job.profile.name}: {job.profile.description}",
         "decision back end": backend,
-        "recording": f"{recording} (decision log SHA-256 {summary['decisions_sha256'][:16]}…; `pans replay` recomputes it)",
+        "recording": f"{job.recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; `pans replay` recomputes it)",
         "command": f"`{job.command}`",
         "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
     }

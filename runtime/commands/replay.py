@@ -6,15 +6,15 @@ Owns the command; the replay itself is record/replay.py's.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
-from pans.runtime.record import read_recording, replay
+from pans.runtime.record import Recording, read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.record.pictures import PictureLog
+from pans.runtime.record.replay import Replayed
 from pans.runtime.report.words import passage_words
 
 
@@ -33,53 +33,55 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     if args.recording.is_dir():
         return _run_parts(args)
-    recording = read_recording(args.recording)
-    bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
     pictures = PictureLog() if args.pictures or args.truth else None
-    figures: dict[str, Any] = {}
-    n_decisions, sha256 = replay(recording, bundle, pictures, figures)
-    identical = sha256 == recording.decisions_sha256
+    recording, found = _replayed(args, args.recording, pictures)
+    identical = found.sha256 == recording.decisions_sha256
     payload = {
-        "decisions": n_decisions,
-        "sha256": sha256,
+        "decisions": found.decisions,
+        "sha256": found.sha256,
         "recorded_sha256": recording.decisions_sha256,
         "identical": identical,
         "complete": recording.complete,
-        **figures,
+        **_figures(found),
     }
     if pictures is not None and args.pictures:
         pictures.write(args.pictures)
     if pictures is not None and args.truth:
         payload |= pictures.compare(args.truth)
     words = "identical" if identical else f"DIFFERENT from the recorded log ({recording.n_decisions} decisions)"
-    emit(args, payload, "\n".join([f"{n_decisions} decisions, SHA-256 {sha256}: {words}", *_passage_words(figures)]))
+    head = f"{found.decisions} decisions, SHA-256 {found.sha256}: {words}"
+    emit(args, payload, "\n".join([head, *_words(found)]))
     return EXIT_FINE if identical else EXIT_ALERT
-
-
-def _passage_words(figures: Mapping[str, Any]) -> list[str]:
-    return passage_words(figures) if "passages" in figures else []
 
 
 def _run_parts(args: argparse.Namespace) -> int:
     """Replay each part of a recording by itself."""
     rows: list[dict[str, Any]] = []
+    lines: list[str] = []
     for path in parts_in(args.recording):
-        recording = read_recording(path)
-        bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
-        figures: dict[str, Any] = {}
-        n_decisions, sha256 = replay(recording, bundle, None, figures)
-        same = sha256 == recording.decisions_sha256
-        rows.append({"part": path.name, "decisions": n_decisions, "sha256": sha256, "identical": same, **figures})
+        recording, found = _replayed(args, path)
+        same = found.sha256 == recording.decisions_sha256
+        facts = {"part": path.name, "decisions": found.decisions, "sha256": found.sha256, "identical": same}
+        rows.append(facts | _figures(found))
+        lines += [f"{path.name}: {found.decisions} decisions: {'identical' if same else 'DIFFERENT'}", *_words(found)]
     identical = all(row["identical"] for row in rows)
     payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
-    lines = []
-    for row in rows:
-        lines += [
-            f"{row['part']}: {row['decisions']} decisions: {'identical' if row['identical'] else 'DIFFERENT'}",
-            *_passage_words(row),
-        ]
     emit(args, payload, "\n".join(lines))
     return EXIT_FINE if identical else EXIT_ALERT
+
+
+def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None = None) -> tuple[Recording, Replayed]:
+    recording = read_recording(path)
+    bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
+    return recording, replay(recording, bundle, pictures)
+
+
+def _figures(found: Replayed) -> dict[str, Any]:
+    return {} if found.passages is None else found.passages.as_json()
+
+
+def _words(found: Replayed) -> list[str]:
+    return [] if found.passages is None else passage_words(found.passages)
 
 
 REPLAY = Command("recompute a recording's decisions and compare", _configure, _run)

@@ -18,6 +18,7 @@ from pans.runtime.instrument.profile import Profile
 
 from .cells import CellCore
 from .core import FlowCore
+from .matching import PassageFigures
 from .plan import build_flow_plan
 from .settings import FlowSettings, flow_limits, flow_of_header
 from .tape import TapeCore
@@ -72,10 +73,10 @@ def recorded_flow_core(
     )
 
 
-def replayed_figures(core: FlowCore, events: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def replayed_figures(core: FlowCore, events: Iterable[Mapping[str, Any]]) -> PassageFigures:
     """Return what a replayed flow was worth; `events` tell which pulses were not made."""
     core.matcher.finish()
     for event in events:
         if event["kind"] in ("gate_refused", "gate_expired") and "decision" in event:
             core.matcher.undo(int(event["decision"]))
-    return core.matcher.summary(core.frames)
+    return core.matcher.figures(core.frames)

@@ -1,7 +1,7 @@
 """What the decisions about passing objects were worth: they are matched with the MARKs that tell the truth, afterwards.
 
 Owns counts of marks that were decided, missed, doubled, in coincidence or in a gap, and of pulses that met their target; never takes part
-in a decision. `PassageMatcher.summary` returns the figures with 95 % Wilson intervals. Memory is bounded: a mark is settled when no
+in a decision. `PassageMatcher.figures` returns the figures with 95 % Wilson intervals. Memory is bounded: a mark is settled when no
 decision can reach it any more.
 
 A mark's object is in the field from `half_exposures` before its centre to as many after it. Two marks whose times in the field overlap
@@ -11,6 +11,7 @@ are in coincidence: they are counted apart, since no instrument could tell them 
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,10 @@ from pans.runtime.wire.messages import Mark
 MAX_REMEMBERED_PULSES = 1 << 16  # whose fate may still change
 MAX_GAPS = 4096
 _ABSTAINED, _COINCIDENCE = int(DecisionFlag.ABSTAINED), int(DecisionFlag.COINCIDENCE)
+COUNTED = (
+    *("decisions", "marks", "alone", "missed", "doubled", "coincident", "coincident_aborted", "coincident_labelled"),
+    *("in_gaps", "cut_off", "without_mark", "targets", "pulses", "pulses_on_target", "pulses_pure"),
+)
 REASONS = (  # the first that applies names an abort
     (int(DecisionFlag.GAP), "gap"),
     (int(DecisionFlag.INCOMPLETE), "incomplete"),
@@ -50,6 +55,45 @@ class _Row(NamedTuple):
     clicks: int
     passage_clicks: int
     gated: bool
+
+
+class Share(NamedTuple):
+    """A share with its 95 % Wilson interval; None where there is nothing to take it of."""
+
+    value: float | None
+    interval: list[float] | None
+
+
+def share(n: int, of: int) -> Share:
+    """Return `n` of `of`."""
+    return Share(n / of, list(wilson_interval(n, of))) if of else Share(None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class PassageFigures:
+    """What the decisions about passing objects were worth; means are per decision, None where there is nothing."""
+
+    accuracy: Share
+    accuracy_labelled: Share
+    missed: Share
+    doubled: Share
+    yield_: Share
+    purity: Share
+    aborted: dict[str, int]
+    passages: dict[str, int]
+    clicks_mean: float | None
+    photons_mean: float | None
+    passage_clicks_mean: float | None
+    passage_photons_mean: float | None
+    centre_offset_exposures: dict[str, float | None]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures under the contract's keys; a share is two of them."""
+        facts: dict[str, Any] = {}
+        for field in fields(self):
+            key, value = field.name.rstrip("_"), getattr(self, field.name)
+            facts |= {key: value.value, f"{key}_ci": value.interval} if isinstance(value, Share) else {key: value}
+        return facts
 
 
 class PassageMatcher:
@@ -207,45 +251,33 @@ class PassageMatcher:
 
     # -- what came of it -----------------------------------------------------------------------------------------------
 
-    def summary(self, frames: int) -> dict[str, Any]:
-        """Return the figures under the contract's keys; `frames` exposures are a decision. Shares are None where there is nothing."""
+    def figures(self, frames: int) -> PassageFigures:
+        """Return the figures; `frames` exposures are a decision. Shares are None where there is nothing."""
         counts = self.counts
         decided = int(self.confusion.sum()) + counts["alone_aborted"]
         right = int(np.trace(self.confusion))
         seen = counts["alone"] - counts["missed"]
         photons = self._photons * frames / seen if seen else None
         gain = counts["alone_passage_clicks"] / counts["alone_clicks"] if counts["alone_clicks"] else None
-        shares = {
-            "accuracy": (right, decided),
-            "accuracy_labelled": (right, int(self.confusion.sum())),
-            "missed": (counts["missed"], counts["alone"]),
-            "doubled": (counts["doubled"], counts["alone"]),
-            "yield": (counts["pulses_on_target"], counts["targets"]),
-            "purity": (counts["pulses_pure"], counts["pulses"]),
-        }
-        figures: dict[str, Any] = {}
-        for name, (n, of) in shares.items():
-            figures[name] = n / of if of else None
-            figures[f"{name}_ci"] = list(wilson_interval(n, of)) if of else None
         mean = counts["offset"] / seen if seen else 0.0
-        return figures | {
-            "aborted": dict(sorted(self.aborted.items())),
-            "passages": {
-                name: counts[name]
-                for name in (
-                    "decisions", "marks", "alone", "missed", "doubled", "coincident", "coincident_aborted", "coincident_labelled",
-                    "in_gaps", "cut_off", "without_mark", "targets", "pulses", "pulses_on_target", "pulses_pure",
-                )
-            },
-            "clicks_mean": counts["alone_clicks"] / seen if seen else _ratio(counts["clicks"], counts["decisions"]),
-            "photons_mean": photons,
-            "passage_clicks_mean": _ratio(counts["passage_clicks"], counts["decisions"]),
-            "passage_photons_mean": None if photons is None or gain is None else photons * gain,
-            "centre_offset_exposures": {
+        return PassageFigures(
+            accuracy=share(right, decided),
+            accuracy_labelled=share(right, int(self.confusion.sum())),
+            missed=share(counts["missed"], counts["alone"]),
+            doubled=share(counts["doubled"], counts["alone"]),
+            yield_=share(counts["pulses_on_target"], counts["targets"]),
+            purity=share(counts["pulses_pure"], counts["pulses"]),
+            aborted=dict(sorted(self.aborted.items())),
+            passages={name: counts[name] for name in COUNTED},
+            clicks_mean=counts["alone_clicks"] / seen if seen else _ratio(counts["clicks"], counts["decisions"]),
+            photons_mean=photons,
+            passage_clicks_mean=_ratio(counts["passage_clicks"], counts["decisions"]),
+            passage_photons_mean=None if photons is None or gain is None else photons * gain,
+            centre_offset_exposures={
                 "mean": mean if seen else None,
                 "std": max(0.0, counts["offset_squared"] / seen - mean**2) ** 0.5 if seen else None,
             },
-        }  # fmt: skip
+        )
 
 
 def until_field(mark: Mark) -> int:

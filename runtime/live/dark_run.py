@@ -6,6 +6,7 @@ from the recording's header (`recorded_guard`).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,6 +38,16 @@ FALSE_ALARM_H = (
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
 NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFigures:
+    """What the summary says of the calibration and of the light during the run, and the faults that follow."""
+
+    calibration: dict[str, Any] | None
+    warnings: list[str]
+    light: dict[str, Any] | None
+    faults: list[str]
 
 
 class DarkRun:
@@ -120,15 +131,9 @@ class DarkRun:
                 if words:
                     run.journal.event({"kind": "light_changed", **self.light.found[-1]})
 
-    def add_to(self, summary: dict[str, Any]) -> None:
-        """Add calibration, its warnings and the light to a run's summary; data that contradict the calibration are a fault."""
+    def figures(self) -> DarkFigures:
+        """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults."""
         one = self.calibration
-        summary["calibration"] = (
-            None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
-        )
-        summary["calibration_warnings"] = self.warnings
-        summary["light"] = self.light.report()
-        contradicted = [] if one is None else [str(found["words"]) for found in self.light.found]
-        if contradicted:
-            summary["faults"] = [*summary["faults"], *contradicted]
-            summary["verdict"] = "FAIL"
+        facts = None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
+        faults = [] if one is None else [str(found["words"]) for found in self.light.found]
+        return DarkFigures(facts, self.warnings, self.light.report(), faults)

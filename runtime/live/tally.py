@@ -1,6 +1,6 @@
 """What the decisions of a run add up to: accuracy with both spreads, clicks, photons, confusion.
 
-Owns integer sums, updated per decision; never touches single photons. `RunTally.summary` returns the figures of the contract.
+Owns integer sums, updated per decision; never touches single photons. `RunTally.figures` returns the figures of the contract.
 Spread over trials: how much the mean accuracy of one pass over the objects varies. Spread over objects: the standard error from
 having measured only these objects.
 """
@@ -8,7 +8,7 @@ having measured only these objects.
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,21 @@ from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
 
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
+
+
+@dataclass(frozen=True, slots=True)
+class TallyFigures:
+    """What decisions add up to; None where it is not known. Clicks and photons are per decision."""
+
+    accuracy: float | None
+    accuracy_std_trials: float | None
+    accuracy_stderr_objects: float | None
+    objects: int
+    trials: int
+    decisions: int
+    abstained: int
+    clicks_mean: float | None
+    photons_mean: float | None
 
 
 class RunTally:
@@ -88,17 +103,17 @@ class RunTally:
         total = sum(n for n, _ in self._trials.values())
         return sum(right for _, right in self._trials.values()) / total if total else None
 
-    def summary(self) -> dict[str, Any]:
+    def figures(self) -> TallyFigures:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
         per_trial = [right / n for n, right in self._trials.values() if n]
-        return {
-            "accuracy": self.accuracy,
-            "accuracy_std_trials": float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
-            "accuracy_stderr_objects": self._spread_over_objects(),
-            "objects": self.objects,
-            "trials": len(self._trials),
-            "decisions": self.decisions,
-            "abstained": self.abstained,
-            "clicks_mean": self.clicks / self.decisions if self.decisions else None,
-            "photons_mean": self.photons / self.photons_known if self.photons_known else None,
-        }
+        return TallyFigures(
+            accuracy=self.accuracy,
+            accuracy_std_trials=float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
+            accuracy_stderr_objects=self._spread_over_objects(),
+            objects=self.objects,
+            trials=len(self._trials),
+            decisions=self.decisions,
+            abstained=self.abstained,
+            clicks_mean=self.clicks / self.decisions if self.decisions else None,
+            photons_mean=self.photons / self.photons_known if self.photons_known else None,
+        )

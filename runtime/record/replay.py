@@ -7,7 +7,7 @@ of their log, which is the recorded one when nothing has changed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
+from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
@@ -34,23 +35,22 @@ from .recording import Recording
 from .sent_plan import sent_plan
 
 
-def replay(
-    recording: Recording,
-    bundle: Bundle,
-    pictures: PictureLog | None = None,
-    figures: dict[str, Any] | None = None,
-) -> tuple[int, str]:
-    """Return how many decisions `recording` gives with `bundle`, and the SHA-256 of their log.
+class Replayed(NamedTuple):
+    """What a replay gave: how many decisions, the SHA-256 of their log, and what those about passing objects were worth."""
 
-    `pictures` collects those given back, `figures` what the decisions about passing objects were worth.
-    """
+    decisions: int
+    sha256: str
+    passages: PassageFigures | None
+
+
+def replay(recording: Recording, bundle: Bundle, pictures: PictureLog | None = None) -> Replayed:
+    """Decide `recording` again with `bundle`; `pictures` collects those given back."""
     core, n_decisions, sha256 = _replayed(recording, bundle, pictures)
-    if figures is not None and isinstance(core, FlowCore):
-        figures |= replayed_figures(core, recording.events())
-    return n_decisions, sha256
+    passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
+    return Replayed(n_decisions, sha256, passages)
 
 
-def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[dict[str, Any], NDArray[np.int64]]:
+def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures, NDArray[np.int64]]:
     """Return what a replay's decisions about passing objects were worth, and truth against decision (classes, classes).
 
     UsageError where nothing passed.

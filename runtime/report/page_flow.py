@@ -40,7 +40,7 @@ def add_passages(page: Page, recording: Recording, bundle: Bundle | None) -> Non
 
     figures, confusion = replayed_flow(recording, bundle)
     pulses = _pulses(recording, bundle)
-    page.table(flow_rows({**figures, "gates": {name: len(numbers) for name, numbers in pulses.items()}}))
+    page.table(flow_rows(figures, {name: len(numbers) for name, numbers in pulses.items()}))
     if "part" in recording.header:
         page.text(
             "This is one part of a run: objects whose truth came in the part before count as without one.", "note"

@@ -1,67 +1,130 @@
-"""The summary of a run: the JSON of the contract, the verdict, and a Markdown page for people.
+"""The summary of a run: its figures, its faults and the verdict, as facts and as the JSON of the contract.
 
-Owns how results are worded; never measures. `summarise` returns the JSON object, `write_markdown` writes the page beside and
-renames it. A simulated run says SIMULATED in both.
+Owns what stands in it and in which order; never measures and never words a page (summary_page.py, words.py).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from pans.runtime.container import replace_file
+from pans.runtime.instrument.dark_rate import DarkReport
 from pans.runtime.live.config import RunResult
-from pans.runtime.live.tally import RunTally
-
-from .words import flow_faults, flow_rows
+from pans.runtime.live.dark_run import DarkFigures
+from pans.runtime.live.flow_run import FlowFigures
+from pans.runtime.live.tally import TallyFigures
 
 MAX_VERDICTS = 20  # of a summary; the recording has them all
 
 
-def summarise(
-    result: RunResult, *, illumination: float, expected_decisions: int, flow: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return the run's figures under the contract's keys; `illumination` is per decision, in photoelectrons per unit transmission.
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run came to. The fields are the contract's keys in their order; what `tally` and `flow` hold stands beside the others."""
 
-    `flow` is what FlowRun says of passing objects; its figures replace those of still ones.
-    """
-    tally, timing = result.tally, result.timing
+    tally: TallyFigures
+    flow: FlowFigures | None  # of passing objects: its figures replace those of still ones
+    illumination: float  # per decision, photoelectrons per unit transmission
+    late: int
+    late_blame: dict[str, int]
+    late_cause: dict[str, int]
+    lost_cause: dict[str, int]
+    blame: list[dict[str, Any]]
+    lost: int
+    latency_us: dict[str, float]
+    stage_latency_us: dict[str, dict[str, float]]
+    deadline_us: float
+    clock: dict[str, Any]
+    slot_jitter_us: float
+    wrong_patterns: int
+    dark: DarkReport
+    stream: dict[str, int]
+    link: dict[str, int]
+    realtime: dict[str, Any]
+    device: dict[str, Any]
+    armed_after_s: float
+    seconds: float
+    ended: str
+    link_lost: bool
+    reconnects: int
+    decisions_sha256: str
+    simulated: bool
+    verdict: str
+    faults: list[str]
+    calibration: dict[str, Any] | None
+    calibration_warnings: list[str]
+    light: dict[str, Any] | None
+
+    @property
+    def accuracy(self) -> float | None:
+        """Of all decisions with a known truth, or of the objects that passed alone."""
+        return self.tally.accuracy if self.flow is None else self.flow.passages.accuracy.value
+
+    @property
+    def clicks_mean(self) -> float | None:
+        """Clicks per decision."""
+        return (self.tally if self.flow is None else self.flow.passages).clicks_mean
+
+    @property
+    def photons_mean(self) -> float | None:
+        """Expected photoelectrons per decision; None where the instrument does not know."""
+        return (self.tally if self.flow is None else self.flow.passages).photons_mean
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the summary under the contract's keys, in their order."""
+        facts = asdict(self.tally) | ({} if self.flow is None else self.flow.as_json())
+        for field in fields(self)[2:]:
+            facts[field.name] = getattr(self, field.name)
+        return facts | {"dark": asdict(self.dark)}
+
+
+def summarise(
+    result: RunResult,
+    *,
+    illumination: float,
+    expected_decisions: int,
+    flow: FlowFigures | None = None,
+    dark: DarkFigures | None = None,
+) -> Summary:
+    """Return the summary of `result`; `illumination` is per decision, in photoelectrons per unit transmission."""
+    timing = result.timing
+    dark = DarkFigures(None, [], None, []) if dark is None else dark
     faults = find_faults(result, expected_decisions, aborts_are_faults=flow is None)
-    faults += [] if flow is None else flow_faults(flow)
-    return {
-        **tally.summary(),
-        **(flow or {}),
-        "illumination": illumination,
-        "late": timing.late,
-        "late_blame": timing.blame,
-        "late_cause": result.late_cause,
-        "lost_cause": result.lost_cause,
-        "blame": [event for event in result.events if event["kind"] == "blame"][:MAX_VERDICTS],
-        "lost": result.stream["lost_exposures"],
-        "latency_us": timing.total.summary(),
-        "stage_latency_us": {name: histogram.summary() for name, histogram in timing.stages.items()},
-        "deadline_us": timing.deadline_ns / 1000,
-        "clock": result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
-        "slot_jitter_us": result.slot_jitter_us,
-        "wrong_patterns": result.wrong_patterns,
-        "dark": asdict(result.dark),
-        "stream": result.stream,
-        "link": result.decoder,
-        "realtime": result.realtime,
-        "device": _plain_device(result.device),
-        "armed_after_s": result.armed_after_s,
-        "seconds": result.seconds,
-        "ended": result.ended,
-        "link_lost": result.link_lost,
-        "reconnects": result.reconnects,
-        "decisions_sha256": result.decisions_sha256,
-        "simulated": bool(result.device.get("simulated")),
-        "verdict": "FAIL" if faults else "PASS",
-        "faults": faults,
-    }
+    faults += ([] if flow is None else gate_faults(flow.gates)) + dark.faults
+    return Summary(
+        tally=result.tally.figures(),
+        flow=flow,
+        illumination=illumination,
+        late=timing.late,
+        late_blame=timing.blame,
+        late_cause=result.late_cause,
+        lost_cause=result.lost_cause,
+        blame=[event for event in result.events if event["kind"] == "blame"][:MAX_VERDICTS],
+        lost=result.stream["lost_exposures"],
+        latency_us=timing.total.summary(),
+        stage_latency_us={name: histogram.summary() for name, histogram in timing.stages.items()},
+        deadline_us=timing.deadline_ns / 1000,
+        clock=result.clock | {"worst_uncertainty_us": timing.worst_uncertainty_ns / 1000},
+        slot_jitter_us=result.slot_jitter_us,
+        wrong_patterns=result.wrong_patterns,
+        dark=result.dark,
+        stream=result.stream,
+        link=result.decoder,
+        realtime=result.realtime,
+        device=_plain_device(result.device),
+        armed_after_s=result.armed_after_s,
+        seconds=result.seconds,
+        ended=result.ended,
+        link_lost=result.link_lost,
+        reconnects=result.reconnects,
+        decisions_sha256=result.decisions_sha256,
+        simulated=bool(result.device.get("simulated")),
+        verdict="FAIL" if faults else "PASS",
+        faults=faults,
+        calibration=dark.calibration,
+        calibration_warnings=dark.warnings,
+        light=dark.light,
+    )
 
 
 def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: bool = True) -> list[str]:
@@ -92,113 +155,11 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     return faults
 
 
-def write_markdown(
-    path: Path, summary: Mapping[str, Any], facts: Mapping[str, Any], tally: RunTally, classes: Sequence[str]
-) -> None:
-    """Write the summary page; `facts` are name -> text lines about what was run (bundle, profile, device, command)."""
-    simulated = " (SIMULATED)" if summary["simulated"] else ""
-    lines = [f"# Run of {facts.get('bundle', 'a bundle')}{simulated}", ""]
-    if summary["simulated"]:
-        lines += ["> **SIMULATED**: the clicks come from a simulated instrument, not from light.", ""]
-    lines += [f"**{summary['verdict']}**" + "".join(f"\n- {fault}" for fault in summary["faults"]), ""]
-    lines += [
-        *_figures(summary),
-        "",
-        *_timing(summary),
-        "",
-        *_blame(summary),
-        *_confusion(tally, classes),
-        "",
-        "## What was run",
-        "",
-    ]
-    lines += [f"- {name}: {text}" for name, text in facts.items()]
-    replace_file(path, ("\n".join(lines) + "\n").encode())
-
-
-def _figures(summary: Mapping[str, Any]) -> list[str]:
-    rows = [
-        ("accuracy", _percent(summary["accuracy"])),
-        ("spread over trials (standard deviation)", _percent(summary["accuracy_std_trials"])),
-        ("spread over objects (standard error)", _percent(summary["accuracy_stderr_objects"])),
-        ("objects × trials", f"{summary['objects']} × {summary['trials']}"),
-        ("decisions (abstained)", f"{summary['decisions']} ({summary['abstained']})"),
-        ("clicks per decision", _number(summary["clicks_mean"])),
-        ("photons per decision (expected photoelectrons)", _number(summary["photons_mean"])),
-        ("illumination per decision (sum of pattern intensities)", _number(summary["illumination"])),
-        (
-            "dark clicks per dark exposure",
-            f"{summary['dark']['clicks']} in {summary['dark']['exposures']}, 95 % interval "
-            f"{summary['dark']['low']:.2g} to {summary['dark']['high']:.2g}, profile {summary['dark']['expected']:.2g}",
-        ),
-    ]
-    if "flow" in summary:
-        rows += flow_rows(summary)
-    return ["## Results", "", "| figure | value |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in rows)]
-
-
-def _timing(summary: Mapping[str, Any]) -> list[str]:
-    head = [
-        "## Timing",
-        "",
-        "Microseconds; from the end of the last exposure (device clock) to the decision, and by stage.",
-        "",
-    ]
-    table = ["| stage | p50 | p99 | p99.9 | max |", "| --- | --- | --- | --- | --- |"]
-    stages = {"**exposure end to decision**": summary["latency_us"], **summary["stage_latency_us"]}
-    for name, row in stages.items():
-        table.append(f"| {name} | {row['p50']:.0f} | {row['p99']:.0f} | {row['p999']:.0f} | {row['max']:.0f} |")
-    granted = (
-        ", ".join(f"{what}: {answer}" for what, answer in summary["realtime"].items())
-        or "virtual time: nothing asked for"
-    )
-    tail = [
-        "",
-        f"- deadline {summary['deadline_us']:.0f} us: {summary['late']} late; {summary['lost']} exposures lost",
-        f"- clock: uncertainty at most {summary['clock']['worst_uncertainty_us']:.0f} us, "
-        f"drift {summary['clock'].get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary['slot_jitter_us']:.1f} us",
-        f"- armed {summary['armed_after_s']:.2f} s after the start; measured for {summary['seconds']:.1f} s; ended: {summary['ended']}",
-        f"- real-time set-up: {granted}",
-    ]
-    return head + table + tail
-
-
-def _blame(summary: Mapping[str, Any]) -> list[str]:
-    """Who is to blame for late and missing work, with the first verdicts in words."""
-    if not summary["blame"]:
-        return []
-    sums = [(what, summary[key]) for what, key in (("late decisions", "late_cause"), ("lost exposures", "lost_cause"))]
-    lines = ["## Late and missing work", ""]
-    for what, causes in sums:
-        if causes:
-            named = ", ".join(f"{cause} {count}" for cause, count in sorted(causes.items(), key=lambda item: -item[1]))
-            lines.append(f"- {what} by cause: {named}")
-    lines += ["", "| what | cause | sure | why |", "| --- | --- | --- | --- |"]
-    for event in summary["blame"]:
-        late = event["what"] == "late"
-        what = f"{event['decisions']} late" if late else f"{event['exposures']} exposures missing"
-        lines.append(f"| {what} | {event['cause']} | {'yes' if event['sure'] else 'no'} | {event['why']} |")
-    return [*lines, ""]
-
-
-def _confusion(tally: RunTally, classes: Sequence[str]) -> list[str]:
-    if not tally.confusion.any():
-        return []
-    head = ["## Decisions by class", "", "Rows: truth; columns: decision.", "", "| | " + " | ".join(classes) + " |"]
-    rule = "| --- |" + " --- |" * len(classes)
-    body = [
-        f"| **{name}** | " + " | ".join(str(n) if n else "·" for n in row) + " |"
-        for name, row in zip(classes, tally.confusion)
-    ]
-    return [*head, rule, *body]
-
-
-def _percent(value: float | None) -> str:
-    return "unknown" if value is None else f"{100 * value:.2f} %"
-
-
-def _number(value: float | None) -> str:
-    return "unknown (the instrument does not know)" if value is None or math.isnan(value) else f"{value:.3f}"
+def gate_faults(gates: Mapping[str, int]) -> list[str]:
+    """Return one sentence if pulses were not made."""
+    lost = gates.get("refused", 0) + gates.get("expired", 0)
+    counts = f"{gates.get('refused', 0)} refused, {gates.get('expired', 0)} expired"
+    return [f"{lost} of {gates['asked']} pulses were not made: {counts}"] if lost else []
 
 
 def _plain_device(device: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A run's figures in words: closing lines for a terminal, rows for pages, sentences for faults.
+"""A run's figures in words: closing lines for a terminal, rows for pages.
 
 Owns wording alone; never measures. Each call returns text.
 """
@@ -6,88 +6,83 @@ Owns wording alone; never measures. Each call returns text.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pans.runtime.flow.matching import PassageFigures, Share
+    from pans.runtime.live.flow_run import FlowFigures
+
+    from .summary import Summary
 
 
-def closing_words(summary: dict[str, Any]) -> str:
+def closing_words(summary: Summary, recording: str, report: str) -> str:
     """The lines that the command ends with."""
-    banner = "SIMULATED · " if summary["simulated"] else ""
-    accuracy = "unknown" if summary["accuracy"] is None else f"{summary['accuracy']:.2%}"
-    clicks = summary["clicks_mean"] or 0.0
-    photons = "unknown" if summary["photons_mean"] is None else f"{summary['photons_mean']:.2f}"
-    latency = summary["latency_us"]
+    banner = "SIMULATED · " if summary.simulated else ""
+    accuracy = "unknown" if summary.accuracy is None else f"{summary.accuracy:.2%}"
+    clicks = summary.clicks_mean or 0.0
+    photons = "unknown" if summary.photons_mean is None else f"{summary.photons_mean:.2f}"
+    latency, tally = summary.latency_us, summary.tally
     lines = [
-        f"{banner}{summary['verdict']}: {summary['decisions']} decisions ({summary['objects']} objects × {summary['trials']} trials)",
-        f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary['illumination']:.1f} each",
+        f"{banner}{summary.verdict}: {tally.decisions} decisions ({tally.objects} objects × {tally.trials} trials)",
+        f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary.illumination:.1f} each",
         f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
-        f"max {latency['max']:.0f} us; late {summary['late']}, lost {summary['lost']}",
-        *(flow_words(summary) if "flow" in summary else ()),
-        *(f"  fault         {fault}" for fault in summary["faults"]),
-        f"  recording     {summary['recording']}",
-        f"  report        {summary['report']}",
+        f"max {latency['max']:.0f} us; late {summary.late}, lost {summary.lost}",
+        *([] if summary.flow is None else flow_words(summary.flow)),
+        *(f"  fault         {fault}" for fault in summary.faults),
+        f"  recording     {recording}",
+        f"  report        {report}",
     ]
     return "\n".join(lines)
 
 
-def flow_faults(summary: Mapping[str, Any]) -> list[str]:
-    """Return one sentence for each broken promise of the gates."""
-    gates = summary["gates"]
-    lost = gates.get("refused", 0) + gates.get("expired", 0)
-    return (
-        [f"{lost} of {gates['asked']} pulses were not made: {gates['refused']} refused, {gates['expired']} expired"]
-        if lost
-        else []
-    )
-
-
-def flow_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+def flow_rows(passages: PassageFigures, gates: Mapping[str, int]) -> list[tuple[str, str]]:
     """Return name and text of the figures that only a flow has."""
-    counts, gates = summary["passages"], summary["gates"]
-    aborted = ", ".join(f"{name} {n}" for name, n in summary["aborted"].items()) or "none"
+    counts = passages.passages
+    aborted = ", ".join(f"{name} {n}" for name, n in passages.aborted.items()) or "none"
     rows = [
         (
             "passages (alone, in coincidence, in gaps)",
             f"{counts['alone']}, {counts['coincident']}, {counts['in_gaps']}",
         ),
-        ("accuracy per passage alone, 95 % interval", _share(summary, "accuracy")),
-        ("accuracy where a label was given", _share(summary, "accuracy_labelled")),
-        ("missed, of those alone", _share(summary, "missed")),
-        ("doubled, of those alone", _share(summary, "doubled")),
+        ("accuracy per passage alone, 95 % interval", _share(passages.accuracy)),
+        ("accuracy where a label was given", _share(passages.accuracy_labelled)),
+        ("missed, of those alone", _share(passages.missed)),
+        ("doubled, of those alone", _share(passages.doubled)),
         ("decisions without a passage", str(counts["without_mark"])),
         ("coincidences aborted / labelled", f"{counts['coincident_aborted']} / {counts['coincident_labelled']}"),
         ("aborted", aborted),
-        ("yield (targets pulsed)", _share(summary, "yield")),
-        ("purity (pulses on a target alone)", _share(summary, "purity")),
+        ("yield (targets pulsed)", _share(passages.yield_)),
+        ("purity (pulses on a target alone)", _share(passages.purity)),
         ("pulses asked, done, refused, expired", ", ".join(str(n) for n in gates.values())),
-        ("clicks of the whole passage", _mean(summary["passage_clicks_mean"])),
-        ("photons of the whole passage, at least (scaled by clicks)", _mean(summary["passage_photons_mean"])),
+        ("clicks of the whole passage", _mean(passages.passage_clicks_mean)),
+        ("photons of the whole passage, at least (scaled by clicks)", _mean(passages.passage_photons_mean)),
     ]
     return rows
 
 
-def flow_words(summary: Mapping[str, Any]) -> list[str]:
+def flow_words(flow: FlowFigures) -> list[str]:
     """Return the lines of a flow's closing words."""
-    gates = summary["gates"]
+    gates = flow.gates
     pulses = f"asked {gates['asked']}, done {gates['done']}, refused {gates['refused']}, expired {gates['expired']}"
-    return [*passage_words(summary), f"  gates         {pulses}"]
+    return [*passage_words(flow.passages), f"  gates         {pulses}"]
 
 
-def passage_words(summary: Mapping[str, Any]) -> list[str]:
+def passage_words(passages: PassageFigures) -> list[str]:
     """Return what the decisions about passing objects were worth, in lines; all of it is known in a replay, too."""
-    counts = summary["passages"]
+    counts = passages.passages
     return [
         f"  passages      {counts['marks']}: {counts['alone']} alone, {counts['coincident']} in coincidence, {counts['in_gaps']} in gaps; "
-        f"missed {_share(summary, 'missed')}, doubled {_share(summary, 'doubled')}",
-        f"  accuracy      {_share(summary, 'accuracy')} of those alone",
-        f"  aborted       {', '.join(f'{name} {n}' for name, n in summary['aborted'].items()) or 'none'}",
-        f"  light         {_mean(summary['clicks_mean'])} clicks of the window, {_mean(summary['passage_clicks_mean'])} of the passage",
-        f"  pulses        {counts['pulses']} made; yield {_share(summary, 'yield')}, purity {_share(summary, 'purity')}",
+        f"missed {_share(passages.missed)}, doubled {_share(passages.doubled)}",
+        f"  accuracy      {_share(passages.accuracy)} of those alone",
+        f"  aborted       {', '.join(f'{name} {n}' for name, n in passages.aborted.items()) or 'none'}",
+        f"  light         {_mean(passages.clicks_mean)} clicks of the window, {_mean(passages.passage_clicks_mean)} of the passage",
+        f"  pulses        {counts['pulses']} made; yield {_share(passages.yield_)}, purity {_share(passages.purity)}",
     ]
 
 
-def _share(summary: Mapping[str, Any], name: str) -> str:
-    value, interval = summary[name], summary[f"{name}_ci"]
-    return "unknown" if value is None else f"{value:.3%} ({interval[0]:.3%} to {interval[1]:.3%})"
+def _share(share: Share) -> str:
+    value, interval = share
+    return "unknown" if value is None or interval is None else f"{value:.3%} ({interval[0]:.3%} to {interval[1]:.3%})"
 
 
 def _mean(value: float | None) -> str:

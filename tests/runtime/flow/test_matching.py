@@ -39,21 +39,21 @@ def test_each_fate_is_counted_once() -> None:
     decide(found, 4, 500, 1)  # nothing was there
     decide(found, 5, 600, NO_LABEL, DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)
     found.settle(10_000)
-    summary = found.summary(1)
-    counts = summary["passages"]
+    summary = found.figures(1)
+    counts = summary.passages
     expected = {
         "marks": 6, "alone": 4, "missed": 1, "doubled": 1, "coincident": 2, "coincident_aborted": 1, "coincident_labelled": 0,
         "in_gaps": 0, "without_mark": 1, "targets": 6, "pulses": 3, "pulses_on_target": 2, "pulses_pure": 2, "decisions": 6, "cut_off": 0,
     }  # fmt: skip
     assert counts == expected
-    assert summary["accuracy"] == 1 / 3  # right of three decided alone: an abort is not right
-    assert summary["accuracy_labelled"] == 1 / 2
-    assert summary["missed_ci"] == list(wilson_interval(1, 4))
-    assert summary["yield"] == 2 / 6
-    assert summary["purity"] == 2 / 3
-    assert summary["aborted"] == {"ambiguous": 1, "coincidence": 1}
+    assert summary.accuracy.value == 1 / 3  # right of three decided alone: an abort is not right
+    assert summary.accuracy_labelled.value == 1 / 2
+    assert summary.missed.interval == list(wilson_interval(1, 4))
+    assert summary.yield_.value == 2 / 6
+    assert summary.purity.value == 2 / 3
+    assert summary.aborted == {"ambiguous": 1, "coincidence": 1}
     assert found.confusion.tolist() == [[0, 0, 0], [0, 1, 1], [0, 0, 0]]
-    assert (summary["clicks_mean"], summary["photons_mean"], summary["passage_photons_mean"]) == (4, 5.0, 50.0)
+    assert (summary.clicks_mean, summary.photons_mean, summary.passage_photons_mean) == (4, 5.0, 50.0)
 
 
 def test_a_gap_takes_its_passages_out_of_the_figures() -> None:
@@ -63,7 +63,7 @@ def test_a_gap_takes_its_passages_out_of_the_figures() -> None:
     found.add_gap(115, 130)
     decide(found, 0, 200, 1)
     found.settle(10_000)
-    counts = found.summary(1)["passages"]
+    counts = found.figures(1).passages
     assert (counts["in_gaps"], counts["alone"], counts["missed"]) == (1, 1, 0)
 
 
@@ -73,8 +73,8 @@ def test_bars_that_touch_are_no_coincidence() -> None:
         found.add_mark(mark(number, 100 + 39 * number, truth=number % 2))
         decide(found, number, 100 + 39 * number, number % 2)
     found.settle(10_000)
-    summary = found.summary(1)
-    assert (summary["passages"]["alone"], summary["accuracy"], summary["purity"]) == (10, 1.0, 1.0)
+    summary = found.figures(1)
+    assert (summary.passages["alone"], summary.accuracy.value, summary.purity.value) == (10, 1.0, 1.0)
 
 
 def test_what_the_end_cuts_off_is_neither_missed_nor_counted() -> None:
@@ -85,7 +85,7 @@ def test_what_the_end_cuts_off_is_neither_missed_nor_counted() -> None:
     decide(found, 1, 185, NO_LABEL, DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED)
     found.settle(200)
     found.finish()
-    counts = found.summary(1)["passages"]
+    counts = found.figures(1).passages
     assert (counts["marks"], counts["cut_off"], counts["missed"], counts["without_mark"]) == (1, 1, 0, 0)
 
 
@@ -99,8 +99,8 @@ def test_a_pulse_that_was_not_made_is_taken_back_whenever_that_is_known(before: 
     found.settle(10_000)
     if not before:
         found.undo(0)
-    summary = found.summary(1)
-    assert (summary["passages"]["pulses"], summary["yield"], summary["purity"]) == (0, 0.0, None)
+    summary = found.figures(1)
+    assert (summary.passages["pulses"], summary.yield_.value, summary.purity.value) == (0, 0.0, None)
 
 
 def test_memory_is_bounded_and_the_order_of_settling_changes_nothing() -> None:
@@ -117,7 +117,7 @@ def test_memory_is_bounded_and_the_order_of_settling_changes_nothing() -> None:
         assert len(often._marks) + len(often._rows) < 40
     once.settle(centres[-1] + 1000)
     often.settle(centres[-1] + 1000)
-    assert once.summary(1) == often.summary(1)
+    assert once.figures(1) == often.figures(1)
     assert once.counts["alone"] > 500
 
 
@@ -127,7 +127,7 @@ def test_without_marks_rows_do_not_pile_up() -> None:
         decide(found, number, 100 * number, 1)
         found.settle(100 * number + 60)
     assert len(found._rows) < 10
-    assert found.summary(1)["accuracy"] is None
+    assert found.figures(1).accuracy.value is None
 
 
 def test_reasons_have_names() -> None:

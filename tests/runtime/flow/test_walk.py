@@ -89,7 +89,7 @@ def state_of(core: FlowCore) -> dict[str, Any]:
         "jitter": core.jitter_ticks,
         "tallies": core.tallies.tolist(),
         "empty": (core.empty_frames, core.empty_channels.tolist()),
-        "matched": core.matcher.summary(1),
+        "matched": core.matcher.figures(1),
         "n": (core.n_decisions, core.n_abstained, core.n_passages),
     }
 

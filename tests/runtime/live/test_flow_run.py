@@ -95,7 +95,7 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     pulses = [pulse.tick for pulse in device.gates.pulses]
     assert len(asked) > 20
     assert pulses == asked[: len(pulses)]
-    summary = flow.summary()
+    summary = flow.figures().as_json()
     assert summary["gates"]["done"] == len(pulses)
     assert summary["passages"]["pulses"] == len(pulses)
 

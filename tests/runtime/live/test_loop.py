@@ -94,12 +94,12 @@ def run(
 @pytest.mark.parametrize("order", ["pattern-major", "shot-major"])
 def test_every_object_is_decided_on_time_and_truth_is_known(bundle: Bundle, scene: Path, order: str) -> None:
     result = run(bundle, scene, order=order)
-    summary = result.tally.summary()
+    summary = result.tally.figures()
     assert result.ended == "completed"
-    assert (summary["decisions"], summary["objects"], summary["trials"], summary["abstained"]) == (18, 6, 3, 0)
+    assert (summary.decisions, summary.objects, summary.trials, summary.abstained) == (18, 6, 3, 0)
     assert (result.timing.late, result.stream["lost_exposures"], result.wrong_patterns) == (0, 0, 0)
-    assert 0 < summary["clicks_mean"] <= 4
-    assert summary["photons_mean"] > summary["clicks_mean"] * 0.5
+    assert 0 < summary.clicks_mean <= 4
+    assert summary.photons_mean > summary.clicks_mean * 0.5
     assert result.slot_jitter_us == 0.0
     assert result.dark.exposures > 0
     assert result.clock["drift_ppm"] == pytest.approx(-20, abs=1)
@@ -107,7 +107,7 @@ def test_every_object_is_decided_on_time_and_truth_is_known(bundle: Bundle, scen
 
 def test_virtual_runs_are_the_same_bit_for_bit(bundle: Bundle, scene: Path) -> None:
     first, second = run(bundle, scene), run(bundle, scene)
-    assert first.tally.summary() == second.tally.summary()
+    assert first.tally.figures() == second.tally.figures()
     np.testing.assert_array_equal(first.tally.confusion, second.tally.confusion)
 
 
@@ -124,7 +124,7 @@ def test_bytes_one_at_a_time_change_nothing(bundle: Bundle, scene: Path) -> None
             return out
 
     dripped = run(bundle, scene, n_objects=2, wrap=lambda link: Drip(link, None))
-    assert dripped.tally.summary() == run(bundle, scene, n_objects=2).tally.summary()
+    assert dripped.tally.figures() == run(bundle, scene, n_objects=2).tally.figures()
 
 
 def test_damaged_frames_become_flagged_decisions_never_wrong_ones(bundle: Bundle, scene: Path) -> None:
@@ -210,9 +210,7 @@ def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path)
     result = run(headed, scene, shots=4, trials=2)
     assert result.tally.decisions == 12
     assert result.tally.clicks / 12 > 4 * 0.2
-    assert result.tally.summary()["photons_mean"] == pytest.approx(
-        4 * run(headed, scene).tally.summary()["photons_mean"]
-    )
+    assert result.tally.figures().photons_mean == pytest.approx(4 * run(headed, scene).tally.figures().photons_mean)
 
 
 def test_the_plan_survives_the_wire(bundle: Bundle) -> None:

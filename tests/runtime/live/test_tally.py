@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,12 +23,12 @@ def test_spreads_over_trials_and_objects_are_different_things() -> None:
     for obj, row in enumerate(right):
         for trial, value in enumerate(row):
             tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
-    summary = tally.summary()
-    assert summary["accuracy"] == pytest.approx(right.mean())
-    assert summary["accuracy_std_trials"] == pytest.approx(right.mean(axis=0).std(ddof=1))
-    assert summary["accuracy_stderr_objects"] == pytest.approx(right.mean(axis=1).std(ddof=1) / 2)
-    assert (summary["objects"], summary["trials"], summary["decisions"]) == (4, 3, 12)
-    assert (summary["clicks_mean"], summary["photons_mean"]) == (4.0, 6.0)
+    summary = tally.figures()
+    assert summary.accuracy == pytest.approx(right.mean())
+    assert summary.accuracy_std_trials == pytest.approx(right.mean(axis=0).std(ddof=1))
+    assert summary.accuracy_stderr_objects == pytest.approx(right.mean(axis=1).std(ddof=1) / 2)
+    assert (summary.objects, summary.trials, summary.decisions) == (4, 3, 12)
+    assert (summary.clicks_mean, summary.photons_mean) == (4.0, 6.0)
     assert tally.confusion.tolist() == [[0, 0], [6, 6]]
 
 
@@ -37,16 +39,16 @@ def test_an_abstention_is_not_right_and_stands_in_no_column() -> None:
     assert tally.accuracy == 0.5
     assert tally.abstained == 1
     assert tally.confusion.sum() == 1
-    assert tally.summary()["photons_mean"] is None
+    assert tally.figures().photons_mean is None
 
 
 def test_without_truth_there_is_no_accuracy() -> None:
     tally = RunTally(2, 2)
     tally.add(decision(0, 0, 1, -1), 3.0)
-    summary = tally.summary()
-    assert summary["accuracy"] is None
-    assert summary["accuracy_std_trials"] is None
-    assert summary["photons_mean"] == 6.0  # two shots of three photons each
+    summary = tally.figures()
+    assert summary.accuracy is None
+    assert summary.accuracy_std_trials is None
+    assert summary.photons_mean == 6.0  # two shots of three photons each
 
 
 def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,8 +62,8 @@ def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.Mo
             for trial, value in enumerate(row):
                 tally.add(decision(obj, trial, 1 if value else 0, 1), 6.0)
         assert len(tally._objects) <= most
-        summaries.append(tally.summary())
+        summaries.append(tally.figures())
     whole, summed = summaries
-    assert summed["objects"] == 500
-    assert summed.pop("accuracy_stderr_objects") == pytest.approx(whole.pop("accuracy_stderr_objects"), rel=1e-12)
-    assert summed == whole
+    assert summed.objects == 500
+    assert summed.accuracy_stderr_objects == pytest.approx(whole.accuracy_stderr_objects, rel=1e-12)
+    assert replace(summed, accuracy_stderr_objects=whole.accuracy_stderr_objects) == whole

@@ -68,7 +68,7 @@ def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
     for path in paths:
         recording = read_recording(path)
         assert recording.complete
-        count, sha256 = replay(recording, recording.bundle())
+        count, sha256, _ = replay(recording, recording.bundle())
         assert (count, sha256) == (recording.n_decisions, recording.decisions_sha256)
         assert count > 50
         assert recording.decisions()["index"][0] == first_decision(recording)
@@ -103,7 +103,7 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
     assert len(paths) > 2
     for path in paths:
         recording = read_recording(path)
-        assert replay(recording, recording.bundle()) == (recording.n_decisions, recording.decisions_sha256), path
+        assert replay(recording, recording.bundle())[:2] == (recording.n_decisions, recording.decisions_sha256), path
     assert all(verdict.ok for verdict in verify_folder(tmp_path)), verify_folder(tmp_path)
     assert sum(read_recording(path).n_decisions for path in paths) == result.tally.decisions
 

@@ -1,0 +1,127 @@
+"""The summary of a run as a Markdown page for people, written beside the recording.
+
+Owns how results are worded there; never measures. A simulated run says SIMULATED.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.container import replace_file
+
+from .summary import Summary
+from .words import flow_rows
+
+
+def write_markdown(
+    path: Path, summary: Summary, facts: Mapping[str, Any], confusion: NDArray[np.int64], classes: Sequence[str]
+) -> None:
+    """Write the summary page; `facts` are name -> text lines about what was run (bundle, profile, device, command)."""
+    simulated = " (SIMULATED)" if summary.simulated else ""
+    lines = [f"# Run of {facts.get('bundle', 'a bundle')}{simulated}", ""]
+    if summary.simulated:
+        lines += ["> **SIMULATED**: the clicks come from a simulated instrument, not from light.", ""]
+    lines += [f"**{summary.verdict}**" + "".join(f"\n- {fault}" for fault in summary.faults), ""]
+    lines += [
+        *_figures(summary),
+        "",
+        *_timing(summary),
+        "",
+        *_causes(summary),
+        *_confusion(confusion, classes),
+        "",
+        "## What was run",
+        "",
+    ]
+    lines += [f"- {name}: {text}" for name, text in facts.items()]
+    replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def _figures(summary: Summary) -> list[str]:
+    rows = [
+        ("accuracy", _percent(summary.accuracy)),
+        ("spread over trials (standard deviation)", _percent(summary.tally.accuracy_std_trials)),
+        ("spread over objects (standard error)", _percent(summary.tally.accuracy_stderr_objects)),
+        ("objects × trials", f"{summary.tally.objects} × {summary.tally.trials}"),
+        ("decisions (abstained)", f"{summary.tally.decisions} ({summary.tally.abstained})"),
+        ("clicks per decision", _number(summary.clicks_mean)),
+        ("photons per decision (expected photoelectrons)", _number(summary.photons_mean)),
+        ("illumination per decision (sum of pattern intensities)", _number(summary.illumination)),
+        (
+            "dark clicks per dark exposure",
+            f"{summary.dark.clicks} in {summary.dark.exposures}, 95 % interval "
+            f"{summary.dark.low:.2g} to {summary.dark.high:.2g}, profile {summary.dark.expected:.2g}",
+        ),
+    ]
+    if summary.flow is not None:
+        rows += flow_rows(summary.flow.passages, summary.flow.gates)
+    return ["## Results", "", "| figure | value |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in rows)]
+
+
+def _timing(summary: Summary) -> list[str]:
+    head = [
+        "## Timing",
+        "",
+        "Microseconds; from the end of the last exposure (device clock) to the decision, and by stage.",
+        "",
+    ]
+    table = ["| stage | p50 | p99 | p99.9 | max |", "| --- | --- | --- | --- | --- |"]
+    stages = {"**exposure end to decision**": summary.latency_us, **summary.stage_latency_us}
+    for name, row in stages.items():
+        table.append(f"| {name} | {row['p50']:.0f} | {row['p99']:.0f} | {row['p999']:.0f} | {row['max']:.0f} |")
+    granted = (
+        ", ".join(f"{what}: {answer}" for what, answer in summary.realtime.items()) or "virtual time: nothing asked for"
+    )
+    tail = [
+        "",
+        f"- deadline {summary.deadline_us:.0f} us: {summary.late} late; {summary.lost} exposures lost",
+        f"- clock: uncertainty at most {summary.clock['worst_uncertainty_us']:.0f} us, "
+        f"drift {summary.clock.get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary.slot_jitter_us:.1f} us",
+        f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {summary.ended}",
+        f"- real-time set-up: {granted}",
+    ]
+    return head + table + tail
+
+
+def _causes(summary: Summary) -> list[str]:
+    """What made work late or lost it, with the first verdicts in words."""
+    if not summary.blame:
+        return []
+    sums = (("late decisions", summary.late_cause), ("lost exposures", summary.lost_cause))
+    lines = ["## Late and missing work", ""]
+    for what, causes in sums:
+        if causes:
+            named = ", ".join(f"{cause} {count}" for cause, count in sorted(causes.items(), key=lambda item: -item[1]))
+            lines.append(f"- {what} by cause: {named}")
+    lines += ["", "| what | cause | sure | why |", "| --- | --- | --- | --- |"]
+    for event in summary.blame:
+        late = event["what"] == "late"
+        what = f"{event['decisions']} late" if late else f"{event['exposures']} exposures missing"
+        lines.append(f"| {what} | {event['cause']} | {'yes' if event['sure'] else 'no'} | {event['why']} |")
+    return [*lines, ""]
+
+
+def _confusion(confusion: NDArray[np.int64], classes: Sequence[str]) -> list[str]:
+    if not confusion.any():
+        return []
+    head = ["## Decisions by class", "", "Rows: truth; columns: decision.", "", "| | " + " | ".join(classes) + " |"]
+    rule = "| --- |" + " --- |" * len(classes)
+    body = [
+        f"| **{name}** | " + " | ".join(str(n) if n else "·" for n in row) + " |"
+        for name, row in zip(classes, confusion)
+    ]
+    return [*head, rule, *body]
+
+
+def _percent(value: float | None) -> str:
+    return "unknown" if value is None else f"{100 * value:.2f} %"
+
+
+def _number(value: float | None) -> str:
+    return "unknown (the instrument does not know)" if value is None or math.isnan(value) else f"{value:.3f}"

@@ -1,0 +1,38 @@
+"""The summary of a seeded run in virtual time, compared key by key with a stored one: scripts read it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pans.runtime.cli import main
+
+MEASURED = ("armed_after_s", "realtime", "recording", "report")  # of this machine and this run
+DEMO = ("demo", "--pace", "fast", "--trials", "2")
+
+
+def of_a_flow(folder: Path) -> tuple[str, ...]:
+    bundle, scene, settings = (str(folder / name) for name in ("thirds.pans", "cells.toml", "flow.toml"))
+    device = f"sim:flow-snspd?scene={scene}&seed=4&pace=fast"
+    return ("run", bundle, "--device", device, "--flow", settings, "--seconds", "0.1", "--gate-class", "b,c")
+
+
+@pytest.mark.parametrize("kind", ["still", "flow"])
+def test_the_summary_has_the_contracts_keys_order_and_values(
+    kind: str, flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = DEMO if kind == "still" else of_a_flow(flow_folder)
+    assert main([*words, "--out", str(tmp_path), "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    wanted: dict[str, Any] = json.loads((Path(__file__).parent / f"summary_{kind}.json").read_text())
+    assert list(found) == list(wanted)
+    for key in wanted:
+        if key == "device":
+            assert list(found[key]) == list(wanted[key])
+        elif key not in MEASURED:
+            assert found[key] == wanted[key], key
+            if isinstance(wanted[key], dict):
+                assert list(found[key]) == list(wanted[key]), key
