@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.instrument.profile import Profile, load_profile
 
@@ -43,9 +43,7 @@ def small_bundle(profile: Profile, exposure_us: float) -> Bundle:
         task="small",
         classes=("a", "b", "c"),
         image_shape=(2, 2),
-        levels=top + 1,
-        pattern_levels=levels,
-        photons_per_level=exposure_us * 1e-6 * profile.projector.peak_photoelectrons_hz / top,
-        table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32),
+        optics=Shown(top + 1, levels, exposure_us * 1e-6 * profile.projector.peak_photoelectrons_hz / top),
+        back_end=BackEnd(table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32)),
         provenance={},
     )

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.core.still import Core
@@ -177,10 +177,8 @@ def _bundle_and_plan() -> tuple[Bundle, Plan]:
         task="bench",
         classes=("a", "b"),
         image_shape=(2, 2),
-        levels=top + 1,
-        pattern_levels=levels,
-        photons_per_level=exposure_s * profile.projector.peak_photoelectrons_hz / top,
-        table=np.zeros((1 << N_PATTERNS, 2), np.float32),
+        optics=Shown(top + 1, levels, exposure_s * profile.projector.peak_photoelectrons_hz / top),
+        back_end=BackEnd(table=np.zeros((1 << N_PATTERNS, 2), np.float32)),
         provenance={},
     )
     return bundle, build_plan(profile, bundle, shots_per_object=BUFFER_MESSAGES)

@@ -1,6 +1,6 @@
 """The trained artifact in one file: quantised patterns, a back end (table, ONNX head or both), golden vectors, provenance.
 
-Owns how a bundle is made, written and loaded; what it is stands in bundle_facts.py, its bytes in bundle_format.py. Never shows
+Owns how a bundle is made, written and loaded; what it is stands in facts.py, its bytes in format.py. Never shows
 a pattern and never decides. A read either returns a `Bundle` whose every byte is covered by a checksum and whose table
 answers the golden vectors, or raises DamagedFileError.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,9 @@ from .int8 import Int8Head
 from .optics import Analyser
 
 __all__ = [
+    "BackEnd",
     "Bundle",
+    "Shown",
     "bundle_bytes",
     "golden_violation",
     "load_bundle",
@@ -39,37 +42,62 @@ __all__ = [
 TABLE_BUILD_FEATURES_MAX = 12
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """What an active sensor shows: patterns (d_f, pixels) of any integer dtype, each below `levels`.
+
+    `photons_per_level`: photoelectrons per exposure, per level, per unit transmission.
+    """
+
+    levels: int
+    pattern_levels: ArrayLike
+    photons_per_level: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BackEnd:
+    """What decides: a head, a table (2**d_f, classes) of floats, or both, which must agree; and the head in eight bits."""
+
+    head_onnx: bytes | None = None
+    table: ArrayLike | None = None
+    int8_head: Int8Head | None = None
+    int8_onnx: bytes | None = None
+
+
 def make_bundle(
     *,
     name: str,
     task: str,
     classes: Sequence[str] = (),
     image_shape: tuple[int, int],
-    levels: int = 0,
-    pattern_levels: ArrayLike | None = None,
-    photons_per_level: float = 0.0,
-    head_onnx: bytes | None = None,
-    table: ArrayLike | None = None,
+    optics: Shown | Analyser,
+    back_end: BackEnd,
     provenance: Mapping[str, Any],
-    int8_head: Int8Head | None = None,
-    int8_onnx: bytes | None = None,
-    analyser: Analyser | None = None,
     picture_shape: tuple[int, int] | None = None,
 ) -> Bundle:
     """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where d_f <= 12.
 
-    An active sensor has `levels`, `pattern_levels` and `photons_per_level`, a passive one its `analyser` instead; a head decides among
-    `classes`, or gives back a picture of `picture_shape`. `pattern_levels` is (d_f, pixels) of any integer dtype, `table`
-    (2**d_f, classes) floats; one of head and table must be given, and where both are they must agree. UsageError says what does
-    not fit, DamagedFileError what is wrong with the head.
+    `optics` are the patterns of an active sensor or the analyser of a passive one. The head decides among `classes`, or gives back a
+    picture of `picture_shape`. UsageError says what does not fit, DamagedFileError what is wrong with the head.
+
+    >>> shown = Shown(levels=2, pattern_levels=[[1, 0], [0, 1]], photons_per_level=3.0)
+    >>> table = BackEnd(table=[[0, 0], [1, 0], [0, 1], [1, 1]])
+    >>> bundle = make_bundle(
+    ...     name="two", task="left or right", classes=("left", "right"), image_shape=(1, 2), optics=shown, back_end=table,
+    ...     provenance={},
+    ... )
+    >>> bundle.n_features, bundle.illumination()
+    (2, 6.0)
     """
     try:
-        quantised = _as_levels(pattern_levels, levels) if analyser is None else _no_levels(pattern_levels, analyser)
+        analyser = optics if isinstance(optics, Analyser) else None
+        shown = optics if isinstance(optics, Shown) else Shown(0, np.zeros((len(optics.matrix), 0), np.uint16), 0.0)
+        quantised = _as_levels(shown) if analyser is None else np.asarray(shown.pattern_levels)
         n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
-            given = None if table is None else np.array(table, dtype=np.float32)
+            given = None if back_end.table is None else np.array(back_end.table, dtype=np.float32)
         means, scores, given = _evaluate_back_end(
-            head_onnx, given, len(quantised), n_outputs, decides=picture_shape is None
+            back_end.head_onnx, given, len(quantised), n_outputs, decides=picture_shape is None
         )
         bundle = Bundle(
             name=name,
@@ -77,16 +105,16 @@ def make_bundle(
             classes=tuple(classes),
             encoder="active" if analyser is None else analyser.kind,
             image_shape=(int(image_shape[0]), int(image_shape[1])),
-            levels=int(levels),
+            levels=int(shown.levels),
             pattern_levels=frozen(quantised),
-            photons_per_level=float(photons_per_level),
-            head_onnx=None if head_onnx is None else bytes(head_onnx),
+            photons_per_level=float(shown.photons_per_level),
+            head_onnx=None if back_end.head_onnx is None else bytes(back_end.head_onnx),
             table=None if given is None else frozen(given),
             golden_means=frozen(means),
             golden_scores=frozen(scores),
             provenance=parse_json_object(canonical_json(dict(provenance)), "provenance"),
-            int8_head=int8_head,
-            int8_onnx=None if int8_onnx is None else bytes(int8_onnx),
+            int8_head=back_end.int8_head,
+            int8_onnx=None if back_end.int8_onnx is None else bytes(back_end.int8_onnx),
             analyser=analyser,
             picture_shape=picture_shape,
         )
@@ -102,21 +130,15 @@ def word_means(words: ArrayLike, n_features: int) -> NDArray[np.float32]:
     return (bits & 1).astype(np.float32)
 
 
-def _no_levels(pattern_levels: ArrayLike | None, analyser: Analyser) -> NDArray[np.uint16]:
-    if pattern_levels is not None:
-        raise ValueError("pattern_levels beside an analyser: a passive sensor shows nothing")
-    return np.zeros((len(analyser.matrix), 0), np.uint16)
-
-
-def _as_levels(pattern_levels: ArrayLike | None, levels: int) -> NDArray[np.uint16]:
-    values = np.asarray(pattern_levels)
+def _as_levels(shown: Shown) -> NDArray[np.uint16]:
+    values = np.asarray(shown.pattern_levels)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.integer) or values.size == 0:
         raise ValueError(
             f"pattern_levels has shape {values.shape} and dtype {values.dtype}, allowed: integers (d_f, pixels)"
         )
     low, high = int(values.min()), int(values.max())
-    if low < 0 or high >= min(levels, LEVELS_MAX):
-        raise ValueError(f"pattern_levels run from {low} to {high}, allowed: 0 to {levels - 1}")
+    if low < 0 or high >= min(shown.levels, LEVELS_MAX):
+        raise ValueError(f"pattern_levels run from {low} to {high}, allowed: 0 to {shown.levels - 1}")
     return values.astype(np.uint16)
 
 

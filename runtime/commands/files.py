@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import __version__
-from pans.runtime.bundle.model import make_bundle, write_bundle
+from pans.runtime.bundle.model import BackEnd, Shown, make_bundle, write_bundle
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, emit
 from pans.runtime.container import read_file
@@ -158,11 +158,11 @@ def _bundle(args: argparse.Namespace) -> int:
         task=args.task,
         classes=[name.strip() for name in args.classes.split(",")],
         image_shape=_image_shape(args.image_shape, patterns.shape[1]),
-        levels=levels,
-        pattern_levels=quantised.pattern_levels,
-        photons_per_level=quantised.photons_per_level,
-        head_onnx=read_file(args.head) if args.head else None,
-        table=_load_array(args.table) if args.table else None,
+        optics=Shown(levels, quantised.pattern_levels, quantised.photons_per_level),
+        back_end=BackEnd(
+            head_onnx=read_file(args.head) if args.head else None,
+            table=_load_array(args.table) if args.table else None,
+        ),
         provenance={**provenance, "quantisation": _quantisation_facts(quantised)},
     )
     exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}

@@ -262,9 +262,7 @@ def _hold(shots: int, ticks: Ticks) -> int:
 def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     patterns = _interleave(np.arange(n), dark)
     period = max(ticks.spacing, _up(ticks.refresh))
-    return lay_out(
-        profile,
-        n,
+    cycle = Cycle(
         patterns,
         np.zeros(len(patterns), np.int64),
         offsets=np.arange(len(patterns)) * period,
@@ -273,8 +271,8 @@ def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -
         shots_per_cycle=1,
         cycles_per_object=shots,
         block=_block(len(patterns), period, ticks, MAX_BLOCK_EXPOSURES),
-        ticks=ticks,
     )
+    return lay_out(profile, n, cycle, ticks)
 
 
 def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
@@ -282,9 +280,7 @@ def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks
     displays = _interleave(np.arange(n), dark)
     hold = _hold(shots, ticks)
     offsets = np.arange(len(displays))[:, None] * hold + np.arange(shots)[None, :] * ticks.spacing
-    return lay_out(
-        profile,
-        n,
+    cycle = Cycle(
         np.repeat(displays, shots),
         np.tile(np.arange(shots), len(displays)),
         offsets=offsets.ravel(),
@@ -293,16 +289,14 @@ def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks
         shots_per_cycle=shots,
         cycles_per_object=1,
         block=_even_blocks(shots, MAX_BLOCK_EXPOSURES),
-        ticks=ticks,
     )
+    return lay_out(profile, n, cycle, ticks)
 
 
 def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     frames = _interleave(np.arange(shots), dark)
     word_bytes = -(-n // 8) + 8  # a word is rounded up, by less than 8 bytes
-    return lay_out(
-        profile,
-        n,
+    cycle = Cycle(
         np.where(frames == DARK_PATTERN, DARK_PATTERN, 0),
         frames,
         offsets=np.arange(len(frames)) * ticks.spacing,
@@ -311,29 +305,30 @@ def _parallel(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> 
         shots_per_cycle=shots,
         cycles_per_object=1,
         block=_block(len(frames), ticks.spacing, ticks, min(MAX_BLOCK_EXPOSURES, MAX_BLOCK_BYTES // word_bytes)),
-        ticks=ticks,
     )
+    return lay_out(profile, n, cycle, ticks)
 
 
-def lay_out(
-    profile: Profile,
-    n_patterns: int,
-    patterns: NDArray[np.int64],
-    shots: NDArray[np.int64],
-    *,
-    offsets: NDArray[np.int64],
-    cycle_ticks: int,
-    period: int,
-    shots_per_cycle: int,
-    cycles_per_object: int,
-    block: int,
-    ticks: Ticks,
-) -> Plan:
-    """Return the plan of one cycle: `patterns`, `shots` and `offsets` int64 (slots,), the rest in ticks and exposures."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Cycle:
+    """One cycle of a plan to be made: `patterns`, `shots` and `offsets` int64 (slots,), the rest in ticks and exposures."""
+
+    patterns: NDArray[np.int64]
+    shots: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    cycle_ticks: int
+    period: int
+    shots_per_cycle: int
+    cycles_per_object: int
+    block: int
+
+
+def lay_out(profile: Profile, n_patterns: int, cycle: Cycle, ticks: Ticks) -> Plan:
+    """Return the plan of one cycle of `n_patterns` patterns."""
     arrays = (
-        offsets.astype(np.int64),
-        patterns.astype(np.uint16),
-        np.where(patterns == DARK_PATTERN, NO_SHOT, shots).astype(np.uint16),
+        cycle.offsets.astype(np.int64),
+        cycle.patterns.astype(np.uint16),
+        np.where(cycle.patterns == DARK_PATTERN, NO_SHOT, cycle.shots).astype(np.uint16),
     )
     for array in arrays:
         array.setflags(write=False)
@@ -344,11 +339,11 @@ def lay_out(
         slot_pattern=arrays[1],
         slot_shot=arrays[2],
         exposure_ticks=ticks.exposure,
-        slot_period_ticks=period,
-        cycle_ticks=cycle_ticks,
-        shots_per_cycle=shots_per_cycle,
-        cycles_per_object=cycles_per_object,
-        block_exposures=block,
+        slot_period_ticks=cycle.period,
+        cycle_ticks=cycle.cycle_ticks,
+        shots_per_cycle=cycle.shots_per_cycle,
+        cycles_per_object=cycle.cycles_per_object,
+        block_exposures=cycle.block,
         exposure_us=ticks.exposure * 1e6 / profile.clock.tick_hz,
     )
 

@@ -227,12 +227,14 @@ def _dots_of_steps(weights, start, n_out, n_in, x, out):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def int8_scores(counts, i, shots, meta, weights, affine, work, rows, hidden, scores):  # type: ignore[no-untyped-def]
+def int8_scores(counts, i, shots, meta, numbers, room, scores):  # type: ignore[no-untyped-def]
     """Scores scores[i] of the object whose clicks are counts[i], integers (n, d_f), by integer sums.
 
-    Layer one is an exact integer column sum of the clicks. A hidden value is rounded to a whole step (the export has folded its range
-    into the scales) and cut to 0..255.
+    `numbers` and `room` as in `int8_run`. Layer one is an exact integer column sum of the clicks. A hidden value is rounded to a whole
+    step (the export has folded its range into the scales) and cut to 0..255.
     """
+    weights, affine = numbers
+    work, rows, hidden = room
     n_layers, n_features, width, n_fired = meta[0], meta[1], meta[2], 0
     steps = work[2]
     for feature in range(n_features):
@@ -265,9 +267,7 @@ def int8_scores(counts, i, shots, meta, weights, affine, work, rows, hidden, sco
 @njit(cache=True, nogil=True)
 def int8_run(counts, shots, meta, numbers, room, scores, labels, probabilities):  # type: ignore[no-untyped-def]
     """As `float_run`, with the quantised head; `numbers` is (weights int8, affine), `room` (work int32, rows, hidden)."""
-    weights, affine = numbers
-    work, rows, hidden = room
     n_classes = scores.shape[1]
     for i in range(counts.shape[0]):
-        int8_scores(counts, i, shots, meta, weights, affine, work, rows, hidden, scores)
+        int8_scores(counts, i, shots, meta, numbers, room, scores)
         labels[i], probabilities[i] = winner(scores, i, n_classes)

@@ -16,6 +16,7 @@ from pans.runtime.core.plan import (
     MAX_BLOCK_EXPOSURES,
     MAX_SLOTS,
     NO_SHOT,
+    Cycle,
     Plan,
     check_fit,
     exposure_us,
@@ -60,9 +61,7 @@ def build_flow_plan(profile: Profile, bundle: Bundle, *, block_us: float, dark_e
     patterns = np.zeros(slots, np.int64)
     if dark_every:
         patterns[-1] = DARK_PATTERN
-    return lay_out(
-        profile,
-        bundle.n_features,
+    cycle = Cycle(
         patterns,
         np.arange(slots),
         offsets=np.arange(slots) * ticks.spacing,
@@ -71,5 +70,5 @@ def build_flow_plan(profile: Profile, bundle: Bundle, *, block_us: float, dark_e
         shots_per_cycle=slots - bool(dark_every),
         cycles_per_object=1,
         block=frames,
-        ticks=ticks,
     )
+    return lay_out(profile, bundle.n_features, cycle, ticks)

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
 from pans.runtime.bundle.layers import Layer
-from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.bundle.model import Bundle
 
 
 def random_layers(sizes: list[int], seed: int = 0) -> tuple[Layer, ...]:
@@ -65,15 +66,4 @@ def onnx_chain(layers: tuple[Layer, ...], style: str = "gemm", float_data: bool 
 def head_bundle(layers: tuple[Layer, ...], **parts: Any) -> Bundle:
     """A bundle whose head is `layers`; its patterns are one pixel each."""
     n_features, n_classes = layers[0].weights.shape[0], layers[-1].weights.shape[1]
-    return make_bundle(
-        name="chain",
-        task="test",
-        classes=[f"c{i}" for i in range(n_classes)],
-        image_shape=(1, 1),
-        levels=2,
-        pattern_levels=np.ones((n_features, 1), dtype=np.int64),
-        photons_per_level=1.0,
-        provenance={},
-        head_onnx=onnx_chain(layers),
-        **parts,
-    )
+    return made_bundle(n_features, n_classes, **{"name": "chain", "head_onnx": onnx_chain(layers)} | parts)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import make_bundle, write_bundle
+from pans.runtime.bundle.model import write_bundle
 
 SIDE = 16
 
@@ -28,16 +29,14 @@ def write_thirds(path: Path) -> Path:
         levels[third, 5 * third : 5 * third + 5, 4:12] = 16
     levels[0, 0, 0] = 255
     words = (np.arange(8)[:, None] >> np.arange(3)) & 1
-    bundle = make_bundle(
+    bundle = made_bundle(
         name="thirds",
-        task="test",
         classes=("a", "b", "c"),
         image_shape=(SIDE, SIDE),
         levels=256,
         pattern_levels=levels.reshape(3, -1),
         photons_per_level=4.0 / 255,  # 2 us at the profile's light
         table=(4.0 * words).astype(np.float32),
-        provenance={},
     )
     write_bundle(bundle, path / "thirds.pans")
     return path

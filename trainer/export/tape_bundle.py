@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle, make_bundle, write_bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, write_bundle
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.barcode import CLASSES, N_BARS, all_strings
@@ -83,10 +83,8 @@ def tape_bundle(
         task="barcode",
         classes=CLASSES,
         image_shape=(1, N_BARS * pixels_per_bar),
-        levels=levels,
-        pattern_levels=bar_patterns(pixels_per_bar, lit_px).astype(np.uint16) * level,
-        photons_per_level=top / (levels - 1),
-        table=table,
+        optics=Shown(levels, bar_patterns(pixels_per_bar, lit_px).astype(np.uint16) * level, top / (levels - 1)),
+        back_end=BackEnd(table=table),
         provenance={
             "made_by": "pans.trainer.export.tape_bundle",
             "profile": profile.name,

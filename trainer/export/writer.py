@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import onnx
@@ -24,7 +24,7 @@ from pans.runtime import __version__
 from pans.runtime.bundle.facts import GOLDEN_TOLERANCE
 from pans.runtime.bundle.int8 import quantise_head
 from pans.runtime.bundle.layers import read_layers
-from pans.runtime.bundle.model import Bundle, load_bundle, make_bundle, word_means, write_bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_bundle, word_means, write_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError, UsageError
@@ -58,14 +58,6 @@ class Exported:
     words_compared: int
     score_difference: float  # the largest, over max(1, |score|)
     dead_patterns: tuple[int, ...]
-
-
-class Shown(NamedTuple):
-    """Patterns as the projector shows them; the field names are those of `make_bundle`."""
-
-    levels: int
-    pattern_levels: NDArray[np.uint16]
-    photons_per_level: float
 
 
 def fold_normalisation(
@@ -152,11 +144,9 @@ def export(
         classes=() if picture_shape else classes,
         picture_shape=picture_shape,
         image_shape=image_shape,
-        head_onnx=graph,
-        int8_head=int8,
-        int8_onnx=None if int8 is None else int8_onnx(int8),
+        optics=optics,
+        back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
         provenance={**provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
-        **({"analyser": optics} if isinstance(optics, Analyser) else optics._asdict()),
     )
     unchecked = path.with_name(path.name + ".unchecked")  # a wrong bundle must not stand where a right one may be
     try:

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 from heads import head_bundle, onnx_chain, random_layers
 
 from pans.runtime.bench import decide as bench_decide
@@ -23,7 +24,6 @@ from pans.runtime.bench.rows import (
     table_text,
 )
 from pans.runtime.bundle.int8 import quantise_head
-from pans.runtime.bundle.model import make_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
@@ -102,7 +102,7 @@ def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch
 def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
     layers = random_layers([6, 16, 12])
-    bundle = make_bundle(
+    bundle = made_bundle(
         name="chain",
         task="pictures",
         classes=(),
@@ -111,7 +111,6 @@ def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> 
         pattern_levels=np.eye(6, dtype=np.uint16),
         photons_per_level=1.0,
         head_onnx=onnx_chain(layers),
-        provenance={},
         picture_shape=(3, 4),
     )
     row = bench_decide._picture_row(bundle, 50)

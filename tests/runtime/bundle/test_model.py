@@ -11,17 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
 from pans.runtime.bundle import format as bundle_format
-from pans.runtime.bundle.model import (
-    Bundle,
-    bundle_bytes,
-    load_bundle,
-    make_bundle,
-    parse_bundle,
-    word_means,
-    write_bundle,
-)
+from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle, word_means, write_bundle
 from pans.runtime.errors import DamagedFileError, UsageError
 
 
@@ -55,7 +48,6 @@ def random_head(d_f: int, classes: int, seed: int = 1) -> tuple[bytes, np.ndarra
 def small_bundle(d_f: int = 2, **changes: Any) -> Bundle:
     facts: dict[str, Any] = {
         "name": "small",
-        "task": "test",
         "classes": ("left", "right"),
         "image_shape": (1, 3),
         "levels": 4,
@@ -64,7 +56,7 @@ def small_bundle(d_f: int = 2, **changes: Any) -> Bundle:
         "table": np.arange(2 << d_f, dtype=np.float32).reshape(-1, 2) % 5,
         "provenance": {"made_by": "test", "seed": 1, "loss": 0.1},
     }
-    return make_bundle(**{**facts, **changes})
+    return made_bundle(**facts | changes)
 
 
 def resealed(data: bytes, change: Any) -> bytes:

@@ -42,7 +42,9 @@ def run_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def make_parallel(path: Path) -> None:
-    from pans.runtime.bundle.model import make_bundle, write_bundle
+    from bundles import made_bundle
+
+    from pans.runtime.bundle.model import write_bundle
     from pans.runtime.instrument.profile import load_profile
 
     profile, rng = load_profile("wdm-snspd"), np.random.default_rng(0)
@@ -53,16 +55,14 @@ def make_parallel(path: Path) -> None:
     pytest.importorskip("onnx")
     from heads import onnx_chain, random_layers
 
-    made = make_bundle(
+    made = made_bundle(
         name="small",
-        task="t",
         classes=tuple("0123456789"),
         image_shape=(28, 28),
         levels=levels,
         pattern_levels=patterns,
         photons_per_level=top / (levels - 1),
         head_onnx=onnx_chain(random_layers([5, 8, 10])),
-        provenance={},
     )
     write_bundle(made, path)
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, make_bundle, write_bundle
+from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
 from pans.runtime.bundle.quantise import quantise_patterns
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
@@ -21,8 +22,6 @@ from pans.runtime.record import Recorder, read_recording
 
 def toy_bundle(**changes: Any) -> Bundle:
     facts: dict[str, Any] = {
-        "name": "toy",
-        "task": "test",
         "classes": ("a", "b"),
         "image_shape": (1, 2),
         "levels": 4,
@@ -31,7 +30,7 @@ def toy_bundle(**changes: Any) -> Bundle:
         "table": [[1, 0], [0, 1], [1, 0], [0, 1]],
         "provenance": {"made_by": "test"},
     }
-    return make_bundle(**{**facts, **changes})
+    return made_bundle(**facts | changes)
 
 
 def decision(index: int, **changes: Any) -> tuple[Any, ...]:

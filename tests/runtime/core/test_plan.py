@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pans.runtime.bundle.model import Bundle, make_bundle
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import DARK_PATTERN, MAX_BLOCK_EXPOSURES, NO_SHOT, Plan, build_plan, exposure_us
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -21,16 +22,14 @@ def bundle_for(profile: Profile, n_patterns: int, exposure: float, shape: tuple[
     """A bundle of `n_patterns` full-bright patterns that needs `exposure` microseconds on `profile`."""
     levels = profile.projector.levels
     top = exposure * 1e-6 * profile.projector.peak_photoelectrons_hz
-    made = make_bundle(
+    made = made_bundle(
         name="made",
-        task="none",
         classes=("a", "b"),
         image_shape=shape,
         levels=levels,
         pattern_levels=np.full((1, shape[0] * shape[1]), levels - 1, np.uint16),
         photons_per_level=top / (levels - 1),
         table=np.zeros((2, 2), np.float32),
-        provenance={},
     )
     return replace(made, pattern_levels=np.repeat(made.pattern_levels, n_patterns, axis=0))
 

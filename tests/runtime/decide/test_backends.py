@@ -13,8 +13,9 @@ from typing import Any
 import naive_decide as naive
 import numpy as np
 import pytest
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import Bundle, make_bundle, word_means
+from pans.runtime.bundle.model import Bundle, word_means
 from pans.runtime.decide import names as backend_names_module
 from pans.runtime.decide.backends import TableDecider, make_decider, softmax_winner
 from pans.runtime.decide.kernels import label_words
@@ -52,25 +53,11 @@ def affine_head(weights: np.ndarray, bias: np.ndarray, batch: Any = "n") -> byte
     )
 
 
-def bundle(d_f: int, classes: int, **back_end: Any) -> Bundle:
-    return make_bundle(
-        name="toy",
-        task="test",
-        classes=[f"c{i}" for i in range(classes)],
-        image_shape=(1, 1),
-        levels=2,
-        pattern_levels=np.ones((d_f, 1), dtype=np.int64),
-        photons_per_level=1.0,
-        provenance={},
-        **back_end,
-    )
-
-
 def affine_bundle(d_f: int, classes: int, batch: Any = "n") -> tuple[Bundle, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(5)
     weights = rng.normal(size=(d_f, classes)).astype(np.float32)
     bias = rng.normal(size=classes).astype(np.float32)
-    return bundle(d_f, classes, head_onnx=affine_head(weights, bias, batch)), weights, bias
+    return made_bundle(d_f, classes, head_onnx=affine_head(weights, bias, batch)), weights, bias
 
 
 def replaced(old: Bundle, **changes: Any) -> Bundle:
@@ -125,7 +112,7 @@ def test_fewer_shots_than_planned_are_still_means() -> None:
 
 def test_ties_go_to_the_lowest_label() -> None:
     table = np.array([[1, 1, 0], [0, 2, 2], [3, 3, 3], [0, 0, 1]], dtype=np.float32)
-    made = bundle(2, 3, table=table)
+    made = made_bundle(2, 3, table=table)
     assert make_decider(made).decide_batch(all_clicks(2), 1).tolist() == [0, 1, 0, 2]
 
 
@@ -136,7 +123,9 @@ def test_the_winning_probability_is_stable(scores: list[float]) -> None:
     assert found.label == label
     assert found.probability == pytest.approx(probability, rel=1e-12)
     table = np.tile(np.array(scores, dtype=np.float32), (2, 1))
-    assert make_decider(bundle(1, 3, table=table)).decide(np.array([1]), 1).probability == pytest.approx(probability)
+    assert make_decider(made_bundle(1, 3, table=table)).decide(np.array([1]), 1).probability == pytest.approx(
+        probability
+    )
 
 
 @pytest.mark.parametrize("score", [np.nan, np.inf])
@@ -148,7 +137,7 @@ def test_scores_that_are_not_finite_have_no_probability(score: float) -> None:
 def test_words_in_bulk(classes: int) -> None:
     rng = np.random.default_rng(9)
     table = rng.normal(size=(64, classes)).astype(np.float32)
-    decider = TableDecider(bundle(6, classes, table=table))
+    decider = TableDecider(made_bundle(6, classes, table=table))
     for dtype in (np.uint32, np.uint64):
         words = rng.integers(0, 64, size=500).astype(dtype)
         out = np.empty(500, dtype=decider.labels.dtype)
@@ -172,7 +161,7 @@ def test_the_kernel_as_its_oracle(label_dtype: Any) -> None:
 
 
 def test_the_table_refuses_what_it_cannot_answer() -> None:
-    decider = make_decider(bundle(3, 2, table=np.zeros((8, 2))))
+    decider = make_decider(made_bundle(3, 2, table=np.zeros((8, 2))))
     with pytest.raises(UsageError, match="single shots"):
         decider.decide(np.array([0, 1, 2]), 1)
     with pytest.raises(UsageError, match="single shots"):
@@ -195,7 +184,7 @@ def test_the_choice_of_the_back_end() -> None:
     assert choice_of(measured)["chosen"] == measured.name
     assert set(choice_of(measured)["p50_us"]) == {"count-table", "sparse", "onnx"}
     assert make_decider(both, backend="onnx").name == "onnx"
-    only_table = bundle(3, 2, table=np.zeros((8, 2)))
+    only_table = made_bundle(3, 2, table=np.zeros((8, 2)))
     for wrong in ({"backend": "onnx"}, {"shots": 2}, {"backend": "gpu"}, {"shots": 0}):
         with pytest.raises(UsageError):
             make_decider(only_table, **wrong)
@@ -225,7 +214,7 @@ def test_golden_vectors_catch_a_head_that_rolls_dice() -> None:
         helper.make_node("Add", ["means", "noise"], ["scores"]),
     ]
     dice = onnx_model(nodes, [tensor("means", ["n", 13])], [tensor("scores", ["n", 13])], [])
-    made = bundle(13, 13, head_onnx=dice)
+    made = made_bundle(13, 13, head_onnx=dice)
     with pytest.raises(DamagedFileError, match="golden"):
         make_decider(made, backend="onnx")
 
@@ -323,7 +312,7 @@ def test_weights_elsewhere_are_found_inside_attributes_and_branches() -> None:
 def test_the_table_path_needs_neither_numba_nor_onnxruntime(tmp_path: Path) -> None:
     from pans.runtime.bundle.model import write_bundle
 
-    write_bundle(bundle(3, 2, table=np.arange(16).reshape(8, 2)), tmp_path / "t.pans")
+    write_bundle(made_bundle(3, 2, table=np.arange(16).reshape(8, 2)), tmp_path / "t.pans")
     code = (
         "import sys, numpy as np; from pans.runtime.bundle.model import load_bundle; from pans.runtime.decide.backends import make_decider;"
         "print(make_decider(load_bundle(sys.argv[1])[0]).decide(np.array([0, 1, 1]), 1).label,"
@@ -361,7 +350,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None
 
 def test_a_lab_s_own_back_end_is_found_by_its_entry_point(lab: Callable[[int], None]) -> None:
     lab(0)
-    made = bundle(3, 2, table=np.zeros((8, 2)))
+    made = made_bundle(3, 2, table=np.zeros((8, 2)))
     decider = make_decider(made, backend="fewest")
     assert decider.decide(np.zeros(3, np.int64), 1) == (1, 1.0)
     assert make_decider(made, backend="table").name == "table"  # ours cannot be replaced
@@ -372,4 +361,4 @@ def test_a_lab_s_own_back_end_is_found_by_its_entry_point(lab: Callable[[int], N
 def test_a_lab_s_own_back_end_is_held_to_the_classes(lab: Callable[[int], None]) -> None:
     lab(7)
     with pytest.raises(UsageError, match=r"answers \(7, 1.0\) to the clicks"):
-        make_decider(bundle(3, 2, table=np.zeros((8, 2))), backend="fewest")
+        make_decider(made_bundle(3, 2, table=np.zeros((8, 2))), backend="fewest")

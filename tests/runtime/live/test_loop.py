@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
 from pans.firmware_sim.ports.serve import open_sim
-from pans.runtime.bundle.model import Bundle, load_bundle, make_bundle, write_bundle
+from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
@@ -32,16 +33,14 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     levels = rng.integers(0, 124, (4, 64))
     levels[rng.random(levels.shape) < 0.9] = 0
     levels[0, 0] = 123
-    made = make_bundle(
+    made = made_bundle(
         name="loop-test",
-        task="test",
         classes=("a", "b", "c"),
         image_shape=(8, 8),
         levels=124,
         pattern_levels=levels.astype(np.uint16),
         photons_per_level=8.0 / 123,
         table=rng.normal(size=(16, 3)).astype(np.float32),
-        provenance={},
     )
     path = tmp_path_factory.mktemp("bundle") / "test.pans"
     write_bundle(made, path)
@@ -196,16 +195,14 @@ def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path)
         [onnx.numpy_helper.from_array(weights, "w")],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    headed = make_bundle(
+    headed = made_bundle(
         name="headed",
-        task="test",
         classes=bundle.classes,
         image_shape=bundle.image_shape,
         levels=124,
         pattern_levels=bundle.pattern_levels,
         photons_per_level=bundle.photons_per_level,
         head_onnx=model.SerializeToString(),
-        provenance={},
     )
     result = run(headed, scene, shots=4, trials=2)
     assert result.tally.decisions == 12
@@ -264,16 +261,14 @@ def test_a_recording_replays_to_the_same_hash_and_another_bundle_does_not(
     assert json.loads(capsys.readouterr().out)["identical"] is True
     assert len(read_recording(summary["recording"]).decisions()) == 12
 
-    other = make_bundle(
+    other = made_bundle(
         name="other",
-        task="test",
         classes=bundle.classes,
         image_shape=bundle.image_shape,
         levels=124,
         pattern_levels=bundle.pattern_levels,
         photons_per_level=bundle.photons_per_level,
         table=-np.asarray(bundle.table),
-        provenance={},
     )
     write_bundle(other, tmp_path / "other.pans")
     assert main(["replay", summary["recording"], "--bundle", str(tmp_path / "other.pans"), "--json"]) == 1

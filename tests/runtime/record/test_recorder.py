@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import bundle_bytes, make_bundle
+from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
@@ -364,16 +365,14 @@ def test_short_writes_are_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_the_bundle_travels_along(tmp_path: Path) -> None:
-    made = make_bundle(
+    made = made_bundle(
         name="toy",
-        task="test",
         classes=("a", "b"),
         image_shape=(1, 1),
         levels=2,
         pattern_levels=[[1]],
         photons_per_level=1.0,
         table=[[1, 0], [0, 1]],
-        provenance={},
     )
     path = tmp_path / "a.pansrec"
     write_recording(path, bundle=bundle_bytes(made))

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import make_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
@@ -284,9 +284,9 @@ def test_the_longest_pause_between_blocks(shots: int, dark: int, order: str) -> 
     levels = np.zeros((4, 9), np.uint16)
     levels[:, 0] = 123
     table = np.zeros((16, 2), np.float32)
-    bundle = make_bundle(
+    bundle = made_bundle(
         name="p", task="p", classes=("a", "b"), image_shape=(3, 3), levels=124, pattern_levels=levels,
-        photons_per_level=8.0 / 123, table=table, provenance={},
+        photons_per_level=8.0 / 123, table=table,
     )  # fmt: skip
     plan = build_plan(
         load_profile("oled-qcmos"), bundle, shots_per_object=shots, dark_slots_per_cycle=dark, order=order

@@ -7,8 +7,9 @@ import sys
 
 import numpy as np
 import pytest
+from bundles import made_bundle
 
-from pans.runtime.bundle.model import make_bundle, write_bundle
+from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
@@ -23,7 +24,7 @@ IMAGES = RNG.integers(0, 256, (60, 4, 5), dtype=np.uint8)
 
 def bundle(d_f=4, seed=0):
     rng = np.random.default_rng(seed)
-    return make_bundle(
+    return made_bundle(
         name="small",
         task="own",
         classes=("a", "b", "c"),
@@ -32,7 +33,6 @@ def bundle(d_f=4, seed=0):
         pattern_levels=rng.integers(0, 124, (d_f, 20)),
         photons_per_level=1e-3,
         table=rng.normal(size=(1 << d_f, 3)),
-        provenance={},
     )
 
 
@@ -44,7 +44,7 @@ def head_bundle():
     graph, _ = head_onnx(MlpHead(3, 8, 3, torch.Generator().manual_seed(0)), np.full(3, 0.4))
     facts = {"name": "small", "task": "own", "classes": ("a", "b", "c"), "image_shape": (4, 5), "levels": 124}
     levels = RNG.integers(0, 124, (3, 20))
-    return make_bundle(**facts, pattern_levels=levels, photons_per_level=1e-3, head_onnx=graph, provenance={})
+    return made_bundle(**facts, pattern_levels=levels, photons_per_level=1e-3, head_onnx=graph)
 
 
 def test_outcomes_are_binomial_products():

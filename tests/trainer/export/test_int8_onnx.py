@@ -31,8 +31,8 @@ def test_the_model_gives_the_scores_of_the_integers() -> None:
 
 def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
     torch = pytest.importorskip("torch")
-    from pans.runtime.bundle.model import load_bundle
-    from pans.trainer.export.writer import Shown, export
+    from pans.runtime.bundle.model import Shown, load_bundle
+    from pans.trainer.export.writer import export
     from pans.trainer.model.heads import MlpHead
 
     head = MlpHead(4, 8, 3, torch.Generator().manual_seed(1)).eval()

@@ -7,13 +7,12 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 onnx = pytest.importorskip("onnx", reason="needs the train extra")
 
-from pans.runtime.bundle.model import load_bundle
+from pans.runtime.bundle.model import Shown, load_bundle
 from pans.runtime.errors import PansError
 from pans.trainer.export import writer as export_module
 from pans.trainer.export.writer import (
     DEAD_VARIANCE,
     IR_VERSION,
-    Shown,
     compare,
     export,
     fold_normalisation,

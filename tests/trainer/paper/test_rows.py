@@ -10,10 +10,11 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the train extra")
 
+from bundles import made_bundle
 from heads import onnx_chain
 
 from pans.runtime.bundle.layers import Layer
-from pans.runtime.bundle.model import load_bundle, make_bundle, write_bundle
+from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.commands import reproduce
 from pans.trainer.evaluate.accuracy import decision_shares, evaluate_exactly, light_of, sampled_shares
@@ -45,9 +46,7 @@ def code_bundle():
     head = Layer(weights.astype(np.float32), (-4.0 * bits.sum(axis=0) - 99.0 * np.eye(10)[5]).astype(np.float32), False)
     patterns = np.broadcast_to(bits[:, None, :], (4, 10, 10)).reshape(4, 100).astype(np.int64)
     facts = {"name": "code", "task": "columns", "classes": CLASSES, "image_shape": (10, 10), "levels": 2}
-    return make_bundle(
-        **facts, pattern_levels=patterns, photons_per_level=0.3, head_onnx=onnx_chain((head,)), provenance={}
-    )
+    return made_bundle(**facts, pattern_levels=patterns, photons_per_level=0.3, head_onnx=onnx_chain((head,)))
 
 
 @pytest.fixture(scope="module")
