@@ -9,7 +9,9 @@ import pytest
 from tree import ROOT
 
 LIGHT = sorted(
-    f"pans.{path.parent.relative_to(ROOT).as_posix().replace('/', '.')}" for path in ROOT.glob("runtime/*/__init__.py")
+    f"pans.{path.parent.relative_to(ROOT).as_posix().replace('/', '.')}"
+    for top in ("runtime", "firmware_sim")
+    for path in ROOT.glob(f"{top}/*/__init__.py")
 )
 SLOW_TO_LOAD = ("numba", "onnxruntime", "torch", "matplotlib", "h5py", "serial", "usb", "rich")
 

@@ -17,7 +17,7 @@ from pans.runtime.link.base import Link, open_link
 from .inprocess import ThreadedInstrument
 from .serve import SimOptions, parse_sim_url
 
-PACKAGE = "pans.firmware_sim.ports"
+PACKAGE = __package__
 
 
 class Serial(protocol_socket.Serial):  # type: ignore[misc]
