@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def int8_scores(bundle: Bundle) -> Scores:
 
     def scores(counts: Counts, shots: int) -> NDArray[Any]:
         x, unit, weight_at, at = counts, np.float32(1) / np.float32(shots), 0, 0
-        for n_in, n_out in zip(sizes, sizes[1:]):
+        for n_in, n_out in pairwise(sizes):
             flat = bundle.parts["int8_weights"][weight_at : weight_at + n_in * n_out]
             sums = (x @ flat.reshape(n_in, n_out).astype(np.int64)).astype(np.float32)
             y = sums * (scale[at : at + n_out] * unit) + bias[at : at + n_out]

@@ -22,8 +22,11 @@ VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability"
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
 ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:]])
 RUN = np.dtype(
-    [*PLACE, ("count", "<u4"), ("tick_step", "<u4"), ("exposure_step", "<u4"), ("shot_step", "<u4")]
-    + [("truth", "<i2"), ("continues", "<u2")]
+    [
+        *PLACE,
+        *(("count", "<u4"), ("tick_step", "<u4"), ("exposure_step", "<u4"), ("shot_step", "<u4")),
+        *(("truth", "<i2"), ("continues", "<u2")),
+    ]
 )
 NO_NUMBER = 0xFFFF
 STEPS = {"tick": "tick_step", "exposure_index": "exposure_step", "shot": "shot_step"}
@@ -51,15 +54,14 @@ class Recording:
 
 def read_recording(data: bytes) -> Recording:
     """Return a whole recording, every byte checked; Damaged otherwise (a file that was cut counts as damaged here)."""
-    recording, blocks = Recording(), 0
-    for kind, payload in iter_blocks(data):
+    recording = Recording()
+    for blocks, (kind, payload) in enumerate(iter_blocks(data)):
         demand((kind == HEADER) == (blocks == 0), "HEADER is block 0 and no other")
         _take(recording, kind, payload)
         if kind == END:
             found = {"blocks": blocks, "decisions": len(recording.log.rows), "decisions_sha256": recording.log.sha256()}
             for name, value in found.items():
                 demand(recording.end[name] == value, f"END says {name} = {recording.end[name]}, found {value}")
-        blocks += 1
     demand(bool(recording.end), "no END")
     if recording.bundle:
         demand(hashlib.sha256(recording.bundle).hexdigest() == recording.header["bundle_sha256"], "the bundle inside")

@@ -1,0 +1,145 @@
+"""The reader written from the documents alone against recordings of the package: same decisions, bit for bit."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bundles import made_bundle
+from heads import onnx_chain, random_layers
+from lab_bundle import Damaged, read_bundle
+from lab_decisions import decide_again
+from lab_recording import read_recording
+from tree import ROOT
+
+from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.cli import main
+from pans.runtime.errors import DamagedFileError
+from pans.runtime.record import recording as ours
+
+D_F, CLASSES, LEVELS = 6, 4, 16
+EXPOSURE_US = 100.0
+PEAK_HZ = 20_000.0
+FASHION = ROOT / "runtime" / "shipped" / "fashion10.pans"
+TROUBLE = "loss:0.02,flip:0.01,duplicate:0.03,reorder:0.03,drip:0.02,stall:300ms/900ms,disconnect:100ms/1500ms,reset:0ms/2500ms"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One still run and how it decides."""
+
+    mode: str
+    backend: str
+    shots: int = 1
+    trials: int = 1
+    order: str = "auto"
+    faults: str = ""
+    decisions: int = 60
+
+
+CASES = [
+    Case("sequential", "table", trials=3),
+    Case("sequential", "float64", shots=3, trials=2, order="pattern-major"),
+    Case("sequential", "int8", shots=5, order="shot-major"),
+    Case("parallel", "float64", shots=2, trials=2),
+    Case("parallel", "table", trials=5),
+    Case("sequential", "table", trials=2, order="shot-major", faults=TROUBLE, decisions=3000),
+    Case("parallel", "int8", shots=4, trials=3, faults=TROUBLE, decisions=6000),
+]
+
+
+def small_bundle(backend: str) -> Bundle:
+    rng = np.random.default_rng(5)
+    levels = rng.integers(0, LEVELS, (D_F, 4)).astype(np.uint16)
+    levels[0, 0] = LEVELS - 1
+    parts: dict[str, object] = {"table": rng.normal(size=(1 << D_F, CLASSES)).astype(np.float32)}
+    if backend != "table":
+        layers = random_layers([D_F, 24, 10, CLASSES], seed=3)
+        parts = {"head_onnx": onnx_chain(layers, "transposed"), "int8_head": quantise_head(layers)}
+    scale = PEAK_HZ * EXPOSURE_US * 1e-6 / (LEVELS - 1)
+    facts = {"image_shape": (2, 2), "levels": LEVELS, "pattern_levels": levels, "photons_per_level": scale}
+    return made_bundle(D_F, CLASSES, **facts, **parts)
+
+
+def small_profile(mode: str) -> str:
+    """The shipped profile `ideal` with other figures, in either mode."""
+    text = (ROOT / "hw_profiles" / "ideal.toml").read_text().replace('"sequential"', f'"{mode}"')
+    text = text.replace("levels = 65_536", f"levels = {LEVELS}").replace("= 10_000.0\n\n[det", f"= {PEAK_HZ}\n\n[det")
+    text = text.replace("dark_rate_hz = 0.0", "dark_rate_hz = 50.0")
+    return text if mode == "sequential" else text.replace("channels = 1\n", f"channels = {D_F}\n")
+
+
+def record(folder: Path, case: Case, bundle: Path) -> Path:
+    """Make a recording with `pans run` in virtual time; its seed is chosen here and printed."""
+    seed = secrets.randbelow(1 << 32)
+    print(f"seed {seed}")
+    (folder / "small.toml").write_text(small_profile(case.mode))
+    rng = np.random.default_rng(1)
+    np.savez(
+        folder / "scene.npz", images=rng.integers(0, 256, (5, 2, 2)).astype(np.uint8), labels=np.arange(5) % CLASSES
+    )
+    faults = f"&faults={case.faults}" if case.faults else ""
+    device = f"sim:{folder}/small.toml?scene={folder}/scene.npz&seed={seed}&pace=fast{faults}"
+    options = {"shots": case.shots, "trials": case.trials, "decisions": case.decisions, "backend": case.backend}
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    words += ["--order", case.order, "--out", str(folder / "out"), "--reconnect-s", "60", "--json"]
+    main(["run", str(bundle), "--device", device, *words])
+    return folder / "out" / "run.pansrec"
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.mode}-{case.backend}-{bool(case.faults)}")
+def test_decisions_come_out_the_same(tmp_path: Path, case: Case) -> None:
+    write_bundle(small_bundle(case.backend), tmp_path / "small.pans")
+    recording = read_recording(record(tmp_path, case, tmp_path / "small.pans").read_bytes())
+    assert recording.bundle == (tmp_path / "small.pans").read_bytes()
+    assert recording.header["config"]["backend"] == case.backend
+    rows = decide_again(recording, read_bundle(recording.bundle))
+    for found, logged in zip(rows, recording.rows):
+        assert found == logged
+    assert rows.tobytes() == recording.rows.tobytes()
+    assert len(rows) >= case.decisions // 2
+    if case.faults:
+        assert 0 < np.count_nonzero(rows["flags"]) < len(rows)
+
+
+def test_a_head_of_hundreds_of_units(tmp_path: Path) -> None:
+    device = f"sim:oled-qcmos?seed={secrets.randbelow(1 << 32)}&pace=fast"
+    options = ["--decisions", "100", "--shots", "2", "--backend", "float64", "--out", str(tmp_path), "--json"]
+    assert main(["run", str(FASHION), "--device", device, *options]) in (0, 1)  # 1: something rare was noticed
+    recording = read_recording((tmp_path / "run.pansrec").read_bytes())
+    rows = decide_again(recording, read_bundle(recording.bundle))
+    assert rows.tobytes() == recording.rows.tobytes()
+    assert len(rows) == 100
+
+
+def test_a_bundle_means_the_same() -> None:
+    bundle, (known, sha256) = read_bundle(FASHION.read_bytes()), load_bundle(FASHION)
+    assert bundle.sha256 == sha256
+    assert bundle.header["classes"] == list(known.classes)
+    assert [layer.weights.shape for layer in bundle.layers()] == [(10, 512), (512, 10)]
+    for means, scores in zip(bundle.parts["golden_means"], bundle.parts["golden_scores"]):
+        x = means.astype(np.float64)
+        for weights, bias, relu in bundle.layers():
+            x = x @ weights + bias
+            x = np.maximum(x, 0) if relu else x
+        assert np.abs(x - scores).max() <= 1e-5 * max(1.0, np.abs(scores).max())
+
+
+def test_both_readers_notice_every_change(tmp_path: Path) -> None:
+    write_bundle(small_bundle("table"), tmp_path / "small.pans")
+    path = record(tmp_path, Case("sequential", "table", decisions=20), tmp_path / "small.pans")
+    whole, seed = path.read_bytes(), secrets.randbelow(1 << 32)
+    print(f"seed {seed}")
+    rng = np.random.default_rng(seed)
+    for at in rng.integers(0, len(whole), 60).tolist():
+        changed = bytearray(whole)
+        changed[at] ^= 1 << rng.integers(0, 8)
+        with pytest.raises(Damaged):
+            read_recording(bytes(changed))
+        path.write_bytes(changed)
+        with pytest.raises(DamagedFileError, match=r"altered|expected|format version"):
+            ours.read_recording(path)
