@@ -16,8 +16,7 @@ from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
+from pans.runtime.live import RunConfig, run_live
 from pans.runtime.timing import attribution as blame
 from pans.runtime.timing.attribution import Verdict
 from pans.runtime.timing.evidence import IDLE, OVERSLEPT, Facts

@@ -30,9 +30,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
 from pans.runtime.record import Recorder
 
 from .processes import say, sleep_until

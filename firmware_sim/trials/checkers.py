@@ -22,7 +22,7 @@ from pans.firmware_sim.device.sequential import Measurement, StreamMessage
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
 from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Output
 from pans.runtime.core.plan import Plan
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live import LiveRun
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_gate
 from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark

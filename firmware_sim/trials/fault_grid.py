@@ -28,10 +28,7 @@ from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.reconnect import Recovery
-from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
 from pans.runtime.wire.commands import Gate
 
 from . import Report, Trial, option, row_text

@@ -36,9 +36,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import open_link
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason

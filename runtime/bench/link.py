@@ -30,8 +30,7 @@ from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, open_link
 from pans.runtime.link.connection import Connection
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live import LiveRun, RunConfig
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameBlock, Opcode

@@ -83,8 +83,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     """Run one design through the ordinary session; return the core with its sums, and the device's facts."""
     from pans.runtime.core.calibration import CalibrationCore
     from pans.runtime.link.base import open_link
-    from pans.runtime.live.config import RunConfig
-    from pans.runtime.live.loop import run_live
+    from pans.runtime.live import RunConfig, run_live
 
     core = CalibrationCore(design.plan, design.n_cycles)
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6

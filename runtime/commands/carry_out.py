@@ -28,11 +28,9 @@ if TYPE_CHECKING:
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.link.base import Link
-    from pans.runtime.live.config import RunConfig, RunResult
+    from pans.runtime.live import LiveCore, Recovery, RunConfig, RunResult
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
-    from pans.runtime.live.reconnect import Recovery
-    from pans.runtime.live.run import LiveCore
     from pans.runtime.record import AnyRecorder
     from pans.runtime.report.summary import Summary
 
@@ -112,7 +110,7 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
-    from pans.runtime.live.config import RunConfig
+    from pans.runtime.live import RunConfig
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.gates import open_actuator
@@ -152,8 +150,8 @@ def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
     try:
         from pans.runtime.container import read_file
         from pans.runtime.link.trace import TracedLink
+        from pans.runtime.live import Recovery
         from pans.runtime.live.continuous import open_recorder
-        from pans.runtime.live.reconnect import Recovery
 
         ready = _prepare(job, started_ns)
     except BaseException:
@@ -181,9 +179,8 @@ def _watched(
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
+    from pans.runtime.live import LiveRun, Observers, run_live
     from pans.runtime.live.continuous import Attendants
-    from pans.runtime.live.loop import run_live
-    from pans.runtime.live.run import LiveRun, Observers
     from pans.runtime.live.view import live_view
 
     bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder)

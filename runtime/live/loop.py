@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard
@@ -31,9 +32,21 @@ from pans.runtime.timing.ledger import arm_realtime
 from .config import RunConfig, RunResult
 from .continuous import INTERRUPTED, Stop
 from .reconnect import Recovery, reconnect_run
-from .run import NO_OBSERVERS, LiveCore, LiveRun, Observers
+from .run import LiveCore, LiveRun, Watcher
 
 NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Observers:
+    """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
+
+    watch: Watcher | None = None
+    prepared: Callable[[LiveRun], None] | None = None
+    stop: Stop | None = None
+
+
+NO_OBSERVERS = Observers()
 
 
 def run_live(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,7 +27,6 @@ from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Op
 from pans.runtime.wire.tracker import StreamTracker
 
 from .config import RunConfig
-from .continuous import Stop
 from .gates import GateQueue
 from .journal import Journal
 from .lateness import Lateness
@@ -349,15 +347,3 @@ class LiveRun:
             self._counted = self.connection
             counters = self.connection.decoder.counters
             self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
-
-
-@dataclass(frozen=True, slots=True)
-class Observers:
-    """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
-
-    watch: Watcher | None = None
-    prepared: Callable[[LiveRun], None] | None = None
-    stop: Stop | None = None
-
-
-NO_OBSERVERS = Observers()

@@ -1,1 +1,32 @@
-"""Files read back for people: summary, page, verification, facts, exports."""
+"""Files and results for people: the summary of a run, pages, verification, facts, exports.
+
+Owns figures in words and what a file may claim; it reads recordings, bundles, profiles and calibrations, and never runs a device or
+changes a file. `summarise` turns a run's result into a `Summary`, `verify_file` returns what is wrong with a file.
+
+>>> from pans.runtime.report import verify_file
+>>> verify_file("oled-qcmos").ok
+True
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from .page_run import bundle_page, recording_page
+    from .summary import Summary, summarise
+    from .verify import FileVerdict, verify_file
+
+__all__ = ["FileVerdict", "Summary", "bundle_page", "recording_page", "summarise", "verify_file"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "FileVerdict": ".verify",
+        "Summary": ".summary",
+        "bundle_page": ".page_run",
+        "recording_page": ".page_run",
+        "summarise": ".summary",
+        "verify_file": ".verify",
+    },
+)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from pans.runtime.instrument.dark_rate import DarkReport
-from pans.runtime.live.config import RunResult
+from pans.runtime.live import RunResult
 from pans.runtime.live.dark_run import DarkFigures
 from pans.runtime.live.flow_run import FlowFigures
 from pans.runtime.live.tally import TallyFigures

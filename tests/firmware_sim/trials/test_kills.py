@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pans.firmware_sim.trials import kills
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live import LiveRun
 from pans.runtime.record import Recorder
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL and forkserver are not there")

@@ -38,10 +38,7 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import LinkReader
 from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link.usb import UsbLink, usb_target
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.reconnect import Recovery
-from pans.runtime.live.run import Observers
+from pans.runtime.live import Observers, Recovery, RunConfig, run_live
 from pans.runtime.wire import messages as wire
 
 PATIENCE_S = 20.0

@@ -19,10 +19,8 @@ from pans.runtime.flow.make import plan_flow
 from pans.runtime.flow.plan import build_flow_plan
 from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.config import RunConfig
+from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
 from pans.runtime.live.flow_run import FlowRun
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.run import LiveRun, Observers
 from pans.runtime.record import read_recording
 from pans.runtime.wire.messages import DARK_PATTERN
 from pans.trainer.export.tape_bundle import exact_table, tape_bundle

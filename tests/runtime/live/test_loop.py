@@ -20,8 +20,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
-from pans.runtime.live.config import RunConfig, RunResult
-from pans.runtime.live.loop import run_live
+from pans.runtime.live import RunConfig, RunResult, run_live
 from pans.runtime.record import read_recording
 
 PROFILE = load_profile("oled-qcmos")

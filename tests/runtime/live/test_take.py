@@ -10,7 +10,7 @@ import pytest
 from pans.runtime.core.decision import Action, Output
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Arrived
-from pans.runtime.live.run import LiveRun
+from pans.runtime.live import LiveRun
 from pans.runtime.wire.frame import Messages
 
 

@@ -17,10 +17,7 @@ from pans.runtime.cli import main
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
-from pans.runtime.live.config import RunConfig, RunResult
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.reconnect import Recovery
-from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult, run_live
 from pans.runtime.record import PartedRecorder, read_recording, replay
 from pans.runtime.record.part_keeper import PartLimits, index_path, part_path
 from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in

@@ -20,8 +20,7 @@ from pans.runtime.core.plan import build_plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.config import RunConfig
-from pans.runtime.live.loop import run_live
+from pans.runtime.live import RunConfig, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.timing.attribution import CAUSES, QUIET_NS, Incidents, LateWork, judge, judge_gap
 from pans.runtime.timing.evidence import (

@@ -1,0 +1,163 @@
+"""What a notebook needs: load a profile, a bundle or a recording, build a plan, run on a device, replay, evaluate, decide on clicks.
+
+This is `import pans`; the names are loaded when they are first used. Owns nothing of its own: each call is a few lines around the
+packages, which have the rest (pans.runtime.bundle, .instrument, .core, .record, .live, .report, pans.trainer).
+
+>>> import pans
+>>> bundle = pans.load_bundle("fashion10")
+>>> pans.decide(bundle, [0b0000000001, 0b1010000000]).labels.shape
+(2,)
+>>> done = pans.run(bundle, "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast", decisions=20)
+>>> done.summary.tally.decisions, done.recording
+(20, None)
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from pans.runtime import __version__ as __version__
+from pans.runtime.errors import UsageError
+from pans.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.commands.carry_out import Outcome
+    from pans.runtime.core.plan import build_plan
+    from pans.runtime.decide.verdict import Verdicts
+    from pans.runtime.instrument.profile import Profile, load_profile
+    from pans.runtime.record import read_recording as load_recording
+    from pans.runtime.record import replay
+    from pans.trainer.evaluate import evaluate
+
+__all__ = [
+    "__version__",
+    "build_plan",
+    "decide",
+    "evaluate",
+    "load_bundle",
+    "load_profile",
+    "load_recording",
+    "replay",
+    "run",
+]
+
+_load = lazy_names(
+    __name__,
+    {
+        "build_plan": "pans.runtime.core.plan",
+        "evaluate": "pans.trainer.evaluate",
+        "load_profile": "pans.runtime.instrument.profile",
+        "read_recording": "pans.runtime.record",
+        "replay": "pans.runtime.record",
+    },
+)
+
+
+def __getattr__(name: str) -> object:
+    try:
+        return _load("read_recording" if name == "load_recording" else name)
+    except ModuleNotFoundError as error:
+        if name != "evaluate":
+            raise
+        raise UsageError(
+            f"pans.evaluate needs the package {error.name}, which is not installed",
+            remedy="pip install 'pans-runtime[train]'",
+        ) from error
+
+
+def load_bundle(path: str | Path) -> Bundle:
+    """Return the bundle at `path` (.pans), or a shipped one by its name; UsageError or DamagedFileError if it cannot be read.
+
+    >>> load_bundle("fashion10").n_features
+    10
+    """
+    from pans.runtime.bundle.model import load_bundle
+
+    return load_bundle(_file_of(path))[0]
+
+
+def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = "auto") -> Verdicts:
+    """Return `labels`, uint16 (n,), and `probabilities` of the winning classes, float32 (n,), for clicks of n objects.
+
+    `clicks` are integers: words (n,) of one shot, in which bit k is pattern k's click, or counts (n, d_f) of `shots` shots.
+    UsageError for counts outside 0 to `shots` or another shape.
+
+    >>> bundle = load_bundle("fashion10")
+    >>> words, counts = [0b11], [[1, 1, 0, 0, 0, 0, 0, 0, 0, 0]]
+    >>> decide(bundle, words).labels == decide(bundle, counts).labels
+    array([ True])
+    """
+    import numpy as np
+
+    from pans.runtime.bundle.model import word_means
+    from pans.runtime.decide.backends import make_decider
+    from pans.runtime.decide.verdict import checked_counts, verdicts_of
+
+    found = np.asarray(clicks)
+    if found.ndim == 1:
+        if found.size and (int(found.min()) < 0 or int(found.max()) >> bundle.n_features):
+            raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
+        found = word_means(found, bundle.n_features).astype(np.int64)
+    counts = checked_counts(found, shots, bundle.n_features)
+    return verdicts_of(make_decider(bundle, shots=shots, backend=backend), counts, shots)
+
+
+def run(
+    bundle: Bundle | str | Path,
+    device: str,
+    *,
+    profile: Profile | str | None = None,
+    decisions: int = 0,
+    seconds: float = 0.0,
+    shots: int = 1,
+    out: str | Path | None = None,
+    shows: bool = False,
+) -> Outcome:
+    """Run `bundle` on the device behind a URL until `decisions` are made or `seconds` have passed; without both, until interrupted.
+
+    It is what `pans run` does: `out` is a folder for the recording and a page (None: neither), `shows` draws the live view on stderr.
+    `profile` is by default the one that a `sim:` URL names. The result has `summary` (`accuracy`, `verdict`, ...; `as_json()` is what
+    the command prints), `confusion`, and the paths `recording` and `report`. DeviceError and LinkError if the device cannot be armed.
+    """
+    from pans.runtime.commands.carry_out import run_job
+    from pans.runtime.commands.job import Job
+    from pans.runtime.commands.run import profile_of
+    from pans.runtime.instrument.profile import Profile, load_profile
+
+    loaded = profile if isinstance(profile, Profile) else load_profile(profile or profile_of(device))
+    with TemporaryDirectory() as folder:
+        path = _file_of(bundle) if isinstance(bundle, (str, Path)) else _written(bundle, Path(folder))
+        job = Job(
+            bundle_path=path,
+            device=device,
+            profile=loaded,
+            deadline_us=loaded.timing.decision_deadline_us,
+            act_profile=loaded,
+            out=None if out is None else Path(out),
+            shots=shots,
+            decisions=decisions,
+            seconds=seconds,
+            realtime=False,
+            command="pans.run",
+            shows=shows,
+        )
+        return run_job(job)
+
+
+def _file_of(name: str | Path) -> Path:
+    shipped = Path(str(files("pans.runtime") / "shipped" / f"{name}.pans"))
+    return shipped if shipped.exists() and not Path(name).exists() else Path(name)
+
+
+def _written(bundle: Bundle, folder: Path) -> Path:
+    from pans.runtime.bundle.model import write_bundle
+
+    path = folder / f"{bundle.name}.pans"
+    write_bundle(bundle, path)
+    return path

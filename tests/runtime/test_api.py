@@ -1,0 +1,57 @@
+"""`import pans`: what a notebook needs, with the same figures as the commands give."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pans
+from pans.runtime.errors import UsageError
+
+DEVICE = "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast"
+
+
+def test_a_run_leaves_a_recording_that_replays_and_a_page(tmp_path: Path) -> None:
+    done = pans.run("fashion10", DEVICE, decisions=40, out=tmp_path)
+    assert (done.summary.verdict, done.summary.tally.decisions, done.confusion.sum()) == ("PASS", 40, 40)
+    assert done.report is not None
+    assert "SIMULATED" in done.report.read_text()
+    assert done.recording is not None
+    recording = pans.load_recording(done.recording)
+    again = pans.replay(recording, recording.bundle())
+    assert (again.decisions, again.sha256) == (40, done.summary.decisions_sha256)
+
+
+def test_a_run_without_a_folder_leaves_nothing_and_decides_the_same(tmp_path: Path) -> None:
+    bundle = pans.load_bundle("fashion10")
+    done = pans.run(bundle, DEVICE, decisions=40, profile=pans.load_profile("oled-qcmos"))
+    assert (done.recording, done.report) == (None, None)
+    recorded = pans.run(bundle, DEVICE, decisions=40, out=tmp_path)
+    np.testing.assert_array_equal(done.confusion, recorded.confusion)
+
+
+def test_words_and_counts_are_decided_alike_and_checked() -> None:
+    bundle = pans.load_bundle("fashion10")
+    words = np.arange(1 << bundle.n_features)
+    counts = words[:, None] >> np.arange(bundle.n_features) & 1
+    found, wanted = pans.decide(bundle, words), pans.decide(bundle, counts)
+    np.testing.assert_array_equal(found.labels, wanted.labels)
+    np.testing.assert_array_equal(found.probabilities, wanted.probabilities)
+    for wrong in ([-1], [1 << bundle.n_features], [[2] * bundle.n_features], [[0, 1]]):
+        with pytest.raises(UsageError, match="allowed"):
+            pans.decide(bundle, wrong)
+
+
+def test_a_plan_is_built_for_a_shipped_profile() -> None:
+    plan = pans.build_plan(pans.load_profile("oled-qcmos"), pans.load_bundle("fashion10"))
+    assert plan.n_patterns == 10
+
+
+def test_without_the_train_extra_evaluate_says_what_to_install() -> None:
+    code = "import sys; sys.modules['pans.trainer.evaluate'] = None; import pans; pans.evaluate"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "pip install 'pans-runtime[train]'" in done.stderr
