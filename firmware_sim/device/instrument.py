@@ -12,30 +12,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector_model import detector_model
-from pans.firmware_sim.scene.drawing import ClickSource
-from pans.firmware_sim.scene.exposure_times import Exposures
-from pans.firmware_sim.scene.light import LightTable, StillObjects, begin, prepare, tabulate, warm_up
+from pans.firmware_sim.scene.light import Table
 from pans.firmware_sim.scene.moving import SceneFile
-from pans.firmware_sim.scene.optics import passive_photoelectrons
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import PARALLEL, Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
+from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
 from .gates import GATE_CHANNELS, Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
 from .stream_buffer import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Refused
+from .view import View
 
 if TYPE_CHECKING:
-    from pans.firmware_sim.scene.shifts import ShiftTable
-    from pans.firmware_sim.scene.tape import BarTable
-
     from .parallel import FrameRun
 
 FIRMWARE = "pans-sim 1"
@@ -71,25 +63,17 @@ class Instrument:
         buffer_messages: int = BUFFER_MESSAGES,
         optics: Analyser | None = None,
     ) -> None:
-        self.optics = optics  # passive: then there is no projector
         self.profile = profile
-        self.scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
-        _check_scene(self.scene, profile, optics)
-        warm_up(self.scene)
-        if profile.mode == "parallel":  # nothing is compiled after the instrument is switched on
-            from pans.firmware_sim.scene import detector_kernels
-
-            from . import frame_writer
-
-            detector_kernels.warm_up()
-            frame_writer.warm_up()
+        scene = SceneFile(scene.name, scene) if isinstance(scene, Scene) else scene
+        self.view = View(profile, scene, optics, seed)
+        self.view.check_and_warm_up()
         self.counters = InstrumentCounters()
         self.decoder = wire.FrameDecoder()
         self.decoder.use_kernels()
         self.state, self.reason = DeviceState.IDLE, StateReason.POWER_ON
         self.session = 0  # the host's nonce; 0 before the first HELLO
         self.gates = Gates()
-        self._seed, self._epoch, self._tick, self._tick_hz = seed, epoch, power_on_tick, profile.clock.tick_hz
+        self._epoch, self._tick, self._tick_hz = epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
         self.stream = StreamBuffer(buffer_messages)
         self._out: list[bytes | memoryview] = []
@@ -100,7 +84,7 @@ class Instrument:
         pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
         self._plan = PlanMemory(self.profile)
-        self._light: tuple[tuple[int, int, int], LightTable | ShiftTable | BarTable] | None = None
+        self._light: tuple[tuple[int, int, int], Table] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
         self._run: Measurement | FrameRun | None = None
         self._lease_tick: int | None = None
@@ -249,10 +233,11 @@ class Instrument:
 
     def _facts(self) -> dict[str, Any]:
         profile = self.profile
-        passive = {} if self.optics is None else {"optics_sha256": self.optics.fingerprint}
+        optics, scene = self.view.optics, self.view.scene
+        passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
         return passive | {
             "firmware": FIRMWARE,
-            "serial": f"SIM-{self._seed & U32:08X}",
+            "serial": f"SIM-{self.view.seed & U32:08X}",
             "epoch": self._epoch,
             "tick_hz": self._tick_hz,
             "tick": self._tick,
@@ -266,9 +251,9 @@ class Instrument:
             "simulated": True,
             "profile": profile.name,
             "gate_channels": GATE_CHANNELS,
-            "scene": self.scene.name[:60],  # a receiver takes at most 256 bytes of text
-            "objects": self.scene.n_objects,
-            "seed": self._seed,
+            "scene": scene.name[:60],  # a receiver takes at most 256 bytes of text
+            "objects": scene.n_objects,
+            "seed": self.view.seed,
         }
 
     def _grant(self, grant: wire.Grant) -> None:
@@ -304,7 +289,7 @@ class Instrument:
         opcode, body = command.opcode, command.body
         if opcode == Opcode.LOAD_PATTERN:
             self._require_idle("LOAD_PATTERN")
-            if self.optics is not None:
+            if self.view.optics is not None:
                 raise Refused(AckStatus.OUT_OF_RANGE, "passive optics: there is no projector to show a pattern")
             self._patterns.load(unpack_pattern(body))
         elif opcode == Opcode.LOAD_PLAN:
@@ -337,63 +322,22 @@ class Instrument:
         if program is None:
             raise Refused(AckStatus.WRONG_STATE, "no complete plan is loaded")
         check_arm(program, arm, self._tick, self._tick_hz)
-        table = self._light_table(program)
-        model = detector_model(self.profile, self._exposure_us(program))
-        exposures = Exposures(program, arm.n_cycles or None, self._tick_hz)
-        changes = Changes(self.scene.changes, program.channels)
-        light = begin(self.scene, table, program, exposures, changes, self._seed, self._draws)
+        self._run = self.view.run(program, arm, self._light_table(program), self._draws)
         self.stream.restart()
         self._exposures_ended = 0
-        source = ClickSource(light, exposures, model, changes, self._seed, self._draws)
-        if isinstance(light, StillObjects) and program.mode != PARALLEL:
-            self._run = Measurement(program, arm, light, source)
-        else:
-            from .parallel import FrameRun  # numba is loaded only for parallel instruments
-
-            self._run = FrameRun(program, arm, light, source, self.scene.moves)
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
 
-    def _exposure_us(self, program: Program) -> float:
-        return program.exposure_ticks * 1e6 / self._tick_hz
-
-    def _light_table(self, program: Program) -> LightTable | ShiftTable | BarTable:
+    def _light_table(self, program: Program) -> Table:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
         key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
         if self._light is None or self._light[0] != key:
-            try:
-                self._light = (key, self._tabulate(program))
-            except ConfigError as error:
-                raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
+            patterns = self._patterns.stack(program.n_patterns) if self.view.optics is None else None
+            self._light = (key, self.view.tabulate(program, patterns))
         return self._light[1]
-
-    def _tabulate(self, program: Program) -> LightTable | ShiftTable | BarTable:
-        exposure_us = self._exposure_us(program)
-        if self.optics is None:
-            return prepare(self.profile, self.scene, self._patterns.stack(program.n_patterns), exposure_us)
-        if program.n_patterns != len(self.optics.matrix):
-            text = f"a plan of {program.n_patterns} patterns, the optics lead to {len(self.optics.matrix)} detectors"
-            raise Refused(AckStatus.OUT_OF_RANGE, text)
-        assert isinstance(self.scene.what, Scene)  # see _check_scene
-        return tabulate(self.profile, passive_photoelectrons(self.optics, self.scene.what, exposure_us), exposure_us)
 
     def _gate(self, body: bytes) -> None:
         gate = unpack_gate(body)
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)
-
-
-def _check_scene(scene: SceneFile, profile: Profile, optics: Analyser | None) -> None:
-    """Refuse what the simulator cannot do with a scene that moves."""
-    if not scene.moves:
-        return
-    if profile.mode != "parallel":
-        raise ConfigError(
-            f"scene {scene.name!r} moves, and {profile.name} shows pattern after pattern: objects would be gone before the last one",
-            remedy="choose a parallel profile, such as flow-snspd",
-        )
-    if optics is not None:
-        raise ConfigError(
-            f"scene {scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
-        )

@@ -1,12 +1,12 @@
-"""What reaches the detectors in one run: the three kinds of scenes behind one face, for measurement.py.
+"""What reaches the detectors in one run: the three kinds of scenes behind one interface.
 
 Owns the tables made once per pattern set (`prepare`), the choice of a scene's flow (`begin`) and still objects, which pass as the plan
-says; cells and tape have rooms of their own, with numba, opened only where something moves. Never draws a click.
+says; cells and tape have modules of their own, with numba, loaded only where something moves. Never draws a click.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Table: TypeAlias = "LightTable | ShiftTable | BarTable"  # what a scene needs to know of a pattern set
 
 
 class LightTable(NamedTuple):
@@ -65,9 +66,7 @@ def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
     return LightTable(with_dark, first_click_probability(detector_model(profile, exposure_us), with_dark))
 
 
-def prepare(
-    profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float
-) -> LightTable | ShiftTable | BarTable:
+def prepare(profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float) -> Table:
     """Make what `scene` needs to know of the patterns, uint16 (patterns, pixels); ConfigError when they do not fit it."""
     what = scene.what
     if isinstance(what, Cells):
@@ -95,7 +94,7 @@ def warm_up(scene: SceneFile) -> None:
 
 def begin(
     scene: SceneFile,
-    table: LightTable | ShiftTable | BarTable,
+    table: Table,
     program: Program,
     exposures: Exposures,
     changes: Changes,

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from pans.firmware_sim.device.view import View
 from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.moving import Cells, Tape
+from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene, scene_from_arrays
-from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import PARALLEL
+from pans.runtime.wire.commands import PARALLEL, Arm
 
 FLOW = load_profile("flow-snspd")
 TICK_HZ = FLOW.clock.tick_hz
@@ -30,3 +33,20 @@ def program(
     shown[list(dark)] = wire.DARK_PATTERN
     offsets = np.arange(n_slots, dtype=np.int64) * period
     return Program(PARALLEL, 3, exposure, period, n_slots * period + gap, 1, offsets, shown, ((0, n_slots),))
+
+
+def view_of(what: Any = CELLS, changes: tuple[Change, ...] = (), *, profile: Profile = FLOW, seed: int = 7) -> View:
+    """The three-channel instrument before cells, a tape or pictures."""
+    return View(profile, SceneFile("x", what, changes), seed=seed)
+
+
+def light_and_clicks(view: View, plan: Program, cycles: int = 0, first_draw: int = 0) -> tuple[Any, Any]:
+    """The light and the clicks of one run through this module's patterns."""
+    levels = BAR_LEVELS if isinstance(view.scene.what, Tape) else LEVELS
+    return view.light_and_clicks(plan, cycles, view.tabulate(plan, levels), first_draw)
+
+
+def started(view: View, plan: Program, cycles: int = 0, first_draw: int = 0) -> Any:
+    """A run through this module's patterns, armed for tick 1000."""
+    levels = BAR_LEVELS if isinstance(view.scene.what, Tape) else LEVELS
+    return view.run(plan, Arm(1000, cycles, 1), view.tabulate(plan, levels), first_draw)

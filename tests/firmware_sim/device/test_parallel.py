@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from moving_scenes import BAR_LEVELS, CELLS, FLOW, LEVELS, PICTURES, TAPE, TICK_HZ, program
+from moving_scenes import CELLS, FLOW, PICTURES, TAPE, TICK_HZ, light_and_clicks, program, started, view_of
 
 from pans.firmware_sim.commands import bench_flow
 from pans.firmware_sim.device import frame_writer
@@ -18,16 +18,12 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun, Stretch
 from pans.firmware_sim.device.sequential import Measurement
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
+from pans.firmware_sim.device.view import View
 from pans.firmware_sim.ports.faults import parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector_model import detector_model
-from pans.firmware_sim.scene.drawing import ClickSource
-from pans.firmware_sim.scene.exposure_times import Exposures
-from pans.firmware_sim.scene.light import begin, prepare
 from pans.firmware_sim.scene.marks import MARK_PHOTONS, Stamp
-from pans.firmware_sim.scene.moving import Change, SceneFile, Tape
+from pans.firmware_sim.scene.moving import Change
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.messages import DeviceState, Opcode
@@ -47,24 +43,16 @@ class OneByOne(StreamBuffer):
 # -- messages ------------------------------------------------------------------------------------------------------------
 
 
-def parts(scene: SceneFile, plan: Program, cycles: int) -> tuple[Any, ClickSource]:
-    levels = BAR_LEVELS if isinstance(scene.what, Tape) else LEVELS
-    exposure_us = plan.exposure_ticks * 1e6 / TICK_HZ
-    exposures, changes = Exposures(plan, cycles or None, TICK_HZ), Changes(scene.changes, 3)
-    light = begin(scene, prepare(PROFILE, scene, levels, exposure_us), plan, exposures, changes, 7, 0)
-    return light, ClickSource(light, exposures, detector_model(PROFILE, exposure_us), changes, 7, 100)
-
-
-def plain_messages(scene: SceneFile, plan: Program, cycles: int, start: int) -> list[Any]:
+def plain_messages(view: View, plan: Program, cycles: int, start: int) -> list[Any]:
     """The stream in plain loops: clicks by the detector's reference, every mark before the first block that ends after it."""
-    light, source = parts(scene, plan, cycles)
+    light, source = light_and_clicks(view, plan, cycles, 100)
     rows = light.take_marks(cycles * plan.cycle_ticks)
     photons = rows[:, MARK_PHOTONS].copy().view(np.float64).astype(np.float32).tolist()
     marks = [
         wire.Mark(0, number, truth, exposure, tick + start, light, half)
         for (number, truth, exposure, tick, half, _), light in zip(rows.tolist(), photons)
     ]
-    light, source = parts(scene, plan, cycles)
+    light, source = light_and_clicks(view, plan, cycles, 100)
     messages: list[Any] = []
     before = np.zeros(3, np.uint8)
     for cycle in range(cycles):
@@ -76,7 +64,7 @@ def plain_messages(scene: SceneFile, plan: Program, cycles: int, start: int) -> 
             clicks = source.clicks(exposure, count, before)
             before = clicks[-1]
             words = np.packbits(clicks, axis=1, bitorder="little")
-            number = wire.NO_OBJECT if scene.moves else cycle // plan.cycles_per_object
+            number = wire.NO_OBJECT if view.scene.moves else cycle // plan.cycles_per_object
             messages.append(wire.FrameBlock(0, 0, int(begins[0]), exposure, plan.slot_period_ticks, number, words))
     return messages
 
@@ -88,11 +76,10 @@ def comparable(message: Any) -> Any:
 @pytest.mark.parametrize("changes", [(), CHANGES], ids=["steady", "changing"])
 @pytest.mark.parametrize("what", [CELLS, TAPE, PICTURES], ids=["cells", "tape", "still"])
 def test_stretches_hold_the_messages_of_plain_loops(what: Any, changes: tuple[Change, ...]) -> None:
-    scene = SceneFile("x", what, changes)
+    view = view_of(what, changes, profile=PROFILE)
     cut = replace(program(16, dark=(3,), gap=777), blocks=((0, 9), (9, 1), (10, 6)), cycles_per_object=3)
     for plan, cycles in ((cut, 400), (program(1), 1200)):
-        light, source = parts(scene, plan, cycles)
-        run = FrameRun(plan, Arm(1000, cycles, 1), light, source, scene.moves)
+        run = started(view, plan, cycles, 100)
         found = []
         while (due := run.next_tick) is not None:
             stretch = run.stretch()
@@ -100,17 +87,16 @@ def test_stretches_hold_the_messages_of_plain_loops(what: Any, changes: tuple[Ch
             assert stretch.due_by(due - 1) == 0
             assert stretch.due_by(due) >= 1
             found.append(comparable(run.emit()))
-        assert found == [comparable(message) for message in plain_messages(scene, plan, cycles, 1000)]
+        assert found == [comparable(message) for message in plain_messages(view, plan, cycles, 1000)]
         assert sum(isinstance(message, wire.Mark) for message in found) > 100
         assert run.cut(10**9) is None
         assert not run.draw_ahead()
 
 
 def test_a_run_that_is_broken_off_ends_within_a_block() -> None:
-    plan = replace(program(16), blocks=((0, 10), (10, 6)))
+    plan, view = replace(program(16), blocks=((0, 10), (10, 6))), view_of(profile=PROFILE)
     for tick in (0, 1000, 1199, 1200, 1449, 1450, 9999, 77_777):
-        light, source = parts(SceneFile("x", CELLS), plan, 0)
-        run = FrameRun(plan, Arm(1000, 0, 1), light, source, moves=True)
+        run = started(view, plan)
         whole = []
         while run.next_tick is not None and run.next_tick <= tick:
             whole.append(run.emit())
@@ -119,8 +105,7 @@ def test_a_run_that_is_broken_off_ends_within_a_block() -> None:
         assert sent + (len(rest.words) if rest else 0) == run.ended_by(tick)
         assert run.next_tick is None
         if rest is not None:
-            light, source = parts(SceneFile("x", CELLS), plan, 0)
-            uncut = FrameRun(plan, Arm(1000, 0, 1), light, source, moves=True)
+            uncut = started(view, plan)
             blocks = [
                 m for m in (uncut.emit() for _ in range(400) if uncut.next_tick) if isinstance(m, wire.FrameBlock)
             ]
@@ -204,7 +189,7 @@ def story(device: Any, seed: int, ahead: Callable[[], int]) -> tuple[bytes, list
 def instrument(name: str, capacity: int, one_by_one: bool, changes: tuple[Change, ...] = ()) -> Instrument:
     """The bench's instrument, its run stopped; command 100 was the last one."""
     device = bench_flow._armed(name, 10, 5.0, 40)
-    device.scene = replace(device.scene, changes=changes)
+    device.view = replace(device.view, scene=replace(device.view.scene, changes=changes))
     device.stream = (OneByOne if one_by_one else StreamBuffer)(capacity)
     for number in range(device._ack.last_id + 1, 101):
         device.step(0, wire.encode_command(number, Opcode.STOP, b"", bench_flow.SESSION))

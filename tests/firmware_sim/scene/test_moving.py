@@ -10,7 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from moving_scenes import BAR_LEVELS, CELLS, FLOW, LEVELS, PICTURES, TAPE, TICK_HZ, program
+from moving_scenes import (
+    BAR_LEVELS,
+    CELLS,
+    FLOW,
+    LEVELS,
+    PICTURES,
+    TAPE,
+    TICK_HZ,
+    light_and_clicks,
+    program,
+    started,
+    view_of,
+)
 from naive_moving import mean_light, shifted, tape_field
 
 from pans.firmware_sim.commands import bench_flow
@@ -18,15 +30,14 @@ from pans.firmware_sim.device import parallel as frame_run
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
 from pans.firmware_sim.device.sequential import Measurement
+from pans.firmware_sim.device.view import View
 from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene import cells as cells_module
 from pans.firmware_sim.scene import shifts
 from pans.firmware_sim.scene.cells import CellFlow
 from pans.firmware_sim.scene.changes import Changes
 from pans.firmware_sim.scene.detector_model import detector_model
-from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.exposure_times import Exposures
-from pans.firmware_sim.scene.light import StillObjects, begin, prepare
 from pans.firmware_sim.scene.marks import MARK_PHOTONS
 from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
@@ -40,13 +51,8 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm
 
 
-def flow(what: Any = CELLS, plan: Program | None = None, *, changes: tuple[Change, ...] = (), seed: int = 7) -> Any:
-    plan = program() if plan is None else plan
-    scene = SceneFile("x", what, changes)
-    exposure_us = plan.exposure_ticks * 1e6 / TICK_HZ
-    exposures = Exposures(plan, None, TICK_HZ)
-    table = prepare(FLOW, scene, LEVELS if isinstance(what, Cells) else BAR_LEVELS, exposure_us)
-    return begin(scene, table, plan, exposures, Changes(changes, 3), seed, 0)
+def flow(what: Any = CELLS, plan: Program | None = None, seed: int = 7) -> Any:
+    return light_and_clicks(view_of(what, seed=seed), plan or program())[0]
 
 
 def light_of(run: Any, first: int, count: int) -> np.ndarray:
@@ -64,16 +70,6 @@ def marks_of(run: Any, n: int) -> list[wire.Mark]:
         for (number, truth, exposure, tick, half, _), light in zip(rows.tolist(), photons):
             marks.append(wire.Mark(0, number, truth, exposure, tick, light, half))
     return marks[:n]
-
-
-def run_of(scene: SceneFile, plan: Program, *, cycles: int = 0, seed: int = 7, first_draw: int = 0) -> FrameRun:
-    exposure_us = plan.exposure_ticks * 1e6 / TICK_HZ
-    exposures = Exposures(plan, cycles or None, TICK_HZ)
-    levels = LEVELS if not isinstance(scene.what, Tape) else BAR_LEVELS
-    changes = Changes(scene.changes, 3)
-    light = begin(scene, prepare(FLOW, scene, levels, exposure_us), plan, exposures, changes, seed, first_draw)
-    source = ClickSource(light, exposures, detector_model(FLOW, exposure_us), changes, seed, 0)
-    return FrameRun(plan, Arm(1000, cycles, 1), light, source, scene.moves)
 
 
 def emitted(run: FrameRun | Measurement, n: int) -> list[Any]:
@@ -309,10 +305,10 @@ def test_tape_marks_stand_where_the_window_is_aligned() -> None:
 
 @pytest.mark.parametrize("what", [CELLS, TAPE], ids=["cells", "tape"])
 def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = SceneFile("x", what, (Change("drift", 0.0, 1.0, -1, -50.0),))
+    view = view_of(what, (Change("drift", 0.0, 1.0, -1, -50.0),))
 
     def story(ahead: bool = False) -> list[Any]:
-        run = run_of(scene, program(dark=(3,)), cycles=120)
+        run = started(view, program(dark=(3,)), cycles=120)
         messages = []
         while run.next_tick is not None:
             if ahead:
@@ -332,7 +328,7 @@ def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.Monkey
 
 
 def test_messages_come_in_the_order_of_ticks() -> None:
-    run = run_of(SceneFile("x", CELLS), program(), cycles=200)
+    run = started(view_of(), program(), cycles=200)
     last, marks, next_exposure = 0, 0, 0
     together: int | None = None
     while run.next_tick is not None:
@@ -356,8 +352,7 @@ def test_messages_come_in_the_order_of_ticks() -> None:
 
 
 def test_another_run_meets_other_cells() -> None:
-    scene = SceneFile("x", CELLS)
-    first, again, later = (run_of(scene, program(), first_draw=draw) for draw in (0, 0, 5000))
+    first, again, later = (started(view_of(), program(), first_draw=draw) for draw in (0, 0, 5000))
     marks = [marks_of(run._light, 3) for run in (first, again, later)]
     assert marks[0] == marks[1] != marks[2]
 
@@ -398,12 +393,8 @@ def test_changes_add_up_as_declared() -> None:
 
 def test_a_dead_channel_is_silent_in_spite_of_crosstalk() -> None:
     profile = replace(FLOW, detector=replace(FLOW.detector, crosstalk_probability=0.5))
-    scene = SceneFile("x", PICTURES, (Change("dead", 0.0, np.inf, 1, 0.0), Change("burst", 0.0, 1.0, -1, 1e6)))
-    plan = program()
-    exposures, changes = Exposures(plan, None, TICK_HZ), Changes(scene.changes, 3)
-    light = begin(scene, prepare(profile, scene, LEVELS, 2.0), plan, exposures, changes, 1, 0)
-    source = ClickSource(light, exposures, detector_model(profile, 2.0), changes, 1, 0)
-    run = FrameRun(plan, Arm(10, 0, 1), light, source, moves=False)
+    changes = (Change("dead", 0.0, np.inf, 1, 0.0), Change("burst", 0.0, 1.0, -1, 1e6))
+    run = started(view_of(PICTURES, changes, profile=profile, seed=1), program())
     words = np.concatenate([block.words for block in emitted(run, 80) if isinstance(block, wire.FrameBlock)])
     clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3].mean(axis=0)
     assert clicks[1] == 0
@@ -439,19 +430,14 @@ def test_clicks_follow_the_light_that_the_scene_passes() -> None:
     """Sums over 40 000 exposures, channel by channel, against the probabilities they were drawn with; 5 sigma."""
     dim = replace(FLOW.projector, peak_photoelectrons_hz=4e4)
     profile = replace(FLOW, projector=dim, detector=replace(FLOW.detector, crosstalk_probability=0.0))
-    scene, plan = SceneFile("x", CELLS, (Change("dark", 0.02, 9.0, 1, 500.0),)), program()
-    exposures, changes = Exposures(plan, None, TICK_HZ), Changes(scene.changes, 3)
-    model = detector_model(profile, 2.0)
-
-    def light() -> Any:
-        return begin(scene, prepare(profile, scene, LEVELS, 2.0), plan, exposures, changes, 3, 0)
-
-    source = ClickSource(chosen := light(), exposures, model, changes, 3, 0)
-    run = FrameRun(plan, Arm(10, 0, 1), chosen, source, moves=True)
+    view, plan = view_of(CELLS, (Change("dark", 0.02, 9.0, 1, 500.0),), profile=profile, seed=3), program()
+    run = started(view, plan)
     words = np.concatenate([block.words for block in emitted(run, 5500) if isinstance(block, wire.FrameBlock)])[:40_000]
     clicks = np.unpackbits(words, axis=1, bitorder="little")[:, :3]
+    exposures = Exposures(plan, None, TICK_HZ)
     times_s = exposures.seconds(exposures.begins(0, len(words)))
-    probability = changes.probability(model, light_of(light(), 0, len(words)), times_s, 2e-6)
+    light = light_of(light_and_clicks(view, plan)[0], 0, len(words))
+    probability = Changes(view.scene.changes, 3).probability(detector_model(profile, 2.0), light, times_s, 2e-6)
     assert 0.01 < probability.mean() < 0.9
     spread = np.sqrt((probability * (1 - probability)).sum(axis=0))
     assert (np.abs(clicks.sum(axis=0) - probability.sum(axis=0)) < 5 * spread).all()
@@ -461,16 +447,13 @@ def test_a_still_scene_changes_too_pattern_after_pattern() -> None:
     """The paper's way of measuring: 40 000 exposures in the dark, the dark rate ten times as high in the second half."""
     profile = load_profile("ideal")
     profile = replace(profile, detector=replace(profile.detector, dark_rate_hz=1e4))
-    scene = open_scene("dark", "dark:at_s=0.05:factor=10")
     slots = 2 * np.arange(100, dtype=np.int64)
     plan = Program(
         0, 1, 2, 2, 200, 1, slots, np.zeros(100, np.uint16), ((0, 100),)
     )  # 2 us at 1 MHz, one after the other
-    exposures, changes = Exposures(plan, None, 1_000_000), Changes(scene.changes, 1)
-    light = begin(scene, prepare(profile, scene, np.ones((1, 4), np.uint16), 2.0), plan, exposures, changes, 1, 0)
-    source = ClickSource(light, exposures, detector_model(profile, 2.0), changes, 1, 0)
-    assert isinstance(light, StillObjects)
-    run = Measurement(plan, Arm(10, 0, 1), light, source)
+    view = View(profile, open_scene("dark", "dark:at_s=0.05:factor=10"), seed=1)
+    run = view.run(plan, Arm(10, 0, 1), view.tabulate(plan, np.ones((1, 4), np.uint16)))
+    assert isinstance(run, Measurement)
     bits = np.concatenate([block.bits for block in emitted(run, 1100) if isinstance(block, wire.ClickBlock)])[:50_000]
     for part, mean in ((bits[:25_000], 0.02), (bits[25_000:], 0.2)):
         wanted = -np.expm1(-mean)

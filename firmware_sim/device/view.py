@@ -1,0 +1,107 @@
+"""What the instrument looks at, and through what: from a program and the uploaded patterns to a run.
+
+Owns the scene's table for a pattern set and the making of runs; never knows states, sessions or time. The table is made once for each
+pattern set and exposure time, which takes seconds for many pictures in flow. A scene that cannot be shown is refused when the
+instrument is switched on (ConfigError), patterns that do not fit it when they are tabulated (`Refused`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.firmware_sim.program import Program
+from pans.firmware_sim.scene.changes import Changes
+from pans.firmware_sim.scene.detector_model import detector_model
+from pans.firmware_sim.scene.drawing import ClickSource
+from pans.firmware_sim.scene.exposure_times import Exposures
+from pans.firmware_sim.scene.light import RunLight, StillObjects, Table, begin, prepare, tabulate, warm_up
+from pans.firmware_sim.scene.moving import SceneFile
+from pans.firmware_sim.scene.optics import passive_photoelectrons
+from pans.firmware_sim.scene.still import Scene
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.commands import PARALLEL, Arm
+from pans.runtime.wire.messages import AckStatus
+
+from .sequential import Measurement
+from .upload import Refused
+
+if TYPE_CHECKING:
+    from .parallel import FrameRun
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A profile's detector before a scene, with patterns from its projector or, where `optics` are given, behind passive ones."""
+
+    profile: Profile
+    scene: SceneFile
+    optics: Analyser | None = None
+    seed: int = 0
+
+    def check_and_warm_up(self) -> None:
+        """Refuse what the simulator cannot do with a scene that moves, and compile the kernels: later nothing may wait for that."""
+        if self.scene.moves and self.profile.mode != "parallel":
+            raise ConfigError(
+                f"scene {self.scene.name!r} moves, and {self.profile.name} shows pattern after pattern: "
+                "objects would be gone before the last one",
+                remedy="choose a parallel profile, such as flow-snspd",
+            )
+        if self.scene.moves and self.optics is not None:
+            raise ConfigError(
+                f"scene {self.scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
+            )
+        warm_up(self.scene)
+        if self.profile.mode == "parallel":
+            from pans.firmware_sim.scene import detector_kernels
+
+            from . import frame_writer
+
+            detector_kernels.warm_up()
+            frame_writer.warm_up()
+
+    def exposure_us(self, program: Program) -> float:
+        """The exposure time of `program` on this instrument's clock."""
+        return program.exposure_ticks * 1e6 / self.profile.clock.tick_hz
+
+    def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None) -> Table:
+        """Return the light of the scene through `patterns`, uint16 (n, pixels), or through the optics; `Refused` if they do not fit."""
+        exposure_us = self.exposure_us(program)
+        try:
+            if patterns is not None:
+                return prepare(self.profile, self.scene, patterns, exposure_us)
+            assert self.optics is not None
+            if program.n_patterns != len(self.optics.matrix):
+                text = (
+                    f"a plan of {program.n_patterns} patterns, the optics lead to {len(self.optics.matrix)} detectors"
+                )
+                raise Refused(AckStatus.OUT_OF_RANGE, text)
+            assert isinstance(self.scene.what, Scene)  # see check_and_warm_up
+            photons = passive_photoelectrons(self.optics, self.scene.what, exposure_us)
+            return tabulate(self.profile, photons, exposure_us)
+        except ConfigError as error:
+            raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
+
+    def light_and_clicks(
+        self, program: Program, n_cycles: int, table: Table, first_draw: int = 0
+    ) -> tuple[RunLight, ClickSource]:
+        """Start the scene; `first_draw` counts the exposures of earlier runs, 0 cycles last until STOP."""
+        exposures = Exposures(program, n_cycles or None, self.profile.clock.tick_hz)
+        changes = Changes(self.scene.changes, program.channels)
+        light = begin(self.scene, table, program, exposures, changes, self.seed, first_draw)
+        model = detector_model(self.profile, self.exposure_us(program))
+        return light, ClickSource(light, exposures, model, changes, self.seed, first_draw)
+
+    def run(self, program: Program, arm: Arm, table: Table, first_draw: int = 0) -> Measurement | FrameRun:
+        """Return the run that ARM starts: pattern after pattern, or of all channels at once."""
+        light, source = self.light_and_clicks(program, arm.n_cycles, table, first_draw)
+        if isinstance(light, StillObjects) and program.mode != PARALLEL:
+            return Measurement(program, arm, light, source)
+        from .parallel import FrameRun  # numba is loaded only for parallel instruments
+
+        return FrameRun(program, arm, light, source, self.scene.moves)
