@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.sequential import Measurement, StreamMessage
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
-from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Output
+from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag, Output, StreamEndUnknown
 from pans.runtime.core.plan import Plan
 from pans.runtime.live import LiveRun
 from pans.runtime.wire import messages as wire
@@ -258,7 +258,7 @@ class Checker:
     def _on_output(self, output: Output) -> Output:
         stream = self._stream(self._host_session)
         for event in output.events:
-            if event["kind"] == "stream_end_unknown":
+            if isinstance(event, StreamEndUnknown):
                 self.counts.blocks_lost_open_end += len(stream.entries)
                 stream.open_end = True
                 stream.entries.clear()

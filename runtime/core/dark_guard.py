@@ -1,8 +1,8 @@
 """From dark exposures to consequences: the watch, what it means, and what the policy does about it, for one core.
 
-Owns the policies; never counts (dark_watch.py), names (channels.py) or computes tables (dark_tables.py). Deterministic: the
-same blocks give the same events and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
-`decider` for every decision, and passes its events on.
+Owns the policies; never counts (instrument/cusum.py), names (instrument/channel_health.py) or computes tables (dark_tables.py). The
+same blocks give the same findings and the same decisions, live and in a replay. A core gives it every block, asks `flags` and
+`decider` for every decision, and passes its findings on.
 
 Policies: `warn` tells and changes no decision; `tables` decides with a table for the present dark rates, without dead channels; `mask`
 leaves channels out that are hot, quiet or dead; both abstain where all are left out, or more than can be done (dark_tables.py);
@@ -62,7 +62,7 @@ class DarkGuard:
         self.policy, self.watch, self.health = policy, watch, ChannelHealth(watch)
         self.lit = lit  # finds dead channels in lit exposures; None: dark ones alone tell
         self._any_click = np.zeros(1, np.int64)
-        self._news: list[dict[str, Any]] = []
+        self._news: list[Finding] = []
         self.findings: list[Finding] = []
         self.dropped_findings = 0
         self._dark_slot = plan.slot_pattern == DARK_PATTERN
@@ -85,8 +85,8 @@ class DarkGuard:
             self.lit.end_object()
         self._next, self._silent_before = 0, None
 
-    def take(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
-        """Take a block: its dark exposures, and what its lit ones say about dead channels; return events.
+    def take(self, block: ClickBlock | FrameBlock) -> list[Finding]:
+        """Take a block: its dark exposures, and what its lit ones say about dead channels; return the findings.
 
         With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
         """
@@ -100,7 +100,7 @@ class DarkGuard:
     def take_object(self, counts: NDArray[np.int64], number: int) -> None:
         """Take the clicks of a whole window, int64 (d_f,), of object `number` (NO_OBJECT: one of its own).
 
-        What it says holds from this decision on; `news` has the events.
+        What it says holds from this decision on; `news` has the findings.
         """
         if self.lit is None:
             return
@@ -110,8 +110,8 @@ class DarkGuard:
         self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
         self._look_for_dead()
 
-    def news(self) -> list[dict[str, Any]]:
-        """Return the events of what was found with objects, once."""
+    def news(self) -> list[Finding]:
+        """Return what was found with objects, once."""
         news, self._news = self._news, []
         return news
 
@@ -130,7 +130,7 @@ class DarkGuard:
                 found += self.health.note_dead((one.channel,), _silence_words(who, self._parallel, one))
         self._news += self._keep(found)
 
-    def _take_dark(self, block: ClickBlock | FrameBlock) -> list[dict[str, Any]]:
+    def _take_dark(self, block: ClickBlock | FrameBlock) -> list[Finding]:
         if isinstance(block, FrameBlock):
             if not self._any_dark:
                 return []
@@ -144,12 +144,12 @@ class DarkGuard:
         self._next, self._silent_before = block.exposure_index + len(bits), bool(bits[-1] == 0)
         return self.take_dark_words(bits[dark & silent].reshape(-1, 1))
 
-    def take_dark_words(self, words: NDArray[np.uint8]) -> list[dict[str, Any]]:
-        """Take dark exposures, words uint8 (n, bytes), in the order of time; return events."""
+    def take_dark_words(self, words: NDArray[np.uint8]) -> list[Finding]:
+        """Take dark exposures, words uint8 (n, bytes), in the order of time; return the findings."""
         return self._found(self.watch.update_words(words)) if len(words) else []
 
-    def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[dict[str, Any]]:
-        """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return events."""
+    def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[Finding]:
+        """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return the findings."""
         if not frames:
             return []
         if self.lit is not None:
@@ -157,14 +157,14 @@ class DarkGuard:
             self._look_for_dead()
         return self.news() + self._found(self.watch.update(frames, clicks))
 
-    def _found(self, alarms: list[Alarm]) -> list[dict[str, Any]]:
+    def _found(self, alarms: list[Alarm]) -> list[Finding]:
         return self._keep(self.health.take(alarms))
 
-    def _keep(self, found: list[Finding]) -> list[dict[str, Any]]:
+    def _keep(self, found: list[Finding]) -> list[Finding]:
         kept = found[: max(0, MAX_FINDINGS - len(self.findings))]
         self.findings += kept
         self.dropped_findings += len(found) - len(kept)
-        return [finding.event() for finding in found]
+        return found
 
     @property
     def serious(self) -> list[Finding]:

@@ -5,10 +5,15 @@ Owns the vocabulary that cores, recordings, reports and the live run share, and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntFlag
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from pans.runtime.instrument.channel_health import Finding
+from pans.runtime.wire.tracker import Gap
 
 NO_LABEL = 0xFFFF  # the label of a decision that abstained
 
@@ -82,6 +87,31 @@ class Passage(NamedTuple):
     clicks: int
 
 
+@dataclass(frozen=True, slots=True)
+class BeyondPlan:
+    """A block that lies beyond the plan or does not fit it: it was left out."""
+
+    exposure_index: int
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        return {"kind": "beyond_plan", "exposure_index": self.exposure_index}
+
+
+@dataclass(frozen=True, slots=True)
+class StreamEndUnknown:
+    """The stream ended and the device did not say how much it had exposed: `first_exposure` is the first that may be missing."""
+
+    first_exposure: int
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        return {"kind": "stream_end_unknown", "first_exposure": self.first_exposure}
+
+
+CoreEvent = Gap | BeyondPlan | StreamEndUnknown | Finding
+
+
 class Output(NamedTuple):
     """What one step produced; `block_end_tick` is the end of the last exposure seen, None if the frame held no exposures.
 
@@ -89,7 +119,7 @@ class Output(NamedTuple):
     """
 
     decisions: list[Decision]
-    events: list[dict[str, Any]]
+    events: Sequence[CoreEvent]
     block_end_tick: int | None
     passages: tuple[Passage, ...] = ()
     actions: tuple[Action, ...] = ()
@@ -99,7 +129,7 @@ def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Ou
     """Return what two outputs say together, in their order."""
     return Output(
         first.decisions + then.decisions,
-        first.events + then.events,
+        [*first.events, *then.events],
         block_end_tick,
         first.passages + then.passages,
         first.actions + then.actions,

@@ -7,6 +7,8 @@ Owns one stream from ARM to its end and what is remembered of it; never decides:
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from pans.runtime.wire.frame import Messages
@@ -22,13 +24,40 @@ from pans.runtime.wire.messages import (
     Status,
     decode_status,
 )
-from pans.runtime.wire.tracker import Gap, StreamTracker
+from pans.runtime.wire.tracker import StreamTracker
 
-from .decision import Output, joined
+from .decision import BeyondPlan, Output, StreamEndUnknown, joined
 from .plan import Plan
 
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 PART_MARKS = 16  # of them that a part of a recording begins with
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a core stands in a stream, for another one to go on from; `core` is what one kind of core adds, JSON-able."""
+
+    tracker: tuple[int, int, int]
+    marks: tuple[Mark, ...]
+    decisions: int
+    abstained: int
+    last_tick: int
+    core: dict[str, Any]
+
+    def facts(self) -> dict[str, Any]:
+        """Return it as it stands at the beginning of a part of a recording; JSON has no NaN."""
+        marks = [[*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks]
+        numbers = {"decisions": self.decisions, "abstained": self.abstained, "last_tick": self.last_tick}
+        return {"tracker": list(self.tracker), "marks": marks, **numbers, "core": self.core}
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Place:
+        """Invert `facts`; KeyError, TypeError or ValueError if they are damaged."""
+        marks = tuple(
+            Mark._make([*mark[:5], math.nan if mark[5] is None else mark[5], *mark[6:]]) for mark in facts["marks"]
+        )
+        decisions, abstained, last_tick = (int(facts[name]) for name in ("decisions", "abstained", "last_tick"))
+        return cls(tuple(facts["tracker"]), marks, decisions, abstained, last_tick, facts["core"])
 
 
 class Follower:
@@ -92,8 +121,8 @@ class Follower:
 
     # -- parts of a recording ------------------------------------------------------------------------------------------
 
-    def part(self) -> dict[str, Any] | None:
-        """Begin a part of the recording here and return its place in the stream, JSON-able; None while that cannot be.
+    def part(self) -> Place | None:
+        """Begin a part of the recording here and return the place in the stream; None while that cannot be.
 
         What the place does not hold is forgotten here too, so that `resume` in a replay goes on exactly as this core does.
         """
@@ -103,22 +132,16 @@ class Follower:
             return None
         for number in list(self.marks)[:-PART_MARKS]:
             del self.marks[number]
-        marks = [
-            [*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks.values()
-        ]
-        numbers = {"decisions": self.n_decisions, "abstained": self.n_abstained, "last_tick": self.last_tick}
-        return {"tracker": list(self.tracker.position), "marks": marks, **numbers, "core": own}
+        marks = tuple(self.marks.values())
+        return Place(self.tracker.position, marks, self.n_decisions, self.n_abstained, self.last_tick, own)
 
-    def resume(self, place: dict[str, Any]) -> None:
+    def resume(self, place: Place) -> None:
         """Go on from the place that `part` returned, right after `begin`."""
-        self.tracker.resume(tuple(place["tracker"]))
-        for mark in place["marks"]:
-            photons = math.nan if mark[5] is None else mark[5]
-            self._remember(Mark._make([*mark[:5], photons, *mark[6:]]))
-        self.n_decisions, self.n_abstained, self.last_tick = (
-            int(place[name]) for name in ("decisions", "abstained", "last_tick")
-        )
-        self._go_on_from(place["core"])
+        self.tracker.resume(place.tracker)
+        for mark in place.marks:
+            self._remember(mark)
+        self.n_decisions, self.n_abstained, self.last_tick = place.decisions, place.abstained, place.last_tick
+        self._go_on_from(place.core)
 
     # -- one stream ----------------------------------------------------------------------------------------------------
 
@@ -141,7 +164,7 @@ class Follower:
         if status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE):
             return self._finish(status)
         self.completed = True
-        unknown = {"kind": "stream_end_unknown", "first_exposure": self.tracker.next_exposure}
+        unknown = StreamEndUnknown(self.tracker.next_exposure)
         output = Output([], [unknown], None)
         if self._nothing_left():
             output = joined(output, self._give_up())  # nothing is left for another stream: what is open stays open
@@ -167,11 +190,11 @@ class Follower:
         if isinstance(message, Mark):
             self._remember(message)
             return Output([], [], None)
-        events = [] if gap is None else [_gap_event(gap)]
+        events = [] if gap is None else [gap]
         n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
         if message.exposure_index + n_exposures > self.end_exposure or not self._fits(message):
             self.tracker.counters.malformed += 1
-            return Output([], [*events, {"kind": "beyond_plan", "exposure_index": message.exposure_index}], None)
+            return Output([], [*events, BeyondPlan(message.exposure_index)], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
         self.last_tick = end_tick
         self._check_slot(message.exposure_index + n_exposures - 1, end_tick)
@@ -210,14 +233,10 @@ class Follower:
         self.completed = True
         end = min(status.next_exposure, self.end_exposure)
         gap = self.tracker.finish(end, status.drops)
-        return joined(Output([], [] if gap is None else [_gap_event(gap)], None), self._skip_to(end, status.tick))
+        return joined(Output([], [] if gap is None else [gap], None), self._skip_to(end, status.tick))
 
     def _remember(self, mark: Mark) -> None:
         self.marks.pop(mark.object_index, None)
         self.marks[mark.object_index] = mark
         if len(self.marks) > MAX_MARKS:
             del self.marks[next(iter(self.marks))]  # the one that was set longest ago
-
-
-def _gap_event(gap: Gap) -> dict[str, Any]:
-    return {"kind": "gap", **gap._asdict()}

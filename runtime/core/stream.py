@@ -7,7 +7,7 @@ state, so that the rows are those that Core alone would give. Never waits, recor
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from pans.runtime.wire.frame import Frame, unpack_body
 from pans.runtime.wire.messages import Mark, MessageType
 
 from . import stream_kernels as kernels
-from .decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
+from .decision import DECISION_DTYPE, NO_LABEL, CoreEvent, Decision, DecisionFlag
 from .plan import Plan
 from .still import Core
 from .stream_kernels import DecisionTables, MarkArrays, WindowArrays
@@ -36,7 +36,7 @@ class Batch(NamedTuple):
     """What came of some messages: rows (n,) of DECISION_DTYPE, a view that is valid until the next batch, events, and other frames."""
 
     rows: npt.NDArray[np.void]
-    events: list[dict[str, Any]]
+    events: Sequence[CoreEvent]
     others: list[Frame]
 
 

@@ -24,6 +24,7 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
 from pans.runtime.decide.backends import Decider
 from pans.runtime.decide.verdict import Verdict, log_evidence, softmax_winner
 from pans.runtime.errors import UsageError
+from pans.runtime.instrument.channel_health import Finding
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
@@ -213,7 +214,7 @@ class FlowCore(Follower):
         )
         return int(taken)
 
-    def _watch_empty(self, guard: DarkGuard) -> list[dict[str, Any]]:
+    def _watch_empty(self, guard: DarkGuard) -> list[Finding]:
         """Without dark slots, the frames in which no object was found tell the dark rates."""
         frames = self.empty_frames - self._watched[0]
         if frames < WATCHED_FRAMES:

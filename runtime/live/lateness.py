@@ -1,20 +1,20 @@
 """What a live run does about late work: wakes when a block is overdue, asks the device then, and closes incidents with a verdict.
 
-Owns the witnesses of one run (evidence.py) and when they are heard; the judgement is blame.py's, late decisions are counted by timing.py.
+Owns the evidence of one run (timing/evidence.py) and when it is taken; the judgement is timing/attribution.py's, late decisions are
+counted by timing/ledger.py.
 `settled` returns the verdicts that are ready as events for the recording. Costs a block one comparison and one short call.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import AnyRecorder
-from pans.runtime.timing.attribution import Incidents, LateWork
+from pans.runtime.timing.attribution import Incidents, LateAttribution, LateWork, MissingAttribution
 from pans.runtime.timing.evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
 from pans.runtime.wire.messages import Status
+from pans.runtime.wire.tracker import Gap
 
 POLL_S = 0.02
 LEAST_SLACK_NS = 500_000
@@ -70,15 +70,15 @@ class Lateness:
         """Take a late decision with its times, as `TimingLedger.judge` did."""
         self.incidents.late(LateWork(number, marks_ns[0], marks_ns[1], marks_ns[3], uncertainty_ns))
 
-    def lost(self, gap: dict[str, Any], connection: Connection, now_ns: int) -> dict[str, Any]:
+    def lost(self, gap: Gap, connection: Connection, now_ns: int) -> MissingAttribution:
         """Return the verdict on exposures that never came."""
         counters = connection.decoder.counters
         damaged = counters.crc_errors + counters.cobs_errors + counters.short_frames + counters.oversized_frames
-        event = self.incidents.lost(gap, min(self.block_ns, now_ns), now_ns, damaged - self._damaged)
+        attribution = self.incidents.lost(gap, min(self.block_ns, now_ns), now_ns, damaged - self._damaged)
         self._damaged = damaged
-        return event
+        return attribution
 
-    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> dict[str, Any] | None:
+    def settled(self, connection: Connection, now_ns: int, *, idle: bool) -> LateAttribution | None:
         """Do what is due after a turn that brought something, or nothing (`idle`); return a verdict that is ready."""
         if idle and not self._asked and now_ns >= self.block_ns + self._patience_ns:
             connection.session.probe(now_ns)  # is the link open while the block is overdue?
@@ -86,7 +86,7 @@ class Lateness:
         self.evidence.read_if_stale(now_ns)
         return self.incidents.verdict(now_ns)
 
-    def closing_verdicts(self, now_ns: int) -> list[dict[str, Any]]:
+    def closing_verdicts(self, now_ns: int) -> list[LateAttribution]:
         """Return the verdicts on what the end of the run cuts short."""
         return list(iter(lambda: self.incidents.verdict(now_ns, final=True), None))
 

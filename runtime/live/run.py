@@ -15,16 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import Output
+from pans.runtime.core.follower import Place
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record import AnyRecorder, PartedRecorder
 from pans.runtime.record.parted_recorder import repeated_setup
+from pans.runtime.timing.attribution import LateAttribution
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, StateReason, pack_body
-from pans.runtime.wire.tracker import StreamTracker
+from pans.runtime.wire.tracker import Gap, StreamTracker
 
 from .config import RunConfig
 from .gates import GateQueue
@@ -73,7 +75,7 @@ class LiveCore(Protocol):
 
     def cycles_left(self, n_cycles: int) -> int: ...
 
-    def part(self) -> dict[str, Any] | None: ...
+    def part(self) -> Place | None: ...
 
 
 Watcher = Callable[["LiveRun", Output], None]
@@ -154,7 +156,7 @@ class LiveRun:
         self.settle(self.core.end())
         self.gates.finish(session)
         for verdict in self.lateness.closing_verdicts(self.now_ns()):
-            self.journal.event(verdict)
+            self.journal.event(verdict.event())
         self.lateness.close()
         self.journal.clock(self.connection)
 
@@ -288,9 +290,9 @@ class LiveRun:
     def _account(self, output: Output, times_ns: tuple[int, int, int]) -> None:
         """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
         for event in output.events:
-            self.journal.event(event)
-            if event["kind"] == "gap":
-                self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()))
+            self.journal.event(event.event())
+            if isinstance(event, Gap):
+                self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()).event())
         if not output.decisions:
             return
         self.gates.take(output.actions)
@@ -323,7 +325,7 @@ class LiveRun:
         for event in recorder.keeper.news():
             self.journal.event(event)
         if recorder.wants_part and (place := self.core.part()) is not None:
-            recorder.next_part(place, self._setup, now_ns)
+            recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())
             self.journal.session(self.connection)
 
@@ -332,9 +334,9 @@ class LiveRun:
         self._recorder = self.journal.recorder = None
         self.connection.on_sent = None
 
-    def _judge_late(self, verdict: dict[str, Any] | None) -> None:
+    def _judge_late(self, verdict: LateAttribution | None) -> None:
         if verdict is not None:
-            self.journal.event(verdict)
+            self.journal.event(verdict.event())
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW

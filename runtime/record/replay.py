@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE
-from pans.runtime.core.follower import Follower
+from pans.runtime.core.follower import Follower, Place
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.core.still import Core
@@ -104,7 +104,7 @@ def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording
         session, arm = next(following)
         output = core.begin(arm.start_tick, arm.n_cycles)
         if place is not None:
-            core.resume(place)
+            core.resume(Place.of(place))
             place = None
         return output.decisions
 

@@ -1,6 +1,6 @@
-"""Who is to blame for late and missing work: evidence in, one named cause out, with the reason in plain words.
+"""Attribution of late and missing work: evidence in, one named cause out, with the reason in plain words.
 
-Owns the judgement; evidence.py collects, timing.py counts, nobody acts on it. `judge` returns a `Verdict` and is a pure function.
+Owns the judgement; evidence.py collects, ledger.py counts, nobody acts on it. `judge` returns a `Verdict` and is a pure function.
 Every nanosecond between the end of the exposure and the decision is given to the cause that was seen there:
 
     gc          a garbage collection held the interpreter
@@ -12,9 +12,9 @@ Every nanosecond between the end of the exposure and the decision is given to th
     device      ... and a message that says when it left shows that the link was open, or that the device held it back
     decode      the loop's own work, none of the above (reading messages, the live view)
 
-The largest share is the cause. What separates link from device is in docs/explanation/timing.md:
-a click block says when it was exposed, never
-when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the verdict is `link`, not sure.
+The largest share is the cause. What separates link from device is in docs/explanation/timing.md: a click block
+says when it was exposed, never when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the
+verdict is `link`, not sure.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
+
+from pans.runtime.wire.tracker import Gap
 
 from .evidence import DISK, GC, IDLE, INFERENCE, OVERSLEPT, Evidence, Facts, Span, Stamped
 
@@ -43,12 +45,17 @@ class Verdict(NamedTuple):
     why: str
     shares_ns: dict[str, int]
 
+    def facts(self) -> dict[str, Any]:
+        """Return what an event says of it; shares in whole microseconds, those below one left out."""
+        shares = {name: share // 1000 for name, share in self.shares_ns.items() if share >= 1000}
+        return {"cause": self.cause, "sure": self.sure, "why": self.why, "shares_us": shares}
+
 
 def judge(facts: Facts) -> Verdict:
-    """Return who is to blame for the time from `facts.begin_ns` to `facts.end_ns`."""
+    """Return the cause of the time from `facts.begin_ns` to `facts.end_ns`."""
     shares = _shares(facts)
     outside = shares.pop("outside")
-    source, sure, why = blame_outside(facts)
+    source, sure, why = attribute_silence(facts)
     shares[source] = shares.get(source, 0) + outside
     cause = max(CAUSES, key=lambda name: shares.get(name, 0))
     share = shares.get(cause, 0)
@@ -106,7 +113,7 @@ def _stopped(facts: Facts, shares: dict[str, int]) -> int:
     return still
 
 
-def blame_outside(facts: Facts) -> tuple[str, bool, str]:
+def attribute_silence(facts: Facts) -> tuple[str, bool, str]:
     """Tell link from device for a silence that began when the exposure ended and lasted until the block came."""
     begin, end = facts.begin_ns, facts.arrival_ns
     delay = max(end - begin, 1)
@@ -217,6 +224,45 @@ class LateWork(NamedTuple):
     uncertainty_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class LateAttribution:
+    """The verdict on late decisions in a row, from `first_decision` to `last_decision`; `worst` is the latest of them."""
+
+    first_decision: int
+    last_decision: int
+    decisions: int
+    worst: LateWork
+    verdict: Verdict
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        return {
+            "kind": "blame",
+            "what": "late",
+            "first_decision": self.first_decision,
+            "last_decision": self.last_decision,
+            "decisions": self.decisions,
+            "worst_us": (self.worst.end_ns - self.worst.begin_ns) / 1000,
+            "begin_ns": self.worst.begin_ns,
+            "end_ns": self.worst.end_ns,
+            **self.verdict.facts(),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class MissingAttribution:
+    """The verdict on exposures that never came."""
+
+    first_exposure: int
+    exposures: int
+    verdict: Verdict
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        place = {"first_exposure": self.first_exposure, "exposures": self.exposures}
+        return {"kind": "blame", "what": "missing", **place, **self.verdict.facts()}
+
+
 @dataclass(slots=True)
 class _Incident:
     first: LateWork
@@ -253,8 +299,8 @@ class Incidents:
         latest.last = work
         latest.decisions += 1
 
-    def verdict(self, now_ns: int, *, final: bool = False) -> dict[str, Any] | None:
-        """Return the event that closes the incident under way, None while there is none or it is not over.
+    def verdict(self, now_ns: int, *, final: bool = False) -> LateAttribution | None:
+        """Return the verdict on the incident under way, None while there is none or it is not over.
 
         What is known is gathered in one call and judged in the next: a decision may be due between the two.
         """
@@ -272,38 +318,25 @@ class Incidents:
         self._known = oldest, self.evidence.facts(*oldest.worst[1:])
         return self._judged(*self._known) if final else None
 
-    def _judged(self, incident: _Incident, facts: Facts) -> dict[str, Any]:
+    def _judged(self, incident: _Incident, facts: Facts) -> LateAttribution:
         self._known = None
-        first, worst, last, decisions = incident.first, incident.worst, incident.last, incident.decisions
         verdict = judge(facts)
-        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + decisions
-        return {
-            "kind": "blame",
-            "what": "late",
-            "first_decision": first.number,
-            "last_decision": last.number,
-            "decisions": decisions,
-            "worst_us": (worst.end_ns - worst.begin_ns) / 1000,
-            "begin_ns": worst.begin_ns,
-            "end_ns": worst.end_ns,
-            **_told(verdict),
-        }
+        self.causes[verdict.cause] = self.causes.get(verdict.cause, 0) + incident.decisions
+        return LateAttribution(incident.first.number, incident.last.number, incident.decisions, incident.worst, verdict)
 
-    def lost(self, gap: dict[str, Any], since_ns: int, now_ns: int, damaged_frames: int) -> dict[str, Any]:
-        """Return the event that blames somebody for exposures that never came; `since_ns` is when the latest block before came."""
+    def lost(self, gap: Gap, since_ns: int, now_ns: int, damaged_frames: int) -> MissingAttribution:
+        """Return the cause of exposures that never came; `since_ns` is when the latest block before came."""
         verdict = judge_gap(gap, self.evidence.facts(since_ns, now_ns, now_ns, 0), damaged_frames)
-        exposures = int(gap["exposures"])
-        self.missing[verdict.cause] = self.missing.get(verdict.cause, 0) + exposures
-        place = {"first_exposure": gap["first_exposure"], "exposures": exposures}
-        return {"kind": "blame", "what": "missing", **place, **_told(verdict)}
+        self.missing[verdict.cause] = self.missing.get(verdict.cause, 0) + gap.exposures
+        return MissingAttribution(gap.first_exposure, gap.exposures, verdict)
 
 
-def judge_gap(gap: dict[str, Any], facts: Facts, damaged_frames: int) -> Verdict:
-    """Return who is to blame for a gap: what the device dropped was held up by whoever did not take it, the rest got lost on the link."""
-    dropped = int(gap["dropped_by_device"])
-    if 2 * dropped < int(gap["exposures"]):
+def judge_gap(gap: Gap, facts: Facts, damaged_frames: int) -> Verdict:
+    """Return the cause of a gap: what the device dropped was held up by whoever did not take it, the rest got lost on the link."""
+    dropped = gap.dropped_by_device
+    if 2 * dropped < gap.exposures:
         why = (
-            f"{gap['messages']} stream messages left the device (their numbers are missing) and never came; "
+            f"{gap.messages} stream messages left the device (their numbers are missing) and never came; "
             f"{damaged_frames} damaged frames were thrown away meanwhile"
         )
         return Verdict("link", 0, True, why, {})
@@ -312,8 +345,3 @@ def judge_gap(gap: dict[str, Any], facts: Facts, damaged_frames: int) -> Verdict
     if held_up.share_ns < NS_PER_MS:
         return Verdict("device", 0, False, f"{full}; nothing on this side held the stream up", held_up.shares_ns)
     return held_up._replace(why=f"{full}; before that, {held_up.why}")
-
-
-def _told(verdict: Verdict) -> dict[str, Any]:
-    shares = {name: share // 1000 for name, share in verdict.shares_ns.items() if share >= 1000}
-    return {"cause": verdict.cause, "sure": verdict.sure, "why": verdict.why, "shares_us": shares}

@@ -7,7 +7,7 @@ mark of a stream frame (None when it is damaged or repeated) and the gap before 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from . import messages as wire
 from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType
@@ -25,6 +25,10 @@ class Gap(NamedTuple):
     exposures: int
     messages: int
     dropped_by_device: int
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording."""
+        return {"kind": "gap", **self._asdict()}
 
 
 @dataclass(slots=True)
@@ -96,7 +100,7 @@ class StreamTracker:
         self.next_seq, self.next_exposure, self._drops = position
 
     def advance(self, position: tuple[int, int], messages: int, exposures: int) -> None:
-        """Account for messages in order and without loss that were taken elsewhere (stream.py), `exposures` of them in blocks."""
+        """Account for messages in order and without loss that were taken elsewhere (walk.py), `exposures` of them in blocks."""
         self.next_seq, self.next_exposure = position
         self.counters.messages += messages
         self.counters.exposures += exposures

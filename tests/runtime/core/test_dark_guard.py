@@ -329,7 +329,7 @@ def test_an_afterpulse_is_no_dark_count() -> None:
                 continue  # a gap: what was before the next block is not known
             shown = np.resize(plan.slot_pattern, 40)
             events += guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 40]))
-        found[afterpulses] = [event["state"] for event in events]
+        found[afterpulses] = [finding.kind for finding in events]
         report = guard.report(DarkMonitor(0.01).report(20_000, int(bits[::4].sum())))
         assert bool(report.alarm) != afterpulses
         behind_silence = bits[4::4][bits[3:-1:4] == 0]
@@ -345,7 +345,7 @@ def test_empty_fields_as_counts() -> None:
     events = []
     for _ in range(200):
         events += guard.take_empty(256, np.array([2, 3, 12], np.int64))
-    assert [(event["state"], event["channels"]) for event in events] == [("hot", [2])]
+    assert [(finding.kind, finding.channels) for finding in events] == [("hot", (2,))]
     assert "channel 2" in guard.words()
 
 

@@ -70,7 +70,7 @@ def test_a_gap_abstains_and_the_next_window_is_whole_again() -> None:
     core.step(cycle(0, 0, [0, 0, 0, 0]))
     output = core.step(cycle(2, 2, [0, 1, 1, 1]))
     gap, whole = output.decisions
-    assert output.events == [
+    assert [event.event() for event in output.events] == [
         {"kind": "gap", "first_exposure": 4, "exposures": 4, "messages": 1, "dropped_by_device": 0}
     ]
     assert (gap.label, gap.flags) == (NO_LABEL, DecisionFlag.GAP | DecisionFlag.ABSTAINED)
@@ -124,7 +124,7 @@ def test_another_stream_settles_the_open_visit_and_counts_anew() -> None:
     core.step(cycle(1, 1, [0, 1, 1, 1]))
     core.step(cycle(2, 2, [0, 1, 1, 1]))
     ended = core.end()
-    assert ended.events == [{"kind": "stream_end_unknown", "first_exposure": 12}]
+    assert [event.event() for event in ended.events] == [{"kind": "stream_end_unknown", "first_exposure": 12}]
     assert core.cycles_left(6) == 2
     (given_up,) = core.begin(5000, 2).decisions
     assert given_up.flags == DecisionFlag.GAP | DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED
@@ -141,7 +141,7 @@ def test_a_stream_that_was_stopped_reports_what_was_exposed_and_never_came() -> 
     stopped = wire.encode_status(Status(DeviceState.IDLE, StateReason.STOPPED, 0, 0, 2000, 9), 1)
     assert core.step(frame(stopped)).events == []
     ended = core.end()
-    assert [event["exposures"] for event in ended.events] == [5]
+    assert [event.event()["exposures"] for event in ended.events] == [5]
     assert len(ended.decisions) == 1  # the window that lies whole in the gap
     assert core.end().events == []
 
@@ -164,7 +164,7 @@ def test_exposures_beyond_the_plan_are_refused() -> None:
     core, decider = make(n_cycles=1)
     output = core.step(cycle(0, 5, [0, 0, 0, 0]))
     assert output.decisions == []
-    assert {"kind": "beyond_plan", "exposure_index": 20} in output.events
+    assert {"kind": "beyond_plan", "exposure_index": 20} in [event.event() for event in output.events]
     assert decider.asked == []
 
 
@@ -241,6 +241,6 @@ def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
         wire.encode_clicks(other_kind, 1),
     ):
         output = core.step(frame(message))
-        assert output.events[-1]["kind"] == "beyond_plan"
+        assert output.events[-1].event()["kind"] == "beyond_plan"
         assert all(d.flags & DecisionFlag.GAP for d in output.decisions)
     assert core.tracker.counters.malformed == 3

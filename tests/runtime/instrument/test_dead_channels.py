@@ -158,7 +158,8 @@ def test_the_guard_names_it_and_says_when_it_is_over() -> None:
         if 1500 <= number < 2000:
             bits[:, 4] = False
         words = np.packbits(bits, axis=1, bitorder="little")
-        events += guard.take(FrameBlock(0, 0, number, 4 * number, 100, 0, words))
+        found = guard.take(FrameBlock(0, 0, number, 4 * number, 100, 0, words))
+        events += [finding.event() for finding in found]
         guard.take_object(bits.sum(axis=0).astype(np.int64), number)
     assert [(event["state"], event["channels"]) for event in events] == [("dead", [4]), ("over", [4])]
     assert "the other channels click as before" in events[0]["words"]
@@ -176,7 +177,8 @@ def test_one_detector_is_dead_when_nothing_clicks() -> None:
         if number >= 2000:
             bits[:] = 0
         shown = np.array([DARK_PATTERN, 0, 1, 2], np.uint16)
-        events += guard.take(ClickBlock(0, 0, number, 4 * number, 100, 0, shown, bits))
+        found = guard.take(ClickBlock(0, 0, number, 4 * number, 100, 0, shown, bits))
+        events += [finding.event() for finding in found]
         guard.take_object(bits[1:].astype(np.int64), NO_OBJECT)
     assert [(event["state"], event["level"]) for event in events] == [("dead", "alarm")]
     assert "no light at all" in events[0]["words"]

@@ -35,6 +35,7 @@ from pans.runtime.timing.evidence import (
     Stamped,
     longest_pause_ns,
 )
+from pans.runtime.wire.tracker import Gap
 
 MS = 1_000_000
 
@@ -131,8 +132,8 @@ def test_no_cause_explains_more_than_the_delay(
     assert sum(verdict.shares_ns.values()) <= 2 * total + 5  # the scheduler's counters may overlap what was seen
 
 
-def gap(dropped: int, exposures: int = 10) -> dict[str, int]:
-    return {"first_exposure": 5, "exposures": exposures, "messages": 2, "dropped_by_device": dropped}
+def gap(dropped: int, exposures: int = 10) -> Gap:
+    return Gap(5, exposures, 2, dropped)
 
 
 def test_what_never_came_is_the_links_fault_unless_the_device_dropped_it() -> None:
@@ -148,7 +149,8 @@ def test_what_never_came_is_the_links_fault_unless_the_device_dropped_it() -> No
 
 def verdict_of(incidents: Incidents, now_ns: int) -> dict[str, Any] | None:
     """What is known is gathered in one call and judged in the next."""
-    return incidents.verdict(now_ns) or incidents.verdict(now_ns)
+    found = incidents.verdict(now_ns) or incidents.verdict(now_ns)
+    return None if found is None else found.event()
 
 
 def test_an_incident_is_judged_once_from_its_worst_decision() -> None:
@@ -183,9 +185,9 @@ def test_a_run_that_is_always_late_gets_a_verdict_per_second() -> None:
     for number in range(5000):
         incidents.late(LateWork(number, number * MS, number * MS + 1, (number + 20) * MS, 0))
         verdicts.append(incidents.verdict((number + 20) * MS))
-    events = [event for event in verdicts if event is not None]
-    assert len(events) == 4
-    assert sum(incidents.causes.values()) == sum(event["decisions"] for event in events)
+    found = [one for one in verdicts if one is not None]
+    assert len(found) == 4
+    assert sum(incidents.causes.values()) == sum(one.decisions for one in found)
 
 
 def test_a_real_collection_is_seen_with_its_length() -> None:
