@@ -12,14 +12,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from pans.firmware_sim.device.view import View
 from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector import sample_clicks
-from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
-from pans.firmware_sim.scene.exposure_times import Exposures
-from pans.firmware_sim.scene.light import begin, prepare
+from pans.firmware_sim.scene import open_scene
+from pans.firmware_sim.scene.marks import MARK_EXPOSURE, MARK_HALF, MARK_OBJECT, MARK_PHOTONS, MARK_TRUTH
 from pans.firmware_sim.scene.moving import Cells
-from pans.firmware_sim.scene.scene_file import open_scene
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.wire.commands import PARALLEL
 
@@ -42,14 +39,12 @@ def spots(rng: np.random.Generator, side: int) -> np.ndarray:
     return np.rint(np.minimum(patterns, 255)).astype(np.uint16).reshape(N_PATTERNS, -1)
 
 
-def crossing(run: Any) -> tuple[Any, Any]:
-    """The first two marks of which the second cell comes into the field before the first has left it."""
-    before = run.mark
-    while True:
-        run.take_mark()
-        if 25 < run.mark.exposure_index - before.exposure_index < 40:
-            return before, run.mark
-        before = run.mark
+def crossing(light: Any) -> Any:
+    """Rows (marks.py) of the first two marks of which the second cell comes into the field before the first has left it."""
+    rows = light.take_marks(10_000_000)
+    apart = np.diff(rows[:, MARK_EXPOSURE])
+    first = int(np.flatnonzero((apart > 25) & (apart < 40))[0])
+    return rows[first : first + 2]
 
 
 def main() -> None:
@@ -64,22 +59,16 @@ def main() -> None:
     plan = Program(
         PARALLEL, N_PATTERNS, ticks, ticks, ticks, 1, np.zeros(1, np.int64), np.zeros(1, np.uint16), ((0, 1),)
     )
-    table = prepare(profile, scene, spots(np.random.default_rng(2), 100), EXPOSURE_US)
-
-    def run() -> Any:
-        exposures = Exposures(plan, None, profile.clock.tick_hz)
-        return begin(scene, table, plan, exposures, Changes((), N_PATTERNS), SEED, 0)
-
-    marks = crossing(run())
-    first = marks[0].exposure_index - 60
-    rows, row_of = run().rows(first, SHOWN_US)
-    light = rows[row_of]
-    model = detector_model(profile, EXPOSURE_US)
-    clicks = sample_clicks(model, first_click_probability(model, light), SEED, first, np.zeros(N_PATTERNS, np.uint8))
-    draw(light, clicks, [(mark, mark.exposure_index - first) for mark in marks], scene.what.objects.classes)
+    view = View(profile, scene, seed=SEED)
+    table = view.tabulate(plan, spots(np.random.default_rng(2), 100))
+    marks = crossing(view.light_and_clicks(plan, 0, table)[0])
+    first = int(marks[0, MARK_EXPOSURE]) - 60
+    rows, row_of = view.light_and_clicks(plan, 0, table)[0].rows(first, SHOWN_US)
+    clicks = view.light_and_clicks(plan, 0, table)[1].clicks(first, SHOWN_US, np.zeros(N_PATTERNS, np.uint8))
+    draw(rows[row_of], clicks, marks, first, scene.what.objects.classes)
 
 
-def draw(light: np.ndarray, clicks: np.ndarray, marks: list[tuple[Any, int]], classes: tuple[str, ...]) -> None:
+def draw(light: np.ndarray, clicks: np.ndarray, marks: Any, first: int, classes: tuple[str, ...]) -> None:
     figure, (top, bottom) = pyplot.subplots(
         2, 1, figsize=(9, 5), sharex=True, height_ratios=[3, 1], layout="constrained"
     )
@@ -88,11 +77,13 @@ def draw(light: np.ndarray, clicks: np.ndarray, marks: list[tuple[Any, int]], cl
         top.plot(time_us, light[:, channel], label=f"channel {channel}")
         struck = time_us[clicks[:, channel] > 0]
         bottom.plot(struck, np.full(len(struck), channel), "|", ms=8, mew=1.5)
-    for (mark, at), style in zip(marks, ("--", ":")):
+    photons = marks.view(np.float64)[:, MARK_PHOTONS]
+    for mark, light_sum, style in zip(marks, photons, ("--", ":")):
+        at, half = mark[MARK_EXPOSURE] - first, mark[MARK_HALF]
         for axes in (top, bottom):
             axes.axvline(at + 0.5, color="k", ls=style, lw=1)
-            axes.axvspan(at - mark.half_exposures, at + mark.half_exposures, color="k", alpha=0.06, lw=0)
-        words = f"MARK {mark.object_index}: {classes[mark.truth]}\n{mark.photons:.2f} photoelectrons"
+            axes.axvspan(at - half, at + half, color="k", alpha=0.06, lw=0)
+        words = f"MARK {mark[MARK_OBJECT]}: {classes[mark[MARK_TRUTH]]}\n{light_sum:.2f} photoelectrons"
         top.annotate(
             words,
             (at + 0.5, 1),

@@ -81,14 +81,30 @@ def option(default: Any, help: str, **words: Any) -> Any:
 
 def rows_report(rows: Iterable[Mapping[str, Any]], passed: bool, **more: Any) -> Report:
     """Return the report of a trial whose figures are rows: `more` goes beside them into the JSON object."""
-    rows = list(rows)
-    figures = [{key: None if _endless(value) else value for key, value in row.items()} for row in rows]
-    head = ["SIMULATED"] if more.get("simulated") else []
-    return Report({"rows": figures, **more}, passed, "\n".join([*head, *map(row_text, rows)]))
+    rows = [{key: None if _endless(value) else value for key, value in row.items()} for row in rows]
+    return Report({"rows": rows, **more}, passed, figures_text({**more, "rows": rows}))
 
 
 def _endless(value: Any) -> bool:
     return isinstance(value, float) and not math.isfinite(value)  # JSON has no word for it
+
+
+def figures_text(figures: Mapping[str, Any]) -> str:
+    """Return figures for people: a line for each, a line for each row of a list, a table for an object of objects."""
+    lines: list[str] = []
+    for key, value in figures.items():
+        if key == "simulated":
+            lines.insert(0, "SIMULATED")
+        elif isinstance(value, Mapping) and value and all(isinstance(row, Mapping) for row in value.values()):
+            columns = list(next(iter(value.values())))
+            lines.append(f"{key:<18}" + "".join(f"{name:>11}" for name in columns))
+            lines += [f"  {name:<16}" + "".join(f"{row[one]:>11}" for one in columns) for name, row in value.items()]
+        elif isinstance(value, list):
+            head = "" if key == "rows" else f"{key}: "
+            lines += [head + (row_text(row) if isinstance(row, Mapping) else str(row)) for row in value]
+        else:
+            lines.append(row_text({key: row_text(value) if isinstance(value, Mapping) else value}))
+    return "\n".join(lines)
 
 
 def row_text(row: Mapping[str, Any]) -> str:

@@ -28,7 +28,7 @@ from typing import Any
 from pans.runtime.errors import UsageError
 from pans.runtime.record import read_recording
 
-from . import Report, Trial, option
+from . import Report, Trial, figures_text, option
 from .cause_processes import HOST_CORE, INSTRUMENT_CORE, Injection
 from .processes import Child, has_real_time, sleep_until
 from .scheduling_probe import SchedulingProbe
@@ -142,7 +142,7 @@ def _stop_and_go(script: list[Injection], start_ns: int, pids: dict[str, int]) -
 
 
 def report(compared: list[dict[str, Any]], others: Counter[str], host: dict[str, Any]) -> dict[str, Any]:
-    """Return the confusion matrix and its sums."""
+    """Return the confusion matrix (a row for each cause that was made, a column for each that was named) and its sums."""
     disturbed = [entry for entry in compared if entry["disturbed"]]
     compared = [entry for entry in compared if not entry["disturbed"]]
     named = sorted({entry["named"] for entry in compared} - set(KINDS))
@@ -166,26 +166,6 @@ def report(compared: list[dict[str, Any]], others: Counter[str], host: dict[str,
         "wrong": [entry for entry in compared if entry["kind"] != entry["named"]],
         "host": host,
     }
-
-
-def show(result: dict[str, Any]) -> str:
-    """Return the matrix for people: a row per cause that was made, a column per name that it was given."""
-    columns = list(next(iter(result["matrix"].values())))
-    lines = ["SIMULATED instrument, real pace; rows: cause that was made, columns: cause that was named", ""]
-    lines.append(f"{'':<10}" + "".join(f"{name:>11}" for name in columns))
-    for kind, row in result["matrix"].items():
-        lines.append(f"{kind:<10}" + "".join(f"{row[name] or '·':>11}" for name in columns))
-    lines += [
-        "",
-        f"{result['right']} of {result['injections']} named rightly ({result['share']:.1%}); "
-        f"{result['sure']} verdicts say that they are sure, {result['sure_and_wrong']} of these are wrong",
-        f"besides: {result['disturbed']} injections that the machine disturbed at the same time (a scheduling probe was kept "
-        f"from one of the cores); {result['disturbed_right']} of them named rightly, all: {result['disturbed_named']}",
-        f"late work that nobody injected (the machine's own): {result['not_injected'] or 'none'}",
-        f"host: {result['host']}",
-    ]
-    lines += [f"  wrong: {entry}" for entry in result["wrong"]]
-    return "\n".join(lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +194,7 @@ def run(settings: Settings) -> Report:
         if not any(verdict["begin_ns"] < end and verdict["end_ns"] > begin for begin, end in spans)
     )
     result = report(compared, others, host)
-    return Report(result, result["share"] >= NAMED_IN_TIME, show(result))
+    return Report(result, result["share"] >= NAMED_IN_TIME, figures_text(result))
 
 
 TRIAL = Trial(Settings, run)

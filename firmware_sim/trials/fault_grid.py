@@ -31,7 +31,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
 from pans.runtime.wire.commands import Gate
 
-from . import Report, Trial, option, row_text
+from . import Report, Trial, figures_text, option
 from .checkers import Checker, WatchedInstrument
 
 SHOTS = 1
@@ -256,11 +256,8 @@ def run(settings: Settings) -> Report:
     rows = [case_row(case, [one for one in results if one.case == case]) for case in dict.fromkeys(cases)]
     failures = [result for result in results if result.violations]
     total, seconds = sum(result.frames for result in results), time.perf_counter() - started
-    words = [row_text(row) for row in rows]
-    words += [f"FAILED {one.case} seed {one.seed}: " + "; ".join(one.violations) for one in failures]
-    words.append(f"{total} frames in {seconds:.0f} s: {'FAILED' if failures else 'nothing was found'}")
     figures = {"frames": total, "seconds": seconds, "rows": rows, "failures": [asdict(one) for one in failures]}
-    return Report(figures, not failures, "\n".join(words))
+    return Report(figures, not failures, figures_text(figures))
 
 
 TRIAL = Trial(Settings, run)

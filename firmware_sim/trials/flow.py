@@ -24,7 +24,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record import read_recording
 
-from . import Report, Trial, option
+from . import Report, Trial, figures_text, option
 from .flow_attribution import (
     MACHINE,
     OURS,
@@ -239,42 +239,6 @@ def broken_bars(result: dict[str, Any]) -> list[str]:
     return broken
 
 
-def show(result: dict[str, Any]) -> str:
-    """Return the report for people."""
-    run, whose, latency = result["run"], result["whose"], result["run"]["latency_us"]
-    lines = [
-        f"SIMULATED instrument, real pace, {result['seconds']:.0f} s, {result['decisions']} decisions, "
-        f"deadline {result['deadline_us']:g} us",
-        f"latency p50 {latency['p50']:.0f}, p99 {latency['p99']:.0f}, p99.9 {latency['p999']:.0f}, max {latency['max']:.0f} us; "
-        f"processor time per second: host {result['busy']['host']:.2f}, simulator {result['busy']['simulator']:.2f}",
-        f"late {result['late']} ({result['late_share']:.2e}): {whose[MACHINE]} the machine's (by core {result['machine_by_core']}, "
-        f"{result['machine_queued']} while the core ran something else), {whose[PARTLY]} partly "
-        f"({result['partly_worked_off']} of these by no more than the gap and working off what came in it), {whose[OURS]} ours",
-        "",
-        f"{'named by the run':<18}" + "".join(f"{name:>9}" for name in (MACHINE, PARTLY, OURS)),
-        *(f"{cause:<18}" + "".join(f"{row[name]:>9}" for name in (MACHINE, PARTLY, OURS)) for cause, row in result["named"].items()),
-        "",
-    ]  # fmt: skip
-    for gaps in result["gaps"]:
-        rates = ", ".join(f"{rate:.2f} > {step} ms" for step, rate in gaps["per_s_above_ms"].items())
-        lines.append(
-            f"core {gaps['core']} away per second: {rates}; largest {gaps['largest_ms']:.2f} ms, in all {gaps['away_ms']:.0f} ms "
-            f"({gaps['queued_ms']:.0f} ms of it running something else; stolen by the hypervisor's own count {gaps['stolen_ms']:.0f} ms); "
-            f"its probe took {gaps['canary_share_of_core']:.1%}"
-        )
-    lines += [
-        f"{key}: {run[key]}" for key in ("accuracy", "missed", "doubled", "purity", "yield", "gates") if key in run
-    ]
-    for entry in result["unexplained"]:
-        shares = ", ".join(f"{name} {share / 1000:.2f}" for name, share in entry["shares_us"].items())
-        lines.append(
-            f"  {entry['whose']} {entry['decision']}: {entry['latency_us'] / 1000:.2f} ms "
-            f"(bytes after {entry['until_bytes_us'] / 1000:.2f}), away {entry['away_us'] / 1000:.2f} ms; "
-            f"named {entry['cause']} ({shares} ms): {entry['why']}"
-        )
-    return "\n".join([*lines, *(f"BROKEN: {text}" for text in result["broken"])])
-
-
 def run(job: Job) -> Report:
     """Run and judge."""
     if not has_real_time():
@@ -285,7 +249,8 @@ def run(job: Job) -> Report:
         folder.mkdir(parents=True, exist_ok=True)
         job = replace(job, gate_classes=classes, more=tuple(job.more))
         figures = report(job, carry_out(job, folder))
-    return Report(figures, not figures["broken"], show(figures))
+    words = figures_text({key: value for key, value in figures.items() if key not in ("job", "explained")})
+    return Report(figures, not figures["broken"], words)
 
 
 TRIAL = Trial(Job, run, json_to_file=True)

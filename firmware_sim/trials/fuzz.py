@@ -30,7 +30,7 @@ from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
-from . import Report, Trial, option
+from . import Report, Trial, figures_text, option
 
 BATCH_BYTES = 1 << 16
 BATCH_FRAMES = 200
@@ -356,12 +356,8 @@ def run(settings: Settings) -> Report:
             say(failure)
             say(f"pans fuzz: seed {seed} failed after {counts.bytes} bytes and {counts.frames} frames")
             return Report({**total, "failed_seed": seed}, False, "")
-    seconds = time.perf_counter() - started
-    words = ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in total.items()
-    )
-    figures = {**total, "failed_seed": None, "seconds": seconds}
-    return Report(figures, True, f"nothing was found in {seconds:.0f} s: {words}")
+    figures = {**total, "failed_seed": None, "seconds": time.perf_counter() - started}
+    return Report(figures, True, figures_text(figures))
 
 
 TRIAL = Trial(Settings, run)

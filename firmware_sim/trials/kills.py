@@ -41,7 +41,7 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
 
-from . import Report, Trial, option, row_text
+from . import Report, Trial, figures_text, option
 from .processes import PATIENCE_S, wait_until
 
 LEASE_MS = 200
@@ -230,7 +230,7 @@ def run(settings: Settings) -> Report:
     else:
         with tempfile.TemporaryDirectory() as folder:
             figures = recorder_kills(settings.kills or 200, Path(folder), settings.seed)
-    return Report(figures, not figures["broken"], row_text(figures))
+    return Report(figures, not figures["broken"], figures_text(figures))
 
 
 TRIAL = Trial(Settings, run)

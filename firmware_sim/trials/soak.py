@@ -27,7 +27,7 @@ from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_folder
 
-from . import Report, Trial, option
+from . import Report, Trial, figures_text, option
 from .processes import start_command, wait_until
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"
@@ -186,22 +186,6 @@ def _line(sample: dict[str, Any]) -> str:
     )
 
 
-def show(result: dict[str, Any]) -> str:
-    """Return the judgement for people."""
-    handles, threads = result["handles_min_max_last"], result["threads_min_max_last"]
-    lines = [
-        f"SIMULATED instrument, {result['minutes']:.1f} minutes of real time, faults {FAULTS}",
-        f"resident memory {result['rss_first_bytes'] / 2**20:.2f} -> {result['rss_last_bytes'] / 2**20:.2f} MiB after the first "
-        f"{WARM_UP_SHARE:.0%}; slope {result['rss_slope_kib_per_min']:+.2f} ± {result['rss_slope_error_kib_per_min']:.2f} KiB/min",
-        f"handles {handles[0]}..{handles[1]}, at last {handles[2]}; threads {threads[0]}..{threads[1]}, at last {threads[2]}",
-        f"SIGTERM: exit code {result['exit_code']} after {result['goodbye_s']:.2f} s; {result['parts_kept']} parts kept, "
-        f"{result['kept_bytes'] / 2**20:.2f} MiB, {result['decisions_kept']} decisions, each part verified and replayed",
-        f"run: {result['run']}",
-        *(f"BROKEN: {text}" for text in result["broken"]),
-    ]
-    return "\n".join(lines)
-
-
 @dataclass(frozen=True, slots=True)
 class Settings:
     """How long to run, and where."""
@@ -217,7 +201,8 @@ def run(settings: Settings) -> Report:
         folder = settings.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         figures = soak(settings.minutes, settings.seed, folder)
-    return Report(figures, not figures["broken"], show(figures))
+    words = figures_text({key: value for key, value in figures.items() if key != "samples"})
+    return Report(figures, not figures["broken"], words)
 
 
 TRIAL = Trial(Settings, run)

@@ -100,7 +100,7 @@ def test_options_reach_the_trial_and_the_verdict_the_exit_code(
     assert capsys.readouterr().out.splitlines() == [
         "SIMULATED",
         "what a  often 3  some_names []  really True  more []",
-        "size inf",
+        "size None",
     ]
     assert json.loads(path.read_text())["simulated"] is True
 

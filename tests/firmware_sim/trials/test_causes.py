@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pans.firmware_sim.trials import figures_text
 from pans.firmware_sim.trials.cause_processes import Injection
-from pans.firmware_sim.trials.causes import DISK_HOLD_MS, KINDS, compare, make_script, report, show
+from pans.firmware_sim.trials.causes import DISK_HOLD_MS, KINDS, compare, make_script, report
 from pans.firmware_sim.trials.soak import slope_of
 
 MS = 1_000_000
@@ -43,7 +44,18 @@ def test_the_verdict_that_overlaps_most_is_compared() -> None:
     assert (result["injections"], result["right"], result["disturbed"]) == (2, 1, 1)
     assert result["matrix"]["link"]["link"] == 1
     assert result["matrix"]["host"]["nothing"] == 1
-    assert "1 of 2 named rightly (50.0%)" in show(result)
+    text = figures_text(result)
+    assert "right 1\nshare 0.5\n" in text
+    assert next(line.split() for line in text.splitlines() if line.startswith("  host ")) == [
+        "host",
+        "0",
+        "0",
+        "0",
+        "0",
+        "0",
+        "0",
+        "1",
+    ]
 
 
 def test_the_hog_is_no_disturbance_of_its_own_injection() -> None:
