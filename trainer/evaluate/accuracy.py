@@ -20,7 +20,7 @@ from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.image_quality import likeness
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
 from pans.runtime.instrument.profile import Profile
-from pans.trainer.model.quantise import exposure_us_of
+from pans.trainer.model.exposure import exposure_us_of
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
 _CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small

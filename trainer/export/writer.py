@@ -169,7 +169,7 @@ def export_trained(
     if quantised is None:
         optics = analyser_of(trained, task, profile)
     else:
-        optics = Shown(profile.projector.levels, quantised.levels, quantised.photons_per_level)
+        optics = Shown(profile.projector.levels, quantised.pattern_levels, quantised.photons_per_level)
     return export(
         path,
         trained.head,

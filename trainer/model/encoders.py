@@ -14,6 +14,7 @@ sums (incoherent) are at most 1, so that the detectors together receive no more 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +22,7 @@ from torch import Tensor, nn
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import Options
 
-from .quantise import top_limits
+from .exposure import top_limits
 
 KAIMING_A = 1.2  # paper, appendix on the training procedure
 
@@ -43,8 +44,7 @@ class ActiveIllumination(nn.Module):
         light: float = 1.0,
     ) -> None:
         super().__init__()
-        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_pixels))  # Kaiming uniform, times the wanted light
-        self.weight = nn.Parameter((torch.rand(n_features, n_pixels, generator=generator) * 2 - 1) * bound)
+        self.weight = nn.Parameter(_kaiming((n_features, n_pixels), generator, light))
         self.log_top = nn.Parameter(torch.tensor(math.log(top_limits[1])))
         self.top_limits = top_limits
         self.levels: int | None = None
@@ -99,8 +99,8 @@ class ActiveIllumination(nn.Module):
             return float(self.patterns().max() if self.levels is None else self.top())
 
 
-class CoherentField(nn.Module):
-    """Transmission matrix W (d_f, inputs) for fields: light = |W x|**2. `complex_field` makes W complex."""
+class _Passive(nn.Module):
+    """What passive encoders share: random weights (d_f, inputs), or `parts` of them; no projector, no light of their own."""
 
     levels = None  # nothing to quantise: no projector
 
@@ -111,14 +111,25 @@ class CoherentField(nn.Module):
         generator: torch.Generator,
         *,
         light: float = 1.0,
-        complex_field: bool = False,
         conserving: bool = False,
+        parts: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
         self.conserving = conserving
-        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
-        parts = 2 if complex_field else 1
-        self.weight = nn.Parameter((torch.rand(parts, n_features, n_inputs, generator=generator) * 2 - 1) * bound)
+        self.weight = nn.Parameter(_kaiming((*parts, n_features, n_inputs), generator, light))
+
+    def illumination(self) -> Tensor:
+        """Return 0: a passive encoder sends no light."""
+        return torch.zeros(())
+
+
+class CoherentField(_Passive):
+    """Transmission matrix W (d_f, inputs) for fields: light = |W x|**2. `complex_field` makes W complex."""
+
+    def __init__(
+        self, n_features: int, n_inputs: int, generator: torch.Generator, *, complex_field: bool = False, **shared: Any
+    ) -> None:
+        super().__init__(n_features, n_inputs, generator, parts=(2 if complex_field else 1,), **shared)
 
     def matrix(self) -> Tensor:
         """Return W, complex64 or float32; scaled down to a largest singular value of 1 where light is conserved."""
@@ -136,29 +147,9 @@ class CoherentField(nn.Module):
             return out.real.square() + out.imag.square()
         return (field @ matrix.T).square()
 
-    def illumination(self) -> Tensor:
-        """Return 0: a passive encoder sends no light."""
-        return torch.zeros(())
 
-
-class IncoherentIntensity(nn.Module):
+class IncoherentIntensity(_Passive):
     """Transmission matrix W >= 0 (d_f, inputs) for intensities, W = weight**2."""
-
-    levels = None
-
-    def __init__(
-        self,
-        n_features: int,
-        n_inputs: int,
-        generator: torch.Generator,
-        *,
-        light: float = 1.0,
-        conserving: bool = False,
-    ) -> None:
-        super().__init__()
-        self.conserving = conserving
-        bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * n_inputs))
-        self.weight = nn.Parameter((torch.rand(n_features, n_inputs, generator=generator) * 2 - 1) * bound)
 
     def matrix(self) -> Tensor:
         """Return W; where light is conserved, columns that sum to more than 1 are scaled down to 1."""
@@ -170,9 +161,11 @@ class IncoherentIntensity(nn.Module):
         photoelectrons: Tensor = intensity @ self.matrix().T
         return photoelectrons
 
-    def illumination(self) -> Tensor:
-        """Return 0: a passive encoder sends no light."""
-        return torch.zeros(())
+
+def _kaiming(shape: tuple[int, ...], generator: torch.Generator, light: float) -> Tensor:
+    """Kaiming uniform (He et al. 2015) by the last axis, so wide that the squares give `light` times the paper's light."""
+    bound = math.sqrt(light * 6 / ((1 + KAIMING_A**2) * shape[-1]))
+    return (torch.rand(shape, generator=generator) * 2 - 1) * bound
 
 
 Encoder = ActiveIllumination | CoherentField | IncoherentIntensity
@@ -182,15 +175,8 @@ def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch
     """Return the untrained encoder that `options` ask for."""
     if options.encoder == "active":
         return ActiveIllumination(options.features, n_inputs, top_limits(profile), random, options.light)
+    shape = options.features, n_inputs
+    passive: dict[str, Any] = {"light": options.light, "conserving": options.conserving}
     if options.encoder == "incoherent":
-        return IncoherentIntensity(
-            options.features, n_inputs, random, light=options.light, conserving=options.conserving
-        )
-    return CoherentField(
-        options.features,
-        n_inputs,
-        random,
-        light=options.light,
-        complex_field=options.complex_field,
-        conserving=options.conserving,
-    )
+        return IncoherentIntensity(*shape, random, **passive)
+    return CoherentField(*shape, random, complex_field=options.complex_field, **passive)

@@ -23,6 +23,8 @@ CHANNELS = (32, 64)
 MOMENTUM = 0.05
 EPSILON = 1e-5
 
+Shape = tuple[int, int]  # height and width of a picture
+
 
 class ClickNorm(nn.Module):
     """Batch normalisation of binary features: their population variance is p(1-p), so that only the mean is kept."""
@@ -46,66 +48,88 @@ class ClickNorm(nn.Module):
         return normal
 
 
-class MlpHead(nn.Module):
-    """Normalisation, one hidden layer with ReLU, scores (paper: 512 hidden units)."""
+class _Head(nn.Module):
+    """What heads share: normalisation, a first linear layer `hidden` with ReLU, and `rest` behind it."""
 
-    def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
+    output: nn.Linear
+
+    def __init__(self, n_features: int, n_inputs: int, n_hidden: int) -> None:
         super().__init__()
         self.norm = ClickNorm(n_features)
-        self.hidden = nn.Linear(n_features, n_hidden)
+        self.hidden = nn.Linear(n_inputs, n_hidden)
+
+    def inputs(self, normal: Tensor) -> Tensor:
+        """Return what the first layer sees of normalised clicks (n, d_f): by default the clicks themselves."""
+        return normal
+
+    def rest(self, hidden: Tensor) -> Tensor:
+        """Return scores (..., classes) or pixels (..., height * width), about 0 to 1, of hidden units (..., hidden)."""
+        outputs: Tensor = self.output(hidden)
+        return outputs
+
+    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
+        """Return the outputs (n, out) of click means (n, d_f); `mean` as in `ClickNorm`."""
+        return self.rest(torch.relu(self.hidden(self.inputs(self.norm(clicks, mean)))))
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return the outputs (n, d_f, out): in column i click i is inverted."""
+        outputs = []
+        for i in range(clicks.shape[1]):
+            other = clicks.clone()
+            other[:, i] = 1 - other[:, i]
+            outputs.append(self(other, mean))
+        return torch.stack(outputs, dim=1)
+
+
+class _DenseHead(_Head):
+    """A head whose first layer sees the clicks: with one of them inverted, its sums are corrected instead of made anew."""
+
+    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
+        """Return the outputs (n, d_f, out): in column i click i is inverted."""
+        scale = self.norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
+        sums = self.hidden((clicks - mean) * scale + self.norm.bias)
+        columns = (self.hidden.weight * scale).T  # (d_f, hidden)
+        changed = torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0))
+        return self.rest(changed.relu_())
+
+
+class MlpHead(_DenseHead):
+    """One hidden layer, scores (paper: 512 hidden units)."""
+
+    def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
+        super().__init__(n_features, n_features, n_hidden)
         self.output = nn.Linear(n_hidden, n_classes)
         _start(generator, self.hidden, self.output)
 
-    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
-        scores: Tensor = self.output(torch.relu(self.hidden(self.norm(clicks, mean))))
-        return scores
 
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return scores (n, d_f, classes): in column i click i is inverted."""
-        scores: Tensor = self.output(_flipped_hidden(self.norm, self.hidden, clicks, mean))
-        return scores
-
-
-class ConvHead(nn.Module):
-    """Normalisation, two convolutions along the patterns that halve the length, one hidden layer, scores."""
+class ConvHead(_Head):
+    """Two convolutions along the patterns that halve the length, one hidden layer, scores."""
 
     def __init__(self, n_features: int, n_hidden: int, n_classes: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.norm = ClickNorm(n_features)
+        length = -(-n_features // 4)  # each convolution rounds half the length up
+        super().__init__(n_features, CHANNELS[-1] * length, n_hidden)
         half = KERNEL // 2
         self.convolutions = nn.ModuleList(
             nn.Conv1d(before, after, KERNEL, stride=2, padding=half) for before, after in pairwise((1, *CHANNELS))
         )
-        self.length = -(-n_features // 4)  # each convolution rounds half the length up
-        self.hidden = nn.Linear(CHANNELS[-1] * self.length, n_hidden)
         self.output = nn.Linear(n_hidden, n_classes)
         _start(generator, *self.convolutions, self.hidden, self.output)
 
-    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Return scores (n, classes) of click means (n, d_f); `mean` as in `ClickNorm`."""
-        maps = self.norm(clicks, mean).unsqueeze(1)
+    def inputs(self, normal: Tensor) -> Tensor:
+        """Return the maps behind the convolutions, flat: (n, channels * length)."""
+        maps = normal.unsqueeze(1)
         for convolution in self.convolutions:
             maps = torch.relu(convolution(maps))
-        scores: Tensor = self.output(torch.relu(self.hidden(maps.flatten(1))))
-        return scores
-
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return scores (n, d_f, classes): in column i click i is inverted."""
-        return _flipped_one_by_one(self, clicks, mean)
+        return maps.flatten(1)
 
 
-class PictureHead(nn.Module):
-    """Normalisation, a hidden layer, a coarse picture of a quarter of the size, two transposed convolutions."""
+class PictureHead(_Head):
+    """A hidden layer, a coarse picture of a quarter of the size, two transposed convolutions."""
 
-    def __init__(
-        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        self.norm = ClickNorm(n_features)
+    def __init__(self, n_features: int, n_hidden: int, image_shape: Shape, generator: torch.Generator) -> None:
+        super().__init__(n_features, n_features, n_hidden)
         self.image_shape = image_shape
         self.coarse = (-(-image_shape[0] // 4), -(-image_shape[1] // 4))
-        self.hidden = nn.Linear(n_features, n_hidden)
         self.spread = nn.Linear(n_hidden, CHANNELS[-1] * self.coarse[0] * self.coarse[1])
         self.up = nn.ModuleList(
             nn.ConvTranspose2d(before, after, 4, stride=2, padding=1)
@@ -113,74 +137,37 @@ class PictureHead(nn.Module):
         )
         _start(generator, self.hidden, self.spread, *self.up)
 
-    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f)."""
-        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
+    def rest(self, hidden: Tensor) -> Tensor:
         maps = torch.relu(self.spread(hidden)).unflatten(1, (CHANNELS[-1], *self.coarse))
-        picture = self.up[1](torch.relu(self.up[0](maps)))[:, 0, : self.image_shape[0], : self.image_shape[1]]
-        pixels: Tensor = picture.flatten(1)
-        return pixels
-
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
-        return _flipped_one_by_one(self, clicks, mean)
+        picture: Tensor = self.up[1](torch.relu(self.up[0](maps)))
+        return picture[:, 0, : self.image_shape[0], : self.image_shape[1]].flatten(1)
 
 
-class DecoderHead(nn.Module):
-    """Normalisation, two hidden layers with ReLU, pixels (paper: d_f, 512, 512, 784)."""
+class DecoderHead(_DenseHead):
+    """Two hidden layers with ReLU, pixels (paper: d_f, 512, 512, 784)."""
 
-    def __init__(
-        self, n_features: int, n_hidden: int, image_shape: tuple[int, int], generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        self.norm = ClickNorm(n_features)
+    def __init__(self, n_features: int, n_hidden: int, image_shape: Shape, generator: torch.Generator) -> None:
+        super().__init__(n_features, n_features, n_hidden)
         self.image_shape = image_shape
-        self.hidden = nn.Linear(n_features, n_hidden)
         self.second = nn.Linear(n_hidden, n_hidden)
         self.output = nn.Linear(n_hidden, image_shape[0] * image_shape[1])
         _start(generator, self.hidden, self.second, self.output)
 
-    def forward(self, clicks: Tensor, mean: Tensor | None = None) -> Tensor:
-        """Return pixels (n, height * width), about 0 to 1, of click means (n, d_f); `mean` as in `ClickNorm`."""
-        hidden = torch.relu(self.hidden(self.norm(clicks, mean)))
-        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
-        return pixels
-
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return pixels (n, d_f, height * width): in column i click i is inverted."""
-        hidden = _flipped_hidden(self.norm, self.hidden, clicks, mean)
-        pixels: Tensor = self.output(torch.relu(self.second(hidden)))
-        return pixels
+    def rest(self, hidden: Tensor) -> Tensor:
+        return super().rest(torch.relu(self.second(hidden)))
 
 
 Decoders = PictureHead | DecoderHead  # what gives back pictures
 Heads = MlpHead | ConvHead | Decoders
 
 
-def new_head(options: Options, n_outputs: int, image_shape: tuple[int, int], random: torch.Generator) -> Heads:
+def new_head(options: Options, n_outputs: int, image_shape: Shape, random: torch.Generator) -> Heads:
     """Return the untrained head that `options` ask for; `image_shape` is that of the picture to give back."""
     if options.head in PICTURE_HEADS:
         decoder = PictureHead if options.head == "picture" else DecoderHead
         return decoder(options.features, options.hidden, image_shape, random)
     kind = ConvHead if options.head == "conv" else MlpHead
     return kind(options.features, options.hidden, n_outputs, random)
-
-
-def _flipped_hidden(norm: ClickNorm, layer: nn.Linear, clicks: Tensor, mean: Tensor) -> Tensor:
-    """Return the first hidden layer (n, d_f, hidden) with one click inverted each: its sums are made once and corrected."""
-    scale = norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
-    sums = layer((clicks - mean) * scale + norm.bias)
-    columns = (layer.weight * scale).T  # (d_f, hidden)
-    return torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0)).relu_()
-
-
-def _flipped_one_by_one(head: nn.Module, clicks: Tensor, mean: Tensor) -> Tensor:
-    scores = []
-    for i in range(clicks.shape[1]):
-        other = clicks.clone()
-        other[:, i] = 1 - other[:, i]
-        scores.append(head(other, mean))
-    return torch.stack(scores, dim=1)
 
 
 def _start(generator: torch.Generator, *layers: nn.Module) -> None:

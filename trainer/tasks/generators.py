@@ -1,6 +1,6 @@
 """The tasks that are drawn, not read: their generators by name, what their grey levels mean, and what encoder suits them.
 
-Owns the list and the provenance; never draws itself (see the task_*.py files) and never reads a file. `generate` returns a
+Owns the list; never draws itself (each task has a module) and never reads a file. `generate` returns a
 `Drawn`: images uint8 (n, height, width), labels int64 (n,), for training and held out. Every generator here is OURS: the paper's
 images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows and measures them.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +17,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.incident import Light
 from pans.runtime.errors import UsageError
 
-from . import barcode as task_barcode
-from . import cells as task_cells
-from . import fiber as task_fiber
-from . import nebula as task_nebula
-from . import tissue as task_tissue
-from . import transient as task_transient
+from . import barcode, cells, fiber, nebula, tissue, transient
 from .draw import Labels
 
 Draw = Callable[[int, str, int], tuple[NDArray[np.uint8], Labels]]
@@ -33,22 +27,14 @@ Draw = Callable[[int, str, int], tuple[NDArray[np.uint8], Labels]]
 class Recipe:
     """One drawn task: `light` is what grey / 255 means (`transmission` of an object that we light, or `field` amplitude)."""
 
-    name: str
     summary: str
     classes: tuple[str, ...]
     image_shape: tuple[int, int]
     light: Light
     encoder: str  # that the physics asks for: active, coherent or incoherent
-    paper_encoder: str
-    n_train: int
+    n_train: int  # objects drawn unless told otherwise; the numbers of the paper stand in the modules of the tasks
     n_test: int
-    paper_objects: str
     draw: Draw
-
-    @property
-    def n_objects(self) -> int:
-        """Objects drawn by default, for training and held out."""
-        return self.n_train + self.n_test
 
     @property
     def source(self) -> str:
@@ -61,7 +47,6 @@ class Drawn:
     """The objects of one recipe and seed."""
 
     recipe: Recipe
-    seed: int
     train_images: NDArray[np.uint8]
     train_labels: Labels
     test_images: NDArray[np.uint8]
@@ -76,114 +61,27 @@ class Drawn:
             digest.update(labels.astype("<i8").data)
         return digest.hexdigest()
 
-    def provenance(self) -> dict[str, Any]:
-        """Return what a bundle or a report says about these images, JSON-able."""
-        return {
-            "task": self.recipe.name,
-            "source": self.recipe.source,
-            "seed": self.seed,
-            "n_train": len(self.train_labels),
-            "n_test": len(self.test_labels),
-            "light": self.recipe.light,
-            "sha256": self.sha256,
-        }
 
+_Kind = tuple[tuple[int, int], Light, str]  # height and width, what grey means, the encoder
+CELL: _Kind = ((cells.SIDE_PX, cells.SIDE_PX), "transmission", "active")
+BARS: _Kind = ((1, barcode.N_BARS), "transmission", "active")
+COHERENT: _Kind = ((64, 64), "field", "coherent")
+INCOHERENT: _Kind = ((64, 64), "field", "incoherent")  # the paper's encoder is coherent here too
 
 GENERATORS: Mapping[str, Recipe] = {
-    recipe.name: recipe
-    for recipe in (
-        Recipe(
-            name="cells",
-            summary="which organelle is stained in a flowing cell, or is there none",
-            classes=task_cells.CLASSES,
-            image_shape=(task_cells.SIDE_PX, task_cells.SIDE_PX),
-            light="transmission",
-            encoder="active",
-            paper_encoder="active",
-            n_train=20_000,
-            n_test=4000,
-            paper_objects="10 000 + 1000 per class",
-            draw=task_cells.draw,
-        ),
-        Recipe(
-            name="cells-3",
-            summary="which organelle is stained in a flowing cell",
-            classes=task_cells.CLASSES[:3],
-            image_shape=(task_cells.SIDE_PX, task_cells.SIDE_PX),
-            light="transmission",
-            encoder="active",
-            paper_encoder="active",
-            n_train=15_000,
-            n_test=3000,
-            paper_objects="10 000 + 1000 per class (release)",
-            draw=task_cells.draw_without_null,
-        ),
-        Recipe(
-            name="barcode",
-            summary="do ten bars contain 1010",
-            classes=task_barcode.CLASSES,
-            image_shape=(1, task_barcode.N_BARS),
-            light="transmission",
-            encoder="active",
-            paper_encoder="active",
-            n_train=4000,
-            n_test=1000,
-            paper_objects="4000 + 1000",
-            draw=task_barcode.draw,
-        ),
-        Recipe(
-            name="transient",
-            summary="is there a small object in a coherently lit scene",
-            classes=task_transient.CLASSES,
-            image_shape=(task_transient.SIDE_PX, task_transient.SIDE_PX),
-            light="field",
-            encoder="coherent",
-            paper_encoder="coherent",
-            n_train=12_000,
-            n_test=2000,
-            paper_objects="4000 + 1000",
-            draw=task_transient.draw,
-        ),
-        Recipe(
-            name="tissue",
-            summary="does laser speckle show blood flow",
-            classes=task_tissue.CLASSES,
-            image_shape=(task_tissue.SIDE_PX, task_tissue.SIDE_PX),
-            light="field",
-            encoder="incoherent",
-            paper_encoder="coherent",
-            n_train=8000,
-            n_test=2000,
-            paper_objects="4000 + 1000 per class",
-            draw=task_tissue.draw,
-        ),
-        Recipe(
-            name="nebula",
-            summary="planetary or emission nebula",
-            classes=task_nebula.CLASSES,
-            image_shape=(task_nebula.SIDE_PX, task_nebula.SIDE_PX),
-            light="field",
-            encoder="incoherent",
-            paper_encoder="coherent",
-            n_train=12_000,
-            n_test=2000,
-            paper_objects="4000 + 1000 per class",
-            draw=task_nebula.draw,
-        ),
-        Recipe(
-            name="fiber",
-            summary="is the end face of a fibre contaminated",
-            classes=task_fiber.CLASSES,
-            image_shape=(task_fiber.SIDE_PX, task_fiber.SIDE_PX),
-            light="field",
-            encoder="coherent",
-            paper_encoder="coherent",
-            n_train=12_000,
-            n_test=2000,
-            paper_objects="4000 + 1000",
-            draw=task_fiber.draw,
-        ),
-    )
+    "cells": Recipe(
+        "which organelle is stained in a flowing cell, or is there none", cells.CLASSES, *CELL, 20_000, 4000, cells.draw
+    ),
+    "cells-3": Recipe(
+        "which organelle is stained in a flowing cell", cells.CLASSES[:3], *CELL, 15_000, 3000, cells.draw_without_null
+    ),
+    "barcode": Recipe("do ten bars contain 1010", barcode.CLASSES, *BARS, 4000, 1000, barcode.draw),
+    "transient": Recipe(
+        "is there a small object in a coherently lit scene", transient.CLASSES, *COHERENT, 12_000, 2000, transient.draw
+    ),
+    "tissue": Recipe("does laser speckle show blood flow", tissue.CLASSES, *INCOHERENT, 8000, 2000, tissue.draw),
+    "nebula": Recipe("planetary or emission nebula", nebula.CLASSES, *INCOHERENT, 12_000, 2000, nebula.draw),
+    "fiber": Recipe("is the end face of a fibre contaminated", fiber.CLASSES, *COHERENT, 12_000, 2000, fiber.draw),
 }
 
 
@@ -199,4 +97,4 @@ def generate(name: str, seed: int = 0, n_train: int | None = None, n_test: int |
     recipe = GENERATORS[name]
     train = recipe.draw(seed, "train", recipe.n_train if n_train is None else n_train)
     test = recipe.draw(seed, "test", recipe.n_test if n_test is None else n_test)
-    return Drawn(recipe, seed, *train, *test)
+    return Drawn(recipe, *train, *test)

@@ -20,14 +20,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pans.runtime.bundle.quantise import quantise_patterns
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.estimators import cross_entropy
+from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.model.heads import new_head
-from pans.trainer.model.quantise import exposure_us_of, quantise, top_limits
 from pans.trainer.options import Options
 from pans.trainer.tasks.barcode import N_BARS, all_strings, weights
 
@@ -161,7 +162,9 @@ def solve(options: Options, profile: Profile) -> Trained:
     encoder = ActiveIllumination(options.features, N_BARS, (low, high), random)
     with torch.no_grad():
         encoder.weight.copy_(best.patterns.sqrt())
-    shown = quantise(best.patterns.numpy(), profile.projector.levels, min(high, max(low, float(best.patterns.max()))))
+    shown = quantise_patterns(
+        best.patterns.numpy(), profile.projector.levels, min(high, max(low, float(best.patterns.max())))
+    )
     strings, labels = (torch.from_numpy(part) for part in all_strings())
     p = click_probability(strings.double() @ torch.from_numpy(shown.patterns()).T, law)
     head = new_head(options, 2, (1, N_BARS), random)

@@ -22,15 +22,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
 from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
+from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.model.field_basis import in_pixels
 from pans.trainer.model.heads import Heads, new_head
-from pans.trainer.model.quantise import Quantised, exposure_us_of, quantise
 from pans.trainer.options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
 from pans.trainer.tasks.registry import Task
 
@@ -62,7 +63,7 @@ class EpochReport:
 class Trained:
     """A finished model: the shown patterns, the head in evaluation mode, the law it was trained for."""
 
-    quantised: Quantised | None  # of active sensing; None of a passive encoder
+    quantised: QuantisedPatterns | None  # of active sensing; None of a passive encoder
     float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
     encoder: Encoder
     head: Heads
@@ -266,7 +267,7 @@ class Run:
             self.encoder.lower_top()
             with torch.no_grad():
                 floats = (self.encoder.weight**2).cpu().numpy().copy()
-            quantised = quantise(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
+            quantised = quantise_patterns(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
         p, shape = self.probabilities(0, len(self.data.labels)), self.data.picture_shape
         fit_head(
             self.head,

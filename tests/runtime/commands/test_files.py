@@ -13,9 +13,7 @@ import pytest
 from bundles import made_bundle
 
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
-from pans.runtime.bundle.quantise import quantise_patterns
 from pans.runtime.cli import main
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile, shipped_profiles
 from pans.runtime.record import Recorder, read_recording
 
@@ -343,28 +341,6 @@ def test_arrays_from_strangers(kind: str, tmp_path: Path, capsys: pytest.Capture
         path.write_bytes(b"" if kind == "empty" else b"1,2,3\n")
     assert main([*words, "-o", str(tmp_path / "o.pans")]) == 2
     assert "not a readable .npy array" in capsys.readouterr().err
-
-
-def test_quantising_refuses_what_is_not_light() -> None:
-    for bad in (np.array([[1.0, -1e-9]]), np.array([[np.nan, 1]]), np.array([[np.inf, 1]])):
-        with pytest.raises(UsageError, match="allowed: finite photons"):
-            quantise_patterns(bad, 4)
-    with pytest.raises(UsageError, match="no pattern has any light"):
-        quantise_patterns(np.zeros((2, 2)), 4)
-    with pytest.raises(UsageError, match="floats"):
-        quantise_patterns(np.ones((2, 2), dtype=int), 4)
-
-
-def test_quantising_rounds_to_the_nearest_level() -> None:
-    found = quantise_patterns(np.array([[0.0, 0.1, 0.26, 0.74, 1.5]], dtype=np.float32), 4)
-    assert found.pattern_levels.tolist() == [[0, 0, 1, 1, 3]]
-    assert found.photons_per_level == 0.5
-    assert found.error_max == pytest.approx(0.24, abs=1e-6)
-    assert found.pixels_lost == 1
-    assert found.illumination == pytest.approx(2.5)
-    assert found.illumination_wanted == pytest.approx(2.6)
-    full = quantise_patterns(np.array([[0.0, 1e-30, 5e-324 + 1e-25]]), 65536)
-    assert full.pattern_levels[0, 2] == 65535
 
 
 def test_a_recording_of_a_run_is_read_whole(tmp_path: Path) -> None:

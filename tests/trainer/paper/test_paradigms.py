@@ -268,7 +268,7 @@ def test_a_followed_training_ends_where_an_ordinary_one_does(task):
     profile = load_profile("ideal")
     course = follow(task, profile, SMALL, patterns_after=(1, 6))
     plain = train(task, profile, SMALL)
-    assert np.array_equal(course.trained.quantised.levels, plain.quantised.levels)
+    assert np.array_equal(course.trained.quantised.pattern_levels, plain.quantised.pattern_levels)
     assert course.trained.validation_loss == plain.validation_loss
     columns = course.columns()
     assert {len(values) for values in columns.values()} == {6}

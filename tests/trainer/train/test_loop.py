@@ -24,6 +24,7 @@ from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.train import schedule
+from pans.trainer.train.checkpoint import read_checkpoint
 from pans.trainer.train.data import TrainingData, encoder_input
 from pans.trainer.train.head_fit import fit_head_exactly, joint_distribution
 from pans.trainer.train.loop import Run, train
@@ -76,17 +77,17 @@ def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     decided = trained.head(words).argmax(dim=1)
     right = joint_distribution(p, torch.from_numpy(task.test.labels), 4)[torch.arange(16), decided].sum()
     assert float(right) > 0.5  # by chance 0.25
-    assert trained.quantised.levels.max() < PROFILE.projector.levels
+    assert trained.quantised.pattern_levels.max() < PROFILE.projector.levels
     assert [report.epoch for report in reports] == list(range(1, 11))
     assert reports[-1].loss < reports[0].loss
     again = train(task, PROFILE, options)
-    assert np.array_equal(again.quantised.levels, trained.quantised.levels)
+    assert np.array_equal(again.quantised.pattern_levels, trained.quantised.pattern_levels)
     assert all(torch.equal(a, b) for a, b in zip(again.head.state_dict().values(), trained.head.state_dict().values()))
 
 
 def test_another_seed_gives_other_patterns(task):
     first, other = (train(task, PROFILE, Options(features=3, epochs=1, hidden=8, seed=seed)) for seed in (0, 1))
-    assert not np.array_equal(first.quantised.levels, other.quantised.levels)
+    assert not np.array_equal(first.quantised.pattern_levels, other.quantised.pattern_levels)
 
 
 @pytest.mark.parametrize(("name", "low", "high"), [("clicks", 0.8, 1.4), ("photons", 1.4, 3.0)])
@@ -105,7 +106,7 @@ def test_restarts_keep_the_best(task):
     best = train(task, PROFILE, Options(**(options | {"restarts": 3})))
     losses = [one.validation_loss for one in single]
     assert best.validation_losses == pytest.approx(losses)
-    assert np.array_equal(best.quantised.levels, single[int(np.argmin(losses))].quantised.levels)
+    assert np.array_equal(best.quantised.pattern_levels, single[int(np.argmin(losses))].quantised.pattern_levels)
 
 
 def test_with_several_shots_in_the_loss_restarts_are_judged_by_them_too(task):
@@ -145,7 +146,7 @@ def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
     seen = []
     resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True, report=seen.append)
     assert (seen[0].restart, seen[0].epoch) == (1, 3)  # the last whole epoch on disk is the one before
-    assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
+    assert np.array_equal(resumed.quantised.pattern_levels, whole.quantised.pattern_levels)
     assert resumed.validation_losses == whole.validation_losses
 
 
@@ -166,17 +167,27 @@ def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_pa
         with pytest.raises(KeyboardInterrupt):
             train(task, PROFILE, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=interrupt)
     resumed = train(task, PROFILE, options, checkpoint=checkpoint, resume=True)
-    assert np.array_equal(resumed.quantised.levels, whole.quantised.levels)
+    assert np.array_equal(resumed.quantised.pattern_levels, whole.quantised.pattern_levels)
     assert all(torch.equal(a, b) for a, b in zip(resumed.head.state_dict().values(), whole.head.state_dict().values()))
 
 
-def test_a_checkpoint_is_plain_arrays(task, tmp_path):
+class Hostile:
+    """What would run code when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_a_checkpoint_holds_plain_values_and_never_runs_code(task, tmp_path):
     options = Options(**(vars_of(SMALL) | {"epochs": 1}))
     train(task, PROFILE, options, checkpoint=tmp_path / "state")
-    with np.load(tmp_path / "state", allow_pickle=False) as arrays:
-        assert all(arrays[name].dtype != object for name in arrays.files)
-        tree = json.loads(arrays["tree"].tobytes())
-    assert tree["identity"]["features"] == "4"
+    assert torch.load(tmp_path / "state", weights_only=True)["identity"]["features"] == "4"
+    torch.save({"identity": Hostile(tmp_path / "made")}, tmp_path / "state")
+    with pytest.raises(DamagedFileError, match="not a checkpoint"):
+        read_checkpoint(tmp_path / "state", options, task.sha256)
     assert os.listdir(tmp_path) == ["state"]  # nothing stays beside it
 
 
@@ -340,7 +351,7 @@ def test_the_same_seed_gives_the_same_patterns_on_one_device(task, name):
     options = replace(SMALL, epochs=2)
     with computing_on(name):
         first, second = (train(task, PROFILE, options) for _ in range(2))
-    assert np.array_equal(first.quantised.levels, second.quantised.levels)
+    assert np.array_equal(first.quantised.pattern_levels, second.quantised.pattern_levels)
     assert torch.equal(first.head.hidden.weight, second.head.hidden.weight)
     assert first.head.hidden.weight.device.type == "cpu"
     assert torch.get_default_device().type == "cpu"

@@ -1,0 +1,63 @@
+"""From real patterns to levels: what rounding may change is bounded, and the bound is reached."""
+
+import numpy as np
+import pytest
+
+from pans.runtime.bundle.quantise import quantise_patterns
+from pans.runtime.errors import UsageError
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("levels", [2, 16, 124, 65536])
+@pytest.mark.parametrize("top", [None, 1.5])
+def test_no_object_changes_by_more_than_the_bound(levels, top):
+    patterns = RNG.exponential(0.3, (4, 50))
+    found = quantise_patterns(patterns, levels, top)
+    change = found.patterns() - patterns
+    for transmission in [RNG.uniform(size=(200, 50)), np.ones((1, 50)), np.zeros((1, 50))]:
+        assert np.all(np.abs(transmission @ change.T) <= found.error_bound * (1 + 1e-12) + 1e-15)
+    # reached by the object that lets through only the light added, or only the light taken away
+    worst = np.maximum((change * (change > 0)).sum(axis=1), -(change * (change < 0)).sum(axis=1))
+    assert found.error_bound == pytest.approx(worst, rel=1e-12)
+
+
+def test_the_brightest_pixel_is_the_top_level():
+    found = quantise_patterns(RNG.uniform(0, 2, (3, 30)), 124)
+    assert found.pattern_levels.max() == 123
+    assert found.pattern_levels.dtype == np.uint16
+
+
+def test_without_clipping_no_pixel_moves_by_more_than_half_a_level():
+    patterns = RNG.uniform(0, 2, (3, 30))
+    found = quantise_patterns(patterns, 124)
+    assert np.abs(found.patterns() - patterns).max() <= found.photons_per_level / 2 * (1 + 1e-12)
+
+
+def test_brighter_pixels_are_clipped_to_the_top():
+    found = quantise_patterns(np.array([[0.2, 3.0]]), 11, 1.0)
+    assert found.pattern_levels.tolist() == [[2, 10]]
+    assert found.error_bound == pytest.approx([2.0])
+
+
+def test_quantising_refuses_what_is_not_light() -> None:
+    for bad in (np.array([[1.0, -1e-9]]), np.array([[np.nan, 1.0]]), np.array([[np.inf, 1.0]])):
+        with pytest.raises(UsageError, match="allowed: finite photons"):
+            quantise_patterns(bad, 4)
+    with pytest.raises(UsageError, match="no pattern has any light"):
+        quantise_patterns(np.zeros((2, 2)), 4)
+    for bad in (np.ones((2, 2), dtype=int), np.ones(3)):
+        with pytest.raises(UsageError, match="floats"):
+            quantise_patterns(bad, 4)
+
+
+def test_quantising_rounds_to_the_nearest_level() -> None:
+    found = quantise_patterns(np.array([[0.0, 0.1, 0.26, 0.74, 1.5]], dtype=np.float32), 4)
+    assert found.pattern_levels.tolist() == [[0, 0, 1, 1, 3]]
+    assert found.photons_per_level == 0.5
+    assert found.error_max == pytest.approx(0.24, abs=1e-6)
+    assert found.pixels_lost == 1
+    assert found.illumination == pytest.approx(2.5)
+    assert found.illumination_wanted == pytest.approx(2.6)
+    full = quantise_patterns(np.array([[0.0, 1e-30, 5e-324 + 1e-25]]), 65536)
+    assert full.pattern_levels[0, 2] == 65535
