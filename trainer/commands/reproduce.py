@@ -1,29 +1,25 @@
 """`pans reproduce NAME`: the paper's tables and figures, ours beside the paper's, as Markdown, JSON and PNG.
 
-Owns the arguments, the walk over the rows and the files; what a row is, is in the reproduce_*.py modules. Every figure is SIMULATED.
+Owns the arguments and what is refused; the pages are those of the package `paper`. Every figure is SIMULATED.
 Finished rows lie in a cache folder: a killed run goes on, and several processes may share the rows of a table (`--rows`).
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
-from pans.trainer.paper.page import Asked, Draw, write_page
-from pans.trainer.paper_tables import ACTIVE, PASSIVE, UNPRINTED
+from pans.trainer.paper import PAGES, Asked, Made, Page, page_of, write_page
+from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", choices=(*NAMES, "all", "list"), help="which table or figure")
+    parser.add_argument("name", choices=(*PAGES, "all", "list"), help="which table or figure")
     parser.add_argument("--rows", type=int, nargs="+", metavar="D", help="only the rows with that many patterns")
     parser.add_argument("--dark", type=float, nargs="+", metavar="R", help="only these dark counts (not of all tables)")
     parser.add_argument(
@@ -42,7 +38,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     if args.name == "list":
-        emit(args, {"rows": list(NAMES)}, "\n".join(NAMES))
+        emit(args, {"rows": list(PAGES)}, "\n".join(PAGES))
         return EXIT_FINE
     try:
         import torch
@@ -51,55 +47,38 @@ def _run(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     args.cache = args.cache.expanduser()
     args.cache.mkdir(parents=True, exist_ok=True)
-    results = {}
+    results: dict[str, tuple[Page, Made]] = {}
     try:
-        for name in NAMES if args.name == "all" else (args.name,):
-            results[name] = NAMES[name](name, args)
+        for name in PAGES if args.name == "all" else (args.name,):
+            results[name] = _measured(name, args)
             if args.out:
-                write_page(args.out, name, results[name])
+                write_page(args.out, name, *results[name])
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
         return EXIT_INTERRUPTED
-    rows = [row for result in results.values() for row in result["rows"]]
-    emit(args, {"rows": rows, "simulated": True}, "\n\n".join(result["markdown"] for result in results.values()))
+    rows = [row for _, made in results.values() for row in made.rows]
+    text = "\n\n".join(page.whole(name, made) for name, (page, made) in results.items())
+    emit(args, {"rows": rows, "simulated": True}, text)
     return EXIT_FINE
 
 
-def _active(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from pans.trainer.figures import accuracy_against_photons
-    from pans.trainer.paper import active
-    from pans.trainer.paper.active_table import markdown
-
-    wanted = [row for row in active.rows_of(name) if args.rows is None or row.features in args.rows]
-    if not wanted:
-        raise UsageError(
-            f"--rows {args.rows}", remedy=f"{name} has {', '.join(str(row.features) for row in active.rows_of(name))}"
-        )
-    done = []
-    for row in wanted:
-        figures = active.row_with_seeds(args.cache, name, row, args.data_dir, say, collect=args.collect)
-        if figures is None:
-            say(f"{name} d_f={row.features}: not trained yet")
-            continue
-        done.append((row, figures))
-        ahead, clicks_fine = active.passed(row, figures)
-        say(f"{name} d_f={row.features}: {ahead:+.2f} points, clicks {'fine' if clicks_fine else 'above +5 %'}")
-    text = markdown(name, done)
-    rows = [{"task": name, "paper": _facts(row), **figures} for row, figures in done]
-    pictures = {"": partial(accuracy_against_photons, name=name, done=done)}
-    return {"rows": rows, "markdown": text, "pictures": pictures}
+def _measured(name: str, args: argparse.Namespace) -> tuple[Page, Made]:
+    _check(name, args)
+    rows, dark = (None if wanted is None else tuple(wanted) for wanted in (args.rows, args.dark))
+    asked = Asked(name, args.cache, rows, args.data_dir, args.collect, say, dark, args.data_seed)
+    page = page_of(name)
+    return page, page.measure(asked)
 
 
-def _facts(row: Any) -> dict[str, Any]:
-    return {key: getattr(row, key) for key in row.__dataclass_fields__}
-
-
-def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    from pans.trainer.figures import measure_over_patterns
-    from pans.trainer.paper import passive
+def _check(name: str, args: argparse.Namespace) -> None:
+    """Refuse rows, dark counts and draws that a table does not have."""
+    if name in ACTIVE:
+        known = [row.features for row in ACTIVE[name]]
+        if args.rows is not None and not {*known} & {*args.rows}:
+            raise UsageError(f"--rows {args.rows}", remedy=f"{name} has {', '.join(map(str, known))}")
+    if name not in PASSIVE and name not in UNPRINTED:
+        return
     from pans.trainer.paper.passive_recipes import TASKS
-    from pans.trainer.paper.passive_table import markdown, table_of
-    from pans.trainer.paper.picture_samples import draw_samples
     from pans.trainer.tasks.generators import GENERATORS
 
     drawn = TASKS.get(name, name) in GENERATORS and name != "barcode"  # all its strings are judged
@@ -109,61 +88,12 @@ def _passive(name: str, args: argparse.Namespace) -> dict[str, Any]:
         )
         raise UsageError(f"--data-seed {args.data_seed}", remedy=remedy)
     table = table_of(name)
-    wanted = [row for row in table.rows if args.rows is None or row.features in args.rows]
-    levels = [dark for dark in table.dark if args.dark is None or dark in args.dark]
+    known = [row.features for row in table.rows]
+    wanted = args.rows is None or {*known} & {*args.rows}
+    levels = args.dark is None or {*table.dark} & {*args.dark}
     if not (wanted and levels):
-        known = f"rows {', '.join(str(row.features) for row in table.rows)}, dark {', '.join(map(str, table.dark))}"
-        raise UsageError(f"--rows {args.rows} --dark {args.dark}", remedy=f"{name} has {known}")
-    done, others = [], []
-    for row in wanted:
-        for dark in levels:
-            figures = passive.finished_cell(args.cache, name, row, dark, args.data_seed)
-            if figures is None and not args.collect:
-                figures = passive.make_cell(args.cache, name, row, dark, args.data_dir, say, args.data_seed)
-            if figures is not None:
-                done.append((row, figures))
-            if not args.data_seed:
-                others += [(row, other) for other in passive.other_draws(args.cache, name, row, dark)]
-    text = markdown(name, done, others)
-    pictures: dict[str, Draw] = {"": partial(measure_over_patterns, name=name, done=done)}
-    if samples := passive.samples_of(args.cache, name, done):
-        pictures["-pictures"] = partial(draw_samples, name=name, cells=samples)
-    return {"rows": [figures for _, figures in done + others], "markdown": text, "pictures": pictures}
+        has = f"rows {', '.join(map(str, known))}, dark {', '.join(map(str, table.dark))}"
+        raise UsageError(f"--rows {args.rows} --dark {args.dark}", remedy=f"{name} has {has}")
 
-
-def _page(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Measure a page of `PAGES`."""
-    module, _, function = PAGES[name].partition(":")
-    measure = getattr(importlib.import_module(f"pans.trainer.paper.{module}"), function)
-    rows = None if args.rows is None else tuple(args.rows)
-    page: dict[str, Any] = measure(Asked(name, args.cache, rows, args.data_dir, args.collect, say))
-    return page
-
-
-PAGES = {  # name: module and function that measure it (imported when asked for)
-    "estimators": "estimators:estimator_table",
-    "time": "time:time_table",
-    "equal-photons": "equal:equal_table",
-    "sweeps": "sweeps:sweep_table",
-    "fig-2c": "information:information_table",
-    "confusion": "confusion:confusion_page",
-    "dark-counts": "robust:dark_page",
-    "eta": "robust:eta_page",
-    "fig-3": "shots:fig_3_page",
-    "multi-shot": "shots:multi_shot_page",
-    "single-shot": "single:single_shot_page",
-    "alpha": "alpha:alpha_page",
-    "evolution": "alpha:evolution_page",
-    "fig-2e": "paradigms:fig_2e_page",
-    "end-to-end": "paradigms:end_to_end_page",
-    "compressive": "sensing:compressive_page",
-    "direct-frames": "frames:frames_page",
-}
-
-NAMES: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
-    **dict.fromkeys(ACTIVE, _active),
-    **dict.fromkeys([*PASSIVE, *UNPRINTED], _passive),
-    **dict.fromkeys(PAGES, _page),
-}
 
 REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)

@@ -1,7 +1,8 @@
 """The paper's FashionMNIST and MNIST tables: train every row, measure it, put it beside the paper's figures.
 
-Owns the recipes and the measuring of one row; the command and the files are in reproduce.py. The instrument is the profile `ideal`,
-which is what the paper simulates: a plain thresholded Poisson detector and a modulator with perfect black. SIMULATED.
+Owns the recipes, the measuring of one row, the two pages, and the trained rows that other pages measure further (`trained_rows`). The
+instrument is the profile `ideal`, which is what the paper simulates: a plain thresholded Poisson detector and a modulator with perfect
+black. SIMULATED.
 
 A row is trained once and kept in the cache folder, as a bundle and its figures: a killed run goes on where it was, and rows may
 be trained by several processes. Rows are chosen by nothing but validation objects: the test images are used once, at the end.
@@ -13,7 +14,8 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,11 @@ from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, same_options
-from pans.trainer.paper_tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST_OBJECTS, SHOTS, ActiveRow
 from pans.trainer.tasks.registry import Objects, Task, load_task
+
+from . import plots
+from .page import MINUTES, Asked, Column, Made, Page, Row, Rows, Table, accuracy, kept, percent
+from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
 
 PROFILE = "ideal"
 TRIALS = {FIRST_OBJECTS: 100, 10_000: 10}  # where the outcomes are too many to enumerate
@@ -76,29 +81,26 @@ def finished_row(cache: Path, name: str, row: ActiveRow, seed: int = 0) -> dict[
     return found if same_options(found["options"], replace(recipe(name, row), seed=seed)) else None
 
 
-def row_with_seeds(
-    cache: Path, name: str, row: ActiveRow, data_dir: str | None, report: Callable[[str], None], *, collect: bool
-) -> dict[str, Any] | None:
-    """Return the figures of a row, `other_seeds` being those of `OTHER_SEEDS`; with `collect` nothing is trained."""
+def row_with_seeds(asked: Asked, row: ActiveRow) -> Row | None:
+    """Return the figures of a row of the table `asked.name`, `other_seeds` being those of `OTHER_SEEDS`; None where it is not made."""
     found = []
-    for seed in (0, *OTHER_SEEDS.get((name, row.features), ())):
-        figures = finished_row(cache, name, row, seed)
-        if figures is None and not collect:
-            figures = make_row(cache, name, row, data_dir, report, seed)
+    for seed in (0, *OTHER_SEEDS.get((asked.name, row.features), ())):
+        figures = finished_row(asked.cache, asked.name, row, seed)
+        if figures is None and not asked.collect:
+            figures = make_row(asked, row, seed)
         found.append(figures)
     first, *others = found
     return None if first is None else first | {"other_seeds": [figures for figures in others if figures is not None]}
 
 
-def make_row(
-    cache: Path, name: str, row: ActiveRow, data_dir: str | None, report: Callable[[str], None], seed: int = 0
-) -> dict[str, Any]:
-    """Train, export and measure one row, or go on with it; its figures go to the cache and are returned."""
+def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
+    """Train, export and measure one row of the table `asked.name`, or go on with it; its figures go to the cache and are returned."""
     from pans.trainer.export.writer import export_trained
     from pans.trainer.train.loop import train
 
-    bundle_path, figures_path = row_files(cache, name, row.features, seed)
-    task, profile = load_task(name, data_dir), load_profile(PROFILE)
+    name = asked.name
+    bundle_path, figures_path = row_files(asked.cache, name, row.features, seed)
+    task, profile = load_task(name, asked.data_dir), load_profile(PROFILE)
     options = replace(recipe(name, row), seed=seed)
     checkpoint = bundle_path.with_suffix(".checkpoint")
     clock = _Clock(figures_path.with_suffix(".seconds"), goes_on=checkpoint.is_file())
@@ -106,7 +108,7 @@ def make_row(
     def said(epoch: Any) -> None:
         clock.save()
         if epoch.epoch % 5 == 0:
-            report(
+            asked.report(
                 f"{name} d_f={row.features} run {epoch.restart} epoch {epoch.epoch} {epoch.stage}: loss {epoch.loss:.3f}, "
                 f"{epoch.clicks:.2f} clicks, {epoch.photons:.1f} photons"
             )
@@ -134,7 +136,7 @@ def measure_row(bundle_path: Path, task: Task, profile: Profile) -> dict[str, An
     """Return accuracy, clicks, photons and illumination at every number of shots, of the first 200 and of all test images."""
     bundle, _ = load_bundle(bundle_path)
     measured: dict[str, Any] = {}
-    for part, objects in ((f"first_{FIRST_OBJECTS}", _first(task.test, FIRST_OBJECTS)), ("all", task.test)):
+    for part, objects in ((FIRST, _first(task.test, FIRST_OBJECTS)), ("all", task.test)):
         measured[part] = {str(shots): asdict(_measured(bundle, profile, objects, shots)) for shots in SHOTS}
     return measured
 
@@ -149,14 +151,9 @@ def direct_at(name: str, photons: float) -> dict[str, Any]:
 
 def passed(row: ActiveRow, figures: dict[str, Any], shots: int = 1) -> tuple[float, bool]:
     """Return by how many points a row beats the paper's simulation on the first 200, and whether its clicks are within +5 %."""
-    mine = figures[f"first_{FIRST_OBJECTS}"]
+    mine = figures[FIRST]
     ahead = 100 * mine[str(shots)]["accuracy_mean"] - row.simulation[SHOTS.index(shots)]
     return ahead, mine["1"]["clicks_mean"] <= CLICKS_TOLERANCE * row.clicks
-
-
-def rows_of(name: str) -> tuple[ActiveRow, ...]:
-    """Return the paper's rows of a table."""
-    return ACTIVE[name]
 
 
 class _Clock:
@@ -183,3 +180,156 @@ def _measured(bundle: Bundle, profile: Profile, objects: Objects, shots: int) ->
 
 def _first(objects: Objects, count: int) -> Objects:
     return Objects(objects.images[:count], objects.labels[:count])
+
+
+# ---- the pages ----
+
+
+def active_page(asked: Asked) -> Made:
+    """Return one row per number of patterns, with the paper's figures beside ours."""
+    name, done = asked.name, []
+    for row in ACTIVE[name]:
+        if not asked.wants(row.features):
+            continue
+        figures = row_with_seeds(asked, row)
+        if figures is None:
+            asked.report(f"{name} d_f={row.features}: not trained yet")
+            continue
+        ahead, clicks_fine = passed(row, figures)
+        asked.report(
+            f"{name} d_f={row.features}: {ahead:+.2f} points, clicks {'fine' if clicks_fine else 'above +5 %'}"
+        )
+        printed = {key: getattr(row, key) for key in ("features", "simulation", "experiment", "clicks", "illumination")}
+        done.append({"task": name, "paper": printed, **figures})
+    return Made(done, {"": partial(plots.accuracy_against_photons, name=name, rows=done)} if done else {})
+
+
+def active_tables(rows: Rows) -> list[Table]:
+    """Return the table of the paper's images, that of all, and that of other seeds."""
+    others = [other | {"of": row} for row in rows for other in row.get("other_seeds", ())]
+    return [
+        Table(
+            _FIRST_COLUMNS,
+            rows,
+            f"## First {FIRST_OBJECTS} test images, as in the paper (accuracy %, K = 1 / 2 / 3 / 5)",
+        ),
+        Table(_ALL_COLUMNS, rows, "## All 10 000 test images"),
+        *([Table(_SEED_COLUMNS, others, "## Other seeds (accuracy %, K = 1 / 2 / 3 / 5)")] if others else ()),
+    ]
+
+
+def _slashed(values: list[float]) -> str:
+    return " / ".join(f"{value:.2f}" for value in values)
+
+
+def _accuracies(part: str) -> Callable[[Row], str]:
+    return lambda row: _slashed([100 * row[part][str(shots)]["accuracy_mean"] for shots in SHOTS])
+
+
+def _moved(part: str, shots: int) -> Callable[[Row], float]:
+    """By how much another seed moves the accuracy."""
+    return lambda row: float(row[part][str(shots)]["accuracy_mean"] - row["of"][part][str(shots)]["accuracy_mean"])
+
+
+FEATURES = Column("d_f", "features")
+_FIRST_COLUMNS = (
+    FEATURES,
+    Column("paper, simulation", lambda row: _slashed(row["paper"]["simulation"])),
+    Column("paper, experiment", lambda row: _slashed(row["paper"]["experiment"])),
+    Column("ours", _accuracies(FIRST)),
+    Column("ahead (K=1)", lambda row: 100 * row[FIRST]["1"]["accuracy_mean"] - row["paper"]["simulation"][0], "+.2f"),
+    Column("clicks: paper", "paper.clicks", ".2f"),
+    Column("ours", f"{FIRST}.1.clicks_mean", ".2f"),
+    Column("photons", f"{FIRST}.1.photons_mean", ".1f"),
+    Column("illum.: paper", "paper.illumination", ".0f"),
+    Column("ours", f"{FIRST}.1.illumination", ".0f"),
+)
+_ALL_COLUMNS = (
+    FEATURES,
+    Column("ours, K = 1 / 2 / 3 / 5", _accuracies("all")),
+    percent("trials (K=1)", "all.1.accuracy_std"),
+    percent("objects (K=1)", "all.1.accuracy_se_objects"),
+    Column("clicks", "all.1.clicks_mean", ".2f"),
+    Column("photons", "all.1.photons_mean", ".1f"),
+    percent("direct at these photons", "direct.accuracy_mean", ".1f"),
+    Column("how", lambda row: f"{row['all']['1']['trials']} trials" if row["all"]["1"]["trials"] else "exact"),
+    MINUTES,
+)
+_SEED_COLUMNS = (
+    FEATURES,
+    Column("seed", "options.seed"),
+    Column(f"first {FIRST_OBJECTS}", _accuracies(FIRST)),
+    Column("all", _accuracies("all")),
+    Column("clicks", f"{FIRST}.1.clicks_mean", ".2f"),
+    *(
+        percent(f"moved, {words}, K = {shots}", _moved(part, shots), "+.2f")
+        for part, words in ((FIRST, f"first {FIRST_OBJECTS}"), ("all", "all"))
+        for shots in (1, 5)
+    ),
+)
+PAGES = {
+    name: Page(f"{name}: the paper's table", active_page, active_tables, {"": "accuracy over clicks and over photons"})
+    for name in ACTIVE
+}
+
+
+# ---- trained rows, for the pages that measure them further ----
+
+MEASURED = (*accuracy(f"first {FIRST_OBJECTS}", FIRST), *accuracy("all", "all"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainedRow:
+    """A row of the paper, our bundle for it with its SHA-256, and the figures of its table."""
+
+    table: str
+    paper: ActiveRow
+    bundle: Bundle
+    sha256: str
+    figures: Row
+
+    @property
+    def features(self) -> int:
+        """Number of patterns, d_f."""
+        return self.paper.features
+
+
+def trained_rows(asked: Asked, table: str) -> list[TrainedRow]:
+    """Return the rows of `table` whose bundle and figures lie in the cache; what is missing or of an earlier recipe is reported."""
+    found = []
+    for row in ACTIVE[table]:
+        if not asked.wants(row.features):
+            continue
+        bundle_path, figures_path = row_files(asked.cache, table, row.features)
+        if not (bundle_path.is_file() and figures_path.is_file()):
+            asked.report(f"{table} d_f={row.features} is not trained yet: pans reproduce {table} --rows {row.features}")
+            continue
+        if finished_row(asked.cache, table, row) is None:
+            asked.report(f"{table} d_f={row.features} was trained by an earlier recipe than today's")
+        bundle, sha256 = load_bundle(bundle_path)
+        found.append(TrainedRow(table, row, bundle, sha256, json.loads(figures_path.read_text())))
+    return found
+
+
+def measured_on(asked: Asked, row: TrainedRow, facts: Row, make: Callable[[], Row]) -> Row | None:
+    """Return what the page `asked.name` measured on `row` in the way of `facts`, now or before.
+
+    With `collect` None where it did not; that is reported. A figure that was kept for another bundle is measured again.
+    """
+
+    def measured() -> Row:
+        asked.report(f"{asked.name}: measuring {row.table}, d_f = {row.features}")
+        return make()
+
+    path = asked.cache / f"{asked.name}-{row.table}-{row.features}.json"
+    found = kept(path, {"sha256": row.sha256, **facts}, measured, collect=asked.collect)
+    if found is None:
+        asked.report(
+            f"{asked.name}: {row.table}, d_f = {row.features} is not measured yet: pans reproduce {asked.name}"
+        )
+    return found
+
+
+def by_table(rows: Rows) -> list[tuple[str, Rows]]:
+    """Return the rows of each active table, by their key `table`."""
+    return [(table, [row for row in rows if row["table"] == table]) for table in ACTIVE]

@@ -1,12 +1,11 @@
 """PANS against direct imaging at equal photons, on the tasks that our generators draw.
 
-Owns the levels, the recipes and the page; nothing else trains or decides here. At every level N each way gets N detected photoelectrons
-per decision,
-averaged over the held-out objects (PANS: at most N), with ideal shot noise and no dark counts:
+Owns the levels, the recipes and the page. At every level N each way gets N detected photoelectrons per decision, averaged over the
+held-out objects (PANS: at most N), with ideal shot noise and no dark counts:
 
 - **PANS**: ten patterns (cells at many photons: more), trained with N photons as its budget and no limit on clicks;
-- **posterior**: 784 and more perfect photon counters, the exact Poisson likelihood over all training objects (baseline_bayes.py);
-- **network**: the same frames, a convolutional network trained on fresh noisy frames of that level (baseline_direct.py).
+- **posterior**: 784 and more perfect photon counters, the exact Poisson likelihood over all training objects (baselines/bayes.py);
+- **network**: the same frames, a convolutional network trained on fresh noisy frames of that level (baselines/direct.py).
 
 SIMULATED on the profile `ideal`. Finished figures lie in the cache folder, one file each.
 """
@@ -18,7 +17,6 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -34,7 +32,7 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, sam
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
 
-from .page import Asked
+from .page import MINUTES, Asked, Column, Made, Page, Row, Rows, Table
 from .passive import PROFILE, measure
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
 
@@ -52,7 +50,6 @@ FLOOR = (
     5e-3  # of the mean light, by which the posterior lifts every pixel: the middle one of those that it may choose from
 )
 TRIALS = 2
-BOUND = 30.0  # photons below which PANS is meant to be ahead
 WAYS = ("PANS", "equal light", "posterior", "network")
 DIRECT = WAYS[2:]
 LIGHT_SIZE = 100  # fields in which an encoder that conserves light is sought: those that hold most of it
@@ -80,8 +77,8 @@ def light_recipe(name: str, photons: float) -> Options:
     return replace(fields, conserving=True, input_photons=photons)
 
 
-def equal_table(asked: Asked) -> dict[str, Any]:
-    """Return one row per task, way and level, and the Markdown; with `collect` only what is finished."""
+def equal_page(asked: Asked) -> Made:
+    """Return one row per task, way and level; with `collect` only what is finished."""
     rows = []
     for ways in (WAYS[:3], WAYS[3:]):  # the networks last: they take longest
         for name in TASKS:
@@ -96,27 +93,27 @@ def equal_table(asked: Asked) -> dict[str, Any]:
                     asked.report(f"{name}, {way}, {photons:g} photons: {found['value']:.2f} %")
                 if found is not None:
                     rows.append(found)
-    return {"rows": rows, "markdown": markdown(rows)}
+    return Made(rows)
 
 
-def _finished(path: Path, name: str, way: str, photons: float) -> dict[str, Any] | None:
+def _finished(path: Path, name: str, way: str, photons: float) -> Row | None:
     if not path.is_file():
         return None
-    found: dict[str, Any] = json.loads(path.read_text())
+    found: Row = json.loads(path.read_text())
     if way not in DIRECT:
         wanted = (recipe if way == "PANS" else light_recipe)(name, photons)
         return found if same_options(found["options"], wanted) else None
     return found if direct_recipe(name, way).items() <= found.items() else None
 
 
-def direct_recipe(name: str, way: str) -> dict[str, Any]:
+def direct_recipe(name: str, way: str) -> Row:
     """Return what direct imaging is decided with: which frames, and the posterior's floor or the network's passes over fresh noise."""
     if way == "posterior":
         return {"frames": "all", "floor": FLOOR}
     return {"frames": "all", "epochs": NETWORK_EPOCHS.get(name, NETWORK_EPOCHS_ELSE)}
 
 
-def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
+def _made(path: Path, task: Task, way: str, photons: float) -> Row:
     started = time.process_time()
     figures = _direct(task, way, photons) if way in DIRECT else _pans(task, way, photons)
     row = {"task": task.name, "way": way, "asked": photons, "cpu_seconds": time.process_time() - started, **figures}
@@ -124,7 +121,7 @@ def _made(path: Path, task: Task, way: str, photons: float) -> dict[str, Any]:
     return row
 
 
-def _pans(task: Task, way: str, photons: float) -> dict[str, Any]:
+def _pans(task: Task, way: str, photons: float) -> Row:
     if way == "PANS":
         options = recipe(task.name, photons)
         basis = basis_of(task.name, task, options)
@@ -136,7 +133,7 @@ def _pans(task: Task, way: str, photons: float) -> dict[str, Any]:
     return measure(task.name, task, trained) | {"options": plain_options(options)}
 
 
-def _direct(task: Task, way: str, photons: float) -> dict[str, Any]:
+def _direct(task: Task, way: str, photons: float) -> Row:
     frames = measure_frames(task, None)
     how = direct_recipe(task.name, way)
     if way == "posterior":
@@ -157,79 +154,52 @@ def _direct(task: Task, way: str, photons: float) -> dict[str, Any]:
     }
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """Return the page."""
-    lines = [
-        "# PANS against direct imaging at equal photons, on our generators",
-        "",
-        "SIMULATED on the profile `ideal`: shot noise alone, no dark counts, seed 0. Command: `pans reproduce equal-photons`. "
-        "PANS: d_f patterns, K = 1, "
-        "trained with the photons of the row as the budget, judged exactly over all click words (above "
-        f"{EXACT_FEATURES_MAX} patterns in 5 trials); `posterior` and `network` are "
-        f"{TRIALS} readings of all held-out frames, counted by perfect pixels. Photons are photoelectrons "
-        "**detected** per decision, averaged over the held-out objects.",
-        "",
-        "| task | photons asked | way | d_f | held-out % | first 200 % | trials | objects | clicks | photons | illumination | minutes |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-        *(_line(row) for row in sorted(rows, key=lambda r: (TASKS.index(r["task"]), r["asked"], WAYS.index(r["way"])))),
-        "",
-        *_says(rows),
-        "",
-        "The images are drawn by our generators (docs/TASKS.md), which were set with the paper's accuracies in view. **Equal "
-        "photons detected are not equal light.** The W of `PANS` is unconstrained, as in the paper: it dims a bright background "
-        "by interference before anything is detected, and may amplify what is left; for each photon that it detects of an event "
-        "that changes a frame's power by 1 % some hundred must reach it. `equal light` is the fair comparison for passive "
-        "sensing: the light that reaches its optics is the light of the camera's frame, W makes none, and `photons` is what it "
-        "detects of the N. The network is small and trained for minutes: a lower bound.",
-        "",
-        "Of `cells-3`, ten patterns reached 92.3 % at 10 photons and 94.1 % at 25, below the posterior (92.9 and 98.2 %): ten clicks "
-        "are then too few. Rows with more patterns were trained afterwards; how many was chosen on 6000 other objects of the "
-        "generator (data seed 101), for 25 photons among 32, 64 and 128 (97.8, 98.2 and 98.3 % there); `cells` has as many. "
-        "What PANS saves at few photons it there has to pay for in patterns.",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _line(row: dict[str, Any]) -> str:
-    features = row.get("options", {}).get("features", "-")
-    return (
-        f"| {row['task']} | {row['asked']:g} | {row['way']} | {features} | {row['value']:.2f} "
-        f"| {row['first_200']:.2f} | {row['spread_trials']:.2f} "
-        f"| {row['error_objects']:.2f} | {row['clicks']:.2f} | {row['photons']:.2f} | {row['illumination']:.0f} "
-        f"| {row['cpu_seconds'] / 60:.1f} |"
+def equal_tables(rows: Rows) -> list[Table]:
+    """Return every row, and how far ours is ahead of the better direct way at each level."""
+    columns = (
+        Column("task", "task"),
+        Column("photons asked", "asked", "g"),
+        Column("way", "way"),
+        Column("d_f", "options.features"),
+        Column("held-out %", "value", ".2f"),
+        Column("first 200 %", "first_200", ".2f"),
+        Column("trials", "spread_trials", ".2f"),
+        Column("objects", "error_objects", ".2f"),
+        Column("clicks", "clicks", ".2f"),
+        Column("photons", "photons", ".2f"),
+        Column("illumination", "illumination", ".0f"),
+        MINUTES,
     )
+    ordered = sorted(rows, key=lambda row: (TASKS.index(row["task"]), row["asked"], WAYS.index(row["way"])))
+    compared = [found for row in ordered if row["way"] not in DIRECT and (found := ahead(row, rows)) is not None]
+    leads = (
+        Column("task", "task"),
+        Column("photons asked", "asked", "g"),
+        Column("way", "way"),
+        Column("the better direct way", "beside"),
+        Column("ahead, points", "ahead", "+.2f"),
+        Column("standard error of both", "error", ".2f"),
+    )
+    return [Table(columns, ordered), Table(leads, compared, "## Ahead of the better direct way")]
 
 
-def _says(rows: list[dict[str, Any]]) -> list[str]:
-    """Where PANS is ahead of the better of the two, and where it is not; then the same at equal light."""
-    of = {(row["task"], row["asked"], row["way"]): row for row in rows}
-    lines = []
-    for way in ("PANS", "equal light"):
-        for name in TASKS:
-            levels = [n for n in PHOTONS if n < BOUND and (name, n, way) in of and (name, n, "posterior") in of]
-            behind = [words for n in levels if (words := _behind(of, name, n, way))]
-            if levels:
-                words = "ahead at every level measured" if not behind else f"**not ahead at {'; '.join(behind)}**"
-                level = [f"{n:g}" for n in levels if not _behind(of, name, n, way) and _level(of, name, n, way)]
-                words += f", at {', '.join(level)} by less than the standard error of its objects" if level else ""
-                without = [f"{n:g}" for n in levels if (name, n, "network") not in of]
-                missing = f" (no network at {', '.join(without)})" if without else ""
-                lines.append(f"- {name}{'' if way == 'PANS' else ', equal light'}: {words}{missing}")
-    return lines
+def ahead(row: Row, rows: Rows) -> Row | None:
+    """Return a row of ours with `beside` (the better direct way at its task and level), `ahead` in points, and `error`.
+
+    `error` is the standard error from having few objects, of both together. None where no direct way was measured.
+    """
+    there = [
+        other
+        for other in rows
+        if other["way"] in DIRECT and (other["task"], other["asked"]) == (row["task"], row["asked"])
+    ]
+    if not there:
+        return None
+    best = max(there, key=lambda other: float(other["value"]))
+    error = math.hypot(row["error_objects"], best["error_objects"])
+    return row | {"beside": best["way"], "ahead": row["value"] - best["value"], "error": error}
 
 
-def _level(of: dict[tuple[str, float, str], dict[str, Any]], name: str, n: float, way: str) -> bool:
-    """Whether what parts ours from the better direct way is less than the standard error of having few objects, of both together."""
-    ours = of[name, n, way]
-    best = max((of[name, n, other] for other in DIRECT if (name, n, other) in of), key=lambda row: row["value"])
-    return bool(abs(ours["value"] - best["value"]) < math.hypot(ours["error_objects"], best["error_objects"]))
-
-
-def _behind(of: dict[tuple[str, float, str], dict[str, Any]], name: str, n: float, way: str) -> str:
-    """The better of the direct ways beside ours, where ours is not ahead or takes more photons; else nothing."""
-    direct = max((of[name, n, other]["value"], other) for other in DIRECT if (name, n, other) in of)
-    ours = of[name, n, way]
-    if ours["value"] > direct[0] and ours["photons"] <= n:
-        return ""
-    return f"{n:g} photons ({ours['value']:.1f} % at {ours['photons']:.2f}, {direct[1]} {direct[0]:.1f} %)"
+PAGES = {
+    "equal-photons": Page("PANS against direct imaging at equal photons, on our generators", equal_page, equal_tables)
+}

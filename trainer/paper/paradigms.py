@@ -1,37 +1,38 @@
-"""The paper's comparison of paradigms: accuracy against photons, PANS beside the baselines (its Fig. 2E and the green curve's appendix).
+"""The paper's comparison of paradigms: accuracy against photons, PANS beside the alternatives (its Fig. 2E and appendices).
 
-Owns the pages `fig-2e` and `end-to-end`; the baselines are baseline_curves.py's, PANS' rows those of `pans reproduce fashion-mnist` in the
-same cache folder. SIMULATED; FashionMNIST.
+Owns the curves of the baselines over photons, their place in the cache folder, what is read off them, and the pages `fig-2e`,
+`end-to-end` and `compressive`. PANS' rows are those of `pans reproduce fashion-mnist` in the same cache folder. SIMULATED; FashionMNIST.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
 
-from pans.trainer.paper_tables import ACTIVE, E2E_FEW, E2E_MANY, PANS_FEW, SHOTS, ActiveRow
+import numpy as np
 
-from . import figures_baselines
+from pans.trainer.baselines.common import Decide, measure, run_trials, silent
+from pans.trainer.baselines.compressive import clean_mlp, patterns
+from pans.trainer.baselines.nets import EpochOfFit
+from pans.trainer.baselines.options import METHODS, BaselineOptions
+from pans.trainer.baselines.rows import baseline_rows
+from pans.trainer.tasks.registry import load_task
+
+from . import images, plots
 from .active import finished_row
-from .baseline_curves import (
-    CLEAN,
-    CURVES,
-    E2E_FEATURES,
-    ENVELOPE,
-    LEVELS,
-    POSTERIOR,
-    TASK,
-    Curve,
-    Rows,
-    accuracy_at,
-    curve_rows,
-    e2e_curve,
-    envelope,
-)
-from .page import Asked
+from .page import MINUTES, Asked, Column, Draw, Made, Page, Row, Rows, Table, accuracy, kept, light, percent
+from .tables import ACTIVE, FIRST, FIRST_OBJECTS, SHOTS
 
-PANS = "PANS"
-KEPT = (
+TASK = "fashion-mnist"
+LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 5e3, 1e4, 1e6)
+POSTERIOR_LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3)  # at more it is a nearest neighbour
+SENSING_LEVELS = (5.0, 100.0)
+NETWORK_LEVELS = (100.0, 1e3, 1e4)  # a training each
+E2E_FEATURES = (3, 4, 6, 8, 10, 16, 24, 32, 64)  # the paper's
+PANS, ENVELOPE = plots.PANS, plots.ENVELOPE
+MEASURED = (
     "accuracy_mean",
     "accuracy_std",
     "accuracy_se_objects",
@@ -41,254 +42,297 @@ KEPT = (
     "objects",
     "trials",
 )
-HEAD = "| way | d_f | photons asked | all 10 000 % | trials | objects | first 200 % | objects | clicks | photons | illumination |"
+
+FAMILY = "binary"  # of the page `compressive`
+FEATURES = (4, 16, 32, 64, 128, 256, 784)
+PHOTONS = (10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
+EPOCHS = 15
+TRIALS = 3
 
 
-def fig_2e_page(asked: Asked) -> dict[str, Any]:
-    """Return the page `fig-2e`."""
-    curves = {curve.way: curve_rows(asked, curve) for curve in CURVES}
-    curves[ENVELOPE] = envelope(_end_to_end(asked))
-    pans = []
+# ---- curves over photons ----
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One way over photon levels, on `TASK`."""
+
+    way: str
+    options: BaselineOptions
+    levels: tuple[float, ...]
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words of `pans baseline` that measure the curve alone, but for the task; the cache knows the curve by them."""
+        o = self.options
+        of_patterns = () if o.paradigm == "direct" else ("--features", str(o.features))
+        family = ("--patterns", o.patterns) if o.paradigm == "compressive" else ()
+        method = () if o.method == METHODS["e2e"][0] else ("--method", o.method)
+        epochs = () if o.epochs is None else ("--epochs", str(o.epochs))
+        photons = ("--photons", *(f"{level:g}" for level in self.levels))
+        return (o.paradigm, *of_patterns, *family, *method, *epochs, "--trials", str(o.trials), *photons)
+
+    def command(self) -> str:
+        """Return the command that measures the curve alone."""
+        return f"pans baseline {self.words[0]} --task {TASK} {' '.join(self.words[1:])}"
+
+
+def _sensing(family: str, method: str, trials: int) -> BaselineOptions:
+    return BaselineOptions("compressive", method, features=64, patterns=family, trials=trials)
+
+
+CLEAN = Curve("direct, network of clean frames", BaselineOptions("direct", "clean-cnn", epochs=2, trials=2), LEVELS)
+POSTERIOR = Curve("direct, exact posterior", BaselineOptions("direct", "bayes", trials=2), POSTERIOR_LEVELS)
+CURVES = (  # what takes longest is last
+    CLEAN,
+    POSTERIOR,
+    Curve("random binary, clean features", _sensing("binary", "clean-mlp", 5), LEVELS),
+    Curve("Hadamard, clean features", _sensing("hadamard", "clean-mlp", 5), LEVELS),
+    Curve("random binary, exact posterior", _sensing("binary", "bayes", 2), SENSING_LEVELS),
+    Curve("Hadamard, exact posterior", _sensing("hadamard", "bayes", 2), SENSING_LEVELS),
+    Curve("direct, network of each level", BaselineOptions("direct", "cnn", epochs=2, trials=2), NETWORK_LEVELS),
+)
+
+
+def e2e_curve(features: int) -> Curve:
+    """Return the curve of conventional end-to-end optimisation with that many patterns."""
+    return Curve(f"end-to-end, d_f = {features}", BaselineOptions("e2e", "qat", features=features, trials=5), LEVELS)
+
+
+def curve_rows(asked: Asked, curve: Curve) -> Rows:
+    """Return the rows of a curve, each with its `way`; none where it was not measured and nothing is to be made."""
+    name = "-".join(word.lstrip("-").replace(".", "") for word in curve.words[: curve.words.index("--photons")])
+
+    def make() -> Row:
+        rows = []
+        for row in baseline_rows(load_task(TASK, asked.data_dir), curve.options, curve.levels, silent):
+            asked.report(f"{curve.way}, {row['photons_asked']:g} photons: {100 * row['accuracy_mean']:.2f} %")
+            rows.append(row)
+        return {"rows": rows}
+
+    found = kept(asked.cache / f"baseline-{name}.json", {"words": curve.words}, make, collect=asked.collect)
+    if found is None:
+        asked.report(f"{curve.way}: not measured yet ({curve.command()})")
+        return []
+    return [{"way": curve.way, **row} for row in found["rows"]]
+
+
+def envelope(rows: Rows) -> Rows:
+    """Return the best of all rows at each photon level, as rows of the way `ENVELOPE`; chosen by all test objects."""
+    levels = sorted({row["photons_asked"] for row in rows})
+    best = [max((r for r in rows if r["photons_asked"] == n), key=lambda r: float(r["accuracy_mean"])) for n in levels]
+    return [row | {"way": ENVELOPE} for row in best]
+
+
+def accuracy_at(rows: Rows, place: float, of: str) -> float | None:
+    """Return a curve's accuracy where its figure `of` is `place`, by interpolation in its logarithm; None outside of the curve."""
+    known = sorted((float(row[of]), float(row["accuracy_mean"])) for row in rows)
+    if not known or not known[0][0] <= place <= known[-1][0]:
+        return None
+    return float(np.interp(math.log(place), [math.log(x) for x, _ in known], [y for _, y in known]))
+
+
+# ---- fig-2e and end-to-end ----
+
+
+def fig_2e_page(asked: Asked) -> Made:
+    """Return the rows of every curve, of the envelope of `end-to-end`, and of PANS."""
+    rows = [row for curve in CURVES for row in curve_rows(asked, curve)] + envelope(_end_to_end(asked))
+    one = str(SHOTS[0])
     for row in ACTIVE[TASK]:
         figures = finished_row(asked.cache, TASK, row)
         if figures is None:
             asked.report(f"{PANS} d_f = {row.features}: not trained yet (pans reproduce {TASK} --rows {row.features})")
-        else:
-            pans.append((row, figures))
-    rows = [_plain(row) for way in curves.values() for row in way] + [_plain(_pans_row(*each)) for each in pans]
-    drawn = partial(figures_baselines.paradigms, rows=rows, paper=ACTIVE[TASK])
-    return {"rows": rows, "markdown": fig_2e_markdown(rows), "pictures": {"": drawn}}
+            continue
+        facts = {"way": PANS, "features": row.features, "cpu_seconds": figures["cpu_seconds"]}
+        rows.append(figures["all"][one] | facts | {FIRST: figures[FIRST][one]})
+    rows = [_plain(row) for row in rows]
+    return Made(rows, {"": partial(plots.paradigms, rows=rows)})
 
 
-def end_to_end_page(asked: Asked) -> dict[str, Any]:
-    """Return the page `end-to-end`."""
+def end_to_end_page(asked: Asked) -> Made:
+    """Return the rows of every number of patterns, and of their envelope."""
     measured = _end_to_end(asked)
     rows = [_plain(row) for row in measured + envelope(measured)]
-    drawn = partial(figures_baselines.end_to_end, rows=rows)
-    return {"rows": rows, "markdown": end_to_end_markdown(rows), "pictures": {"": drawn}}
+    return Made(rows, {"": partial(plots.end_to_end, rows=rows)})
 
 
 def _end_to_end(asked: Asked) -> Rows:
     return [row for features in E2E_FEATURES if asked.wants(features) for row in curve_rows(asked, e2e_curve(features))]
 
 
-def _pans_row(row: ActiveRow, figures: dict[str, Any]) -> dict[str, Any]:
-    one = str(SHOTS[0])
-    return figures["all"][one] | {
-        "way": PANS,
-        "features": row.features,
-        "first_200": figures["first_200"][one],
-        "cpu_seconds": figures["cpu_seconds"],
-    }
-
-
-def _plain(row: dict[str, Any]) -> dict[str, Any]:
+def _plain(row: Row) -> Row:
     """Return what the page keeps of a row."""
     facts = {key: row[key] for key in ("way", "features", "photons_asked", "cpu_seconds", "seconds") if key in row}
-    return facts | {key: row[key] for key in KEPT} | {"first_200": {key: row["first_200"][key] for key in KEPT}}
+    return facts | {key: row[key] for key in MEASURED} | {FIRST: {key: row[FIRST][key] for key in MEASURED}}
 
 
-def table_lines(rows: Rows) -> list[str]:
-    """Return every row with its light and both spreads."""
-    lines = [HEAD, "| --- " * 11 + "|"]
+def _spread(row: Row) -> str:
+    return f"{100 * row['accuracy_std']:.2f}" + ("" if row["trials"] else " (exact)")
+
+
+_CELL = (
+    percent(f"first {FIRST_OBJECTS} %", f"{FIRST}.accuracy_mean"),
+    percent("objects", f"{FIRST}.accuracy_se_objects", ".1f"),
+)
+_EVERYTHING = (
+    Column("way", "way"),
+    Column("d_f", "features"),
+    Column("photons asked", "photons_asked", "g"),
+    percent("all 10 000 %", "accuracy_mean"),
+    Column("trials", _spread),
+    percent("objects", "accuracy_se_objects"),
+    *_CELL,
+    *light(),
+)
+
+
+def curve_tables(rows: Rows) -> list[Table]:
+    """Return accuracies of all test objects, one line per way and one column per photon level; and every row with its light."""
+    by: dict[str, Row] = {}
     for row in rows:
-        first = row["first_200"]
-        spread = f"{100 * row['accuracy_std']:.2f}" + ("" if row["trials"] else " (exact)")
-        asked_for = f"{row['photons_asked']:g}" if "photons_asked" in row else "-"
-        lines.append(
-            f"| {row['way']} | {row['features']} | {asked_for} | {100 * row['accuracy_mean']:.2f} | {spread} "
-            f"| {100 * row['accuracy_se_objects']:.2f} | {100 * first['accuracy_mean']:.2f} | {100 * first['accuracy_se_objects']:.1f} "
-            f"| {row['clicks_mean']:.2f} | {row['photons_mean']:.1f} | {row['illumination']:.0f} |"
-        )
-    return lines
-
-
-def matrix_lines(rows: Rows, ways: list[str]) -> list[str]:
-    """Return accuracies of all test objects, one line per way and one column per photon level."""
-    by = {(row["way"], row.get("photons_asked")): f"{100 * row['accuracy_mean']:.1f}" for row in rows}
-    levels = [level for level in LEVELS if any((way, level) in by for way in ways)]
-    lines = [f"| way | {' | '.join(f'{level:g}' for level in levels)} |", "| --- " * (len(levels) + 1) + "|"]
-    return lines + [f"| {way} | {' | '.join(by.get((way, level), '') for level in levels)} |" for way in ways]
-
-
-# ---- fig-2e ----
-
-
-def fig_2e_markdown(rows: Rows) -> str:
-    """Return the page `fig-2e`."""
-    ways = [curve.way for curve in CURVES] + [ENVELOPE]
-    missing = [f"{curve.way} (`{curve.command()}`)" for curve in CURVES if not _of(rows, curve.way)]
-    trained = [row["features"] for row in rows if row["way"] == PANS]
-    untrained = [str(row.features) for row in ACTIVE[TASK] if row.features not in trained]
-    if untrained:
-        missing.append(f"{PANS} d_f = {', '.join(untrained)} (`pans reproduce {TASK}`)")
-    lines = [
-        "# Accuracy against photons: PANS and the alternatives (paper, Fig. 2E)",
-        "",
-        "SIMULATED, FashionMNIST, K = 1, seed 0, ideal shot noise, no dark counts. Command: `pans reproduce fig-2e`; the rows "
-        "of PANS are "
-        f"those of `pans reproduce {TASK}` in the same cache folder (profile `ideal`, thresholded detectors: a click at most "
-        "each). **The "
-        "baselines count photons**: their detectors are perfect counters, which is more than PANS is given. All ways are trained on the "
-        "60 000 training objects and judged on all 10 000 test images; the first 200 are the paper's.",
-        "",
-        "![accuracy](fig-2e.png)",
-        "",
-        "Left, as the paper draws it: PANS over its **clicks** (first 200 images), the baselines over their photons. Middle: "
-        "everything over "
-        "the **photons detected**. Right: over the **illumination**, all light that is thrown at the object.",
-        "",
-        *([f"Not finished yet: {'; '.join(missing)}.", ""] if missing else []),
-        *_fig_2e_says(rows),
-        "",
-        "## All 10 000 test images, accuracy % over photons",
-        "",
-        *matrix_lines(rows, [way for way in ways if _of(rows, way)]),
-        "",
-        "## Everything",
-        "",
-        "`trials` is the spread of one trial, `objects` the error from having few images (of all, then of the first 200). "
-        "`clicks` are readouts with at least one "
-        "photon; `photons` are detected photoelectrons, mean over the test images.",
-        "",
-        *table_lines(rows),
-        "",
-        "## Commands of the curves",
-        "",
-        *(f"- {curve.way}: `{curve.command()}`" for curve in CURVES),
-        f"- {ENVELOPE}: the best of the nine of [end-to-end](end-to-end.md) at each level, chosen by these test images as the paper's is",
-        "",
+        if "photons_asked" in row:
+            by.setdefault(row["way"], {})[f"{row['photons_asked']:g}"] = row
+    levels = [f"{level:g}" for level in LEVELS if any(f"{level:g}" in found for found in by.values())]
+    columns = [Column("way", "way"), *(percent(level, f"{level}.accuracy_mean", ".1f") for level in levels)]
+    return [
+        Table(
+            columns,
+            [found | {"way": way} for way, found in by.items()],
+            "## All 10 000 test images, accuracy % over photons",
+        ),
+        Table(_EVERYTHING, rows, "## Everything"),
     ]
-    return "\n".join(lines)
 
 
-def _of(rows: Rows, way: str) -> Rows:
-    return [row for row in rows if row["way"] == way]
+def fig_2e_tables(rows: Rows) -> list[Table]:
+    """Return the tables of the curves, PANS beside two of them at its own photons and its own illumination, and the commands."""
 
+    def beside(way: str, of: str) -> Callable[[Row], float | None]:
+        curve = [row for row in rows if row["way"] == way]
+        return lambda row: accuracy_at(curve, row[of], of)
 
-def _fig_2e_says(rows: Rows) -> list[str]:
-    pans, best = _of(rows, PANS), _of(rows, ENVELOPE)
-    clean, posterior = (_of(rows, curve.way) for curve in (CLEAN, POSTERIOR))
-    lines = []
-    for name, of in (("photons", lambda row: row["photons_mean"]), ("illumination", lambda row: row["illumination"])):
-        for other, words in (
-            (posterior, "direct imaging decided by the exact posterior"),
-            (best, "the end-to-end envelope"),
-        ):
-            pairs = [(row, accuracy_at(other, of(row), of)) for row in pans]
-            known = [(row, there) for row, there in pairs if there is not None]
-            if not known:
-                continue
-            ahead = [_compared(row, there, of(row)) for row, there in known if row["accuracy_mean"] > there]
-            behind = [_compared(row, there, of(row)) for row, there in known if row["accuracy_mean"] <= there]
-            lines.append(
-                f"- **At equal {name}**, all test images, PANS is ahead of {words} at d_f = {', '.join(ahead) or 'none'}"
-                + (f"; behind at d_f = {', '.join(behind)}" if behind else "")
-                + " (d_f: ours against theirs, at so much)."
-            )
-    if clean and posterior:
-        both = [(a, b) for a, b in _same_level(clean, posterior) if a["photons_asked"] in (17.0, 100.0)]
-        told = [
-            f"{100 * a['accuracy_mean']:.1f} against {100 * b['accuracy_mean']:.1f} % at {a['photons_asked']:g} photons"
-            for a, b in both
+    columns = [Column("d_f", "features"), percent("PANS %", "accuracy_mean", ".1f")]
+    for header, of in (("photons", "photons_mean"), ("illumination", "illumination")):
+        columns.append(Column(header, of, ".0f"))
+        columns += [
+            percent(f"{words} there %", beside(way, of), ".1f")
+            for words, way in (("posterior", POSTERIOR.way), ("envelope", ENVELOPE))
         ]
-        lines.append(
-            "- The paper's blue curve is a network trained on clean frames. The exact posterior decides the same frames: "
-            f"{'; '.join(told)}. The gap in the paper's figure is mostly that network's."
-        )
-    levels = [(a["photons_asked"], a["accuracy_mean"] > b["accuracy_mean"]) for a, b in _same_level(best, posterior)]
-    if levels:
-        above = [f"{photons:g}" for photons, ahead in levels if ahead]
-        lines.append(
-            '- The paper: conventional end-to-end "substantially outperforms both direct imaging and compressive sensing". Ours is above '
-            f"direct imaging by the exact posterior at {', '.join(above) or 'none'} of the {len(levels)} levels up to "
-            f"{levels[-1][0]:g} photons."
-        )
-    if pans:
-        lines.append(
-            "- The rows of PANS are held to the paper's clicks, not to photons, and spend these freely. What patterns do with less light "
-            "is in [fig-2c](fig-2c.md), what a budget of photons does, on other tasks, in [equal-photons](equal-photons.md)."
-        )
-    return lines + _claims(rows)
+    pans = [row for row in rows if row["way"] == PANS]
+    compared = Table(
+        columns,
+        pans,
+        "## PANS beside direct imaging by the exact posterior and the end-to-end envelope, at equal light",
+    )
+    return [*curve_tables(rows), compared, _commands(CURVES)]
 
 
-def _same_level(some: Rows, others: Rows) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    return [(a, b) for a in some for b in others if a["photons_asked"] == b["photons_asked"]]
-
-
-def _compared(row: dict[str, Any], there: float, place: float) -> str:
-    return f"{row['features']} ({100 * row['accuracy_mean']:.1f} against {100 * there:.1f} % at {place:.0f})"
-
-
-def _claims(rows: Rows) -> list[str]:
-    """The paper's sentences about the end-to-end baseline, with ours."""
-    best = {row["photons_asked"]: 100 * row["accuracy_mean"] for row in _of(rows, ENVELOPE)}
-    if not best:
-        return []
-    (few, few_low, few_high), (many, many_value) = E2E_FEW, E2E_MANY
-    few_patterns = next(row["features"] for row in _of(rows, ENVELOPE) if row["photons_asked"] == few)
-    lines = [
-        f"- The paper: conventional end-to-end reaches only {few_low:g} to {few_high:g} % at about {few:g} photons. Ours: "
-        f"{best[few]:.1f} % (d_f = {few_patterns})"
-        + (
-            ", the same."
-            if few_low <= best[few] <= few_high
-            else ", which is more: few patterns do better there than many."
-            if best[few] > few_high
-            else ", which is less."
-        )
-        + f" The paper: about {many_value:g} % from {many:g} photons. Ours: {best[many]:.1f} % there."
+def end_to_end_tables(rows: Rows) -> list[Table]:
+    """Return the tables of the curves, of which patterns the envelope is, and the command of each curve."""
+    matrix, everything = curve_tables(rows)
+    best = [row for row in rows if row["way"] == ENVELOPE]
+    columns = (
+        Column("photons asked", "photons_asked", "g"),
+        Column("d_f", "features"),
+        percent("all 10 000 %", "accuracy_mean", ".1f"),
+    )
+    measured = [row for row in rows if row["way"] != ENVELOPE]
+    return [
+        matrix,
+        Table(columns, best, "## Patterns of the envelope"),
+        Table(everything.columns, measured, everything.heading),
+        _commands(tuple(map(e2e_curve, E2E_FEATURES))),
     ]
-    row = next((row for row in _of(rows, PANS) if row["features"] == 10), None)
-    if row is not None:
-        one = row["first_200"]
-        lines.append(
-            f'- The paper sets about {PANS_FEW[1]:g} % of PANS at about {PANS_FEW[0]:g} "photons" against that. These are '
-            f"clicks: our ten patterns have {one['clicks_mean']:.2f} clicks ({100 * one['accuracy_mean']:.1f} % of the first "
-            "200) and detect "
-            f"{one['photons_mean']:.0f} photons for them; the envelope has {best[30.0]:.1f} % at 30 photons."
-        )
-    return lines
 
 
-# ---- end-to-end ----
+def _commands(curves: tuple[Curve, ...]) -> Table:
+    rows = [{"way": curve.way, "command": f"`{curve.command()}`"} for curve in curves]
+    return Table((Column("way", "way"), Column("command", "command")), rows, "## Commands of the curves")
 
 
-def end_to_end_markdown(rows: Rows) -> str:
-    """Return the page `end-to-end`."""
-    curves = [e2e_curve(features) for features in E2E_FEATURES]
-    done = [curve for curve in curves if _of(rows, curve.way)]
-    missing: list[Curve] = [curve for curve in curves if curve not in done]
-    top = {row["photons_asked"]: row["features"] for row in _of(rows, ENVELOPE)}
-    lines = [
-        "# Conventional end-to-end optimisation, without photons in training",
-        "",
-        "SIMULATED, FashionMNIST, perfect photon counters, seed 0, all 10 000 test images. Command: `pans reproduce "
-        "end-to-end`. Patterns and "
-        "head (512 hidden units, as in PANS) are trained on expected values with quantisation-aware training (4 bits of a value, 5 of a "
-        "pattern: the paper names the technique and no numbers), 15 epochs each; then all light is scaled to the photons of the column.",
-        "",
-        "![accuracy](end-to-end.png)",
-        "",
-        *([f"Not finished yet: {'; '.join(f'`{curve.command()}`' for curve in missing)}.", ""] if missing else []),
-        *matrix_lines(rows, [curve.way for curve in done] + ([ENVELOPE] if top else [])),
-        "",
-        f"The envelope is of d_f = {', '.join(f'{d} (at {n:g})' for n, d in top.items())}; it is chosen by the test images, "
-        "as the paper's is."
-        if top
-        else "",
-        *_claims(rows),
-        "- More patterns share the light: at few photons few patterns are better, at many photons many.",
-        "",
-        "## Everything",
-        "",
-        "`trials` is the spread of one trial, `objects` the error from having few images (of all, then of the first 200).",
-        "",
-        *table_lines([row for row in rows if row["way"] != ENVELOPE]),
-        "",
-        "## Commands of the curves",
-        "",
-        *(f"- d_f = {features}: `{curve.command()}`" for features, curve in zip(E2E_FEATURES, curves)),
-        "",
-    ]
-    return "\n".join(lines)
+# ---- compressive sensing ----
+
+
+def compressive_page(asked: Asked) -> Made:
+    """Return one row per number of patterns, with its training on clean measurements and its cells."""
+    rows = []
+    for features in FEATURES:
+        if not asked.wants(features):
+            continue
+        made_with = {"family": FAMILY, "features": features, "photons": PHOTONS, "epochs": EPOCHS, "trials": TRIALS}
+        path = asked.cache / f"compressive-{FAMILY}-{features}.json"
+        found = kept(path, made_with, partial(sensed, asked, features), collect=asked.collect)
+        if found is None:
+            asked.report(f"compressive: d_f = {features} is not measured yet: pans reproduce compressive")
+        else:
+            rows.append(found)
+    pictures: dict[str, Draw] = {}
+    if rows:
+        pictures = {"": partial(images.sensing_map, rows=rows), "-training": partial(plots.sensing_training, rows=rows)}
+    return Made(rows, pictures)
+
+
+def sensed(asked: Asked, features: int) -> Row:
+    """Train on clean measurements by that many patterns, and judge at every photon level."""
+    task = load_task(TASK, asked.data_dir)
+    measurement = measure(task, patterns(FAMILY, features, task.image_shape, seed=0))
+    clean = measurement.photoelectrons(measurement.test, 1.0)
+    columns: dict[str, list[float]] = {"loss": [], "training": [], "held_out": []}
+
+    def watch(epoch: EpochOfFit, decide: Decide) -> None:
+        columns["loss"].append(round(epoch.loss, 4))
+        columns["training"].append(round(100 * epoch.accuracy, 2))
+        columns["held_out"].append(round(100 * float((decide(clean) == measurement.test_labels).mean()), 2))
+
+    at = clean_mlp(measurement, seed=0, epochs=EPOCHS, watch=watch)
+    cells = []
+    for photons in PHOTONS:
+        done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=TRIALS, seed=0)
+        cells.append({"photons_asked": photons, **asdict(done.measured()), FIRST: asdict(done.measured(FIRST_OBJECTS))})
+        asked.report(f"compressive, d_f = {features}, {photons:g} photons: {100 * cells[-1]['accuracy_mean']:.2f} %")
+    return {"features": features, "epochs": columns, "cells": cells}
+
+
+def compressive_tables(rows: Rows) -> list[Table]:
+    """Return the trainings, and every cell."""
+
+    def epoch(column: str, place: int) -> Column:
+        words = {"loss": "loss", "training": "training objects %", "held_out": "test images %"}[column]
+        form = ".3f" if column == "loss" else ".1f"
+        return Column(f"{words}, {'last' if place else 'first'} epoch", lambda row: row["epochs"][column][place], form)
+
+    places = (("loss", 0), ("loss", -1), ("training", -1), ("held_out", 0), ("held_out", -1))
+    trainings = (Column("d_f", "features"), *(epoch(*place) for place in places), MINUTES)
+    cells = (
+        Column("d_f", "features"),
+        Column("photons", "photons_mean", "g"),
+        *accuracy("all 10 000 %"),
+        *_CELL,
+        Column("clicks", "clicks_mean", ".1f"),
+        Column("illumination", "illumination", ".0f"),
+    )
+    every = [{"features": row["features"], **cell} for row in rows for cell in row["cells"]]
+    return [Table(trainings, rows, "## Training on clean measurements"), Table(cells, every, "## Every cell")]
+
+
+PAGES = {
+    "fig-2e": Page(
+        "Accuracy against photons: PANS and the alternatives (paper, Fig. 2E)",
+        fig_2e_page,
+        fig_2e_tables,
+        {"": "accuracy"},
+    ),
+    "end-to-end": Page(
+        "Conventional end-to-end optimisation, without photons in training",
+        end_to_end_page,
+        end_to_end_tables,
+        {"": "accuracy"},
+    ),
+    "compressive": Page(
+        "Compressive sensing: training, and accuracy over patterns and photons",
+        compressive_page,
+        compressive_tables,
+        {"": "accuracy over patterns and photons", "-training": "loss and accuracy over the epochs"},
+    ),
+}

@@ -1,10 +1,10 @@
 """The paper's tables of the other tasks: accuracy or SSIM over patterns and dark counts, ours beside the paper's.
 
-Owns the recipes and the measuring of a row; the command and the files are in reproduce.py. One model per row and dark count, trained with
-that dark count in the click law. SIMULATED on the profile `ideal`.
+Owns the measuring of a row, the pages, and a few pictures given back, kept beside a cell of the table of pictures; the recipes are in
+passive_recipes.py. One model per row and dark count, trained with that dark count in the click law. SIMULATED on the profile `ideal`.
 
 `mmf-mnist` and `mmf-mnist-image` are fully specified in the release and use its way for comparison (speckle *intensity*, normalised
-over a batch, fed as a real field to a real W), see task_mmf.py for what is unphysical in it.
+over a batch, fed as a real field to a real W), see tasks/mmf.py for what is unphysical in it.
 `barcode` is judged on all 1024 strings by their exact weights. The images of the other tasks are ours: equal difficulty is meant, equal
 figures are no proof.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,11 @@ from torch import Tensor
 
 from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.export.writer import export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.ssim import ssim
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, same_options
-from pans.trainer.paper_tables import PassiveRow
 from pans.trainer.tasks import barcode as task_barcode
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.anomaly_search import search
@@ -35,9 +35,10 @@ from pans.trainer.train.barcode_search import solve, solve_patterns
 from pans.trainer.train.data import CHUNK, encoder_input
 from pans.trainer.train.loop import Trained, train
 
+from . import images, plots
+from .page import MINUTES, Asked, Column, Draw, Made, Page, Row, Rows, Table, at
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
-from .passive_table import Done
-from .picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
+from .tables import PASSIVE, UNPRINTED, PassiveRow, table_of
 
 PROFILE = "ideal"
 TRIALS = 5
@@ -45,42 +46,38 @@ SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws
 SPECKLE = ("mmf-mnist", "mmf-mnist-image")  # in the release's way: images that no instrument sees
 
 
-def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> dict[str, Any] | None:
+def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> Row | None:
     """Return the figures of a model that was trained by the present recipe, or None."""
-    return _finished(_path(cache, name, row, dark, data_seed), recipe(name, row, dark))
+    return _finished(_path(cache, name, row.features, dark, data_seed), recipe(name, row, dark))
 
 
-def other_draws(cache: Path, name: str, row: PassiveRow, dark: float) -> list[dict[str, Any]]:
+def other_draws(cache: Path, name: str, row: PassiveRow, dark: float) -> Rows:
     """Return the figures of the same recipe on other draws of the generator (`data_seed` above 0), in the order of their seeds."""
-    paths = cache.glob(f"{_path(cache, name, row, dark).stem}-data*.json")
+    paths = cache.glob(f"{_path(cache, name, row.features, dark).stem}-data*.json")
     found = [figures for path in paths if (figures := _finished(path, recipe(name, row, dark))) is not None]
     return sorted(found, key=lambda figures: figures["data_seed"])
 
 
-def _finished(path: Path, options: Options) -> dict[str, Any] | None:
+def _finished(path: Path, options: Options) -> Row | None:
     if not path.is_file():
         return None
-    found: dict[str, Any] = json.loads(path.read_text())
+    found: Row = json.loads(path.read_text())
     return found if same_options(found["options"], options) else None
 
 
-def _path(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> Path:
-    return cache / (f"{name}-{row.features}-{dark:g}" + (f"-data{data_seed}" if data_seed else "") + ".json")
+def _path(cache: Path, name: str, features: int, dark: float, data_seed: int = 0) -> Path:
+    return cache / (f"{name}-{features}-{dark:g}" + (f"-data{data_seed}" if data_seed else "") + ".json")
 
 
-def make_cell(
-    cache: Path,
-    name: str,
-    row: PassiveRow,
-    dark: float,
-    data_dir: str | None,
-    report: Callable[[str], None],
-    data_seed: int = 0,
-) -> dict[str, Any]:
-    """Train and measure one model, on the draw `data_seed` of a drawn task; its figures go to the cache and are returned."""
+def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
+    """Train and measure one model of the table `asked.name`, on the draw `asked.data_seed` of a drawn task.
+
+    Its figures go to the cache and are returned.
+    """
+    name, data_seed = asked.name, asked.data_seed
     options = recipe(name, row, dark)
-    path = _path(cache, name, row, dark, data_seed)
-    task, profile = load(name, data_dir, data_seed), load_profile(PROFILE)
+    path = _path(asked.cache, name, row.features, dark, data_seed)
+    task, profile = load(name, asked.data_dir, data_seed), load_profile(PROFILE)
     started = time.process_time()
     trained = _trained(name, task, profile, options)
     seconds = time.process_time() - started
@@ -97,7 +94,9 @@ def make_cell(
         best = solve_patterns(options, profile, "balanced")[0][0]
         figures["balanced"] = {"value": 100 * best.accuracy, "clicks": best.clicks}
     if task.target == "image":
-        keep_samples(path.with_suffix(".npz"), _samples(task, trained))
+        objects = first_of_each_class(task.test)
+        p = click_probability(light_of(task, objects, trained), trained.law)
+        keep_samples(path.with_suffix(".npz"), take_samples(trained.head, p, objects))
     if name not in SPECKLE:  # what a bundle looks at must be what the task shows
         provenance = {
             "task_argument": TASKS.get(name, name),
@@ -108,7 +107,7 @@ def make_cell(
         title = f"{name}-{row.features}-dark{dark:g}"
         exported = export_trained(path.with_suffix(".pans"), trained, task, profile, name=title, provenance=provenance)
         figures |= {"sha256": exported.sha256, "score_difference": exported.score_difference}
-    report(f"{name} d_f={row.features} dark={dark:g}: {figures['value']:.3f} at {figures['clicks']:.2f} clicks")
+    asked.report(f"{name} d_f={row.features} dark={dark:g}: {figures['value']:.3f} at {figures['clicks']:.2f} clicks")
     replace_file(path, json.dumps(figures, indent=1).encode())
     return figures
 
@@ -121,7 +120,7 @@ def _trained(name: str, task: Task, profile: Profile, options: Options) -> Train
     return train(task, profile, options, basis=basis_of(name, task, options))
 
 
-def measure(name: str, task: Task, trained: Trained) -> dict[str, Any]:
+def measure(name: str, task: Task, trained: Trained) -> Row:
     """Return accuracy in % (or SSIM), its spreads, clicks, photons and illumination over the held-out objects."""
     objects, weights = task.test, np.full(len(task.test), 1 / len(task.test))
     if name == "barcode":  # all strings there are
@@ -145,24 +144,6 @@ def measure(name: str, task: Task, trained: Trained) -> dict[str, Any]:
             "photons": float((light.sum(dim=1) * share).sum()),
             "illumination": float(trained.encoder.illumination()),
         }
-
-
-def _samples(task: Task, trained: Trained) -> Samples:
-    """A few pictures given back, of held-out objects."""
-    objects = first_of_each_class(task.test)
-    return take_samples(trained.head, click_probability(light_of(task, objects, trained), trained.law), objects)
-
-
-def samples_of(cache: Path, name: str, done: Done) -> list[tuple[str, Samples]]:
-    """Return titles and samples of those cells of a table of pictures whose samples are drawn: the paper's choice, as far as it is done."""
-    kept = []
-    for row, figures in done:
-        path = _path(cache, name, row, figures["dark"]).with_suffix(".npz")
-        if (row.features, figures["dark"]) in SHOWN_CELLS and path.is_file():
-            kept.append(
-                (f"d_f = {row.features}, dark {figures['dark']:g}\nSSIM {figures['value']:.3f}", read_samples(path))
-            )
-    return kept
 
 
 def light_of(task: Task, objects: Objects, trained: Trained) -> Tensor:
@@ -200,3 +181,105 @@ def _similarity(trained: Trained, p: Tensor, images: Any) -> tuple[float, float 
     pictures = found.clamp(0, 1).reshape(wanted.shape)
     values = torch.cat([ssim(a, b) for a, b in zip(pictures.split(CHUNK), wanted.split(CHUNK))]).double()
     return float(values.mean()), None, values
+
+
+# ---- the pages ----
+
+
+def samples_of(cache: Path, name: str, rows: Rows) -> list[tuple[str, Samples]]:
+    """Return titles and samples of those rows of a table of pictures whose samples are drawn: the paper's choice, as far as it is done."""
+    kept = []
+    for row in rows:
+        path = _path(cache, name, row["features"], row["dark"]).with_suffix(".npz")
+        if (row["features"], row["dark"]) in SHOWN_CELLS and path.is_file():
+            kept.append((f"d_f = {row['features']}, dark {row['dark']:g}\nSSIM {row['value']:.3f}", read_samples(path)))
+    return kept
+
+
+def passive_page(asked: Asked) -> Made:
+    """Return one row per number of patterns and dark count; after them those of other draws of the generator."""
+    table, name = table_of(asked.name), asked.name
+    done, others = [], []
+    for row in table.rows:
+        for dark in table.dark:
+            if not asked.wants(row.features) or not (asked.dark is None or dark in asked.dark):
+                continue
+            figures = finished_cell(asked.cache, name, row, dark, asked.data_seed)
+            if figures is None and not asked.collect:
+                figures = make_cell(asked, row, dark)
+            if figures is not None:
+                done.append(figures)
+            if not asked.data_seed:
+                others += other_draws(asked.cache, name, row, dark)
+    pictures: dict[str, Draw] = {"": partial(plots.measure_over_patterns, name=name, rows=done)}
+    if samples := samples_of(asked.cache, name, done):
+        pictures["-pictures"] = partial(images.samples, name=name, cells=samples)
+    return Made(done + others, pictures)
+
+
+def passive_tables(name: str, rows: Rows) -> list[Table]:
+    """Return the table of draw 0, that of other draws, and of `barcode` that of classes equally likely."""
+    table = table_of(name)
+    digits = 3 if table.measure == "SSIM" else 2
+    of = {row.features: row for row in table.rows}
+
+    def paper(row: Row) -> float | None:
+        values = of[row["features"]].values
+        return values[table.dark.index(row["dark"])] if values else None
+
+    def ahead(of_ours: str) -> Column:
+        def points(row: Row) -> float | None:
+            printed = paper(row)
+            return None if printed is None else at(row, of_ours) - printed
+
+        return Column("ahead", points, f"+.{digits}f")
+
+    def clicks(row: Row) -> float | None:
+        printed = of[row["features"]]
+        return printed.clicks if printed.values and row["dark"] == table.dark[0] else None
+
+    beside = (Column("d_f", "features"), Column("dark", "dark", "g"), Column("paper", paper, f".{digits}f"))
+    columns = (
+        *beside,
+        Column("ours", "value", f".{digits}f"),
+        ahead("value"),
+        Column("first 200", "first_200", f".{digits}f"),
+        Column("trials", "spread_trials", ".2f"),
+        Column("objects", "error_objects", f".{digits}f"),
+        Column("clicks: paper", clicks, ".2f"),
+        Column("ours", "clicks", ".2f"),
+        Column("photons", "photons", ".1f"),
+        Column("illumination", "illumination", ".0f"),
+        MINUTES,
+    )
+    balanced = (
+        *beside,
+        Column("ours, balanced", "balanced.value", ".2f"),
+        ahead("balanced.value"),
+        Column("clicks", "balanced.clicks", ".2f"),
+    )
+    seed = Column("data seed", "data_seed")
+    found = [
+        Table(columns, [row for row in rows if not row.get("data_seed")]),
+        Table(
+            (*columns[:2], seed, *columns[2:]),
+            [row for row in rows if row.get("data_seed")],
+            "## Other draws of the generator",
+        ),
+        Table(balanced, [row for row in rows if "balanced" in row], "## Classes equally likely, without dark counts"),
+    ]
+    return found[:1] + [other for other in found[1:] if other.rows]
+
+
+PAGES = {
+    name: Page(
+        f"{name}: " + ("the paper's table" if name in PASSIVE else "no figures in the paper's tables"),
+        passive_page,
+        partial(passive_tables, name),
+        {
+            "": f"{table_of(name).measure} over the number of patterns",
+            "-pictures": "the first held-out digit of every class, its speckle, and three single shots each",
+        },
+    )
+    for name in (*PASSIVE, *UNPRINTED)
+}

@@ -17,9 +17,10 @@ from torch import Tensor
 from pans.runtime.bundle.incident import incident_field
 from pans.trainer.model.field_basis import discriminant_basis
 from pans.trainer.options import EXACT_FEATURES_MAX, Options
-from pans.trainer.paper_tables import CLICKS_TOLERANCE, PASSIVE, PassiveRow
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task, load_task
+
+from .tables import CLICKS_TOLERANCE, PASSIVE, PassiveRow
 
 CLICKS_AIM = 1.02
 CLICKS_AIM_MMF = 0.98  # the test images click a few percent more than the training images
@@ -80,7 +81,7 @@ def _recipe(name: str, row: PassiveRow, dark: float, conserving: bool) -> Option
 
 
 def _barcode(shared: Options, row: PassiveRow) -> Options:
-    """barcode_search.py: searches, not epochs."""
+    """train/barcode_search.py: searches, not epochs."""
     clicks = 0.995 * CLICKS_TOLERANCE * row.clicks
     return replace(shared, clicks=clicks, restarts=3 if row.features < 10 else 2, hidden=128)
 
@@ -101,7 +102,7 @@ def _field(name: str, shared: Options) -> Options:
 
 
 def _fiber(shared: Options, row: PassiveRow) -> Options:
-    """anomaly_search.py: many encoders at once."""
+    """train/anomaly_search.py: many encoders at once."""
     return replace(
         shared,
         clicks=CLICKS_AIM_FIBER * row.clicks,

@@ -12,16 +12,19 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options, check_options, plain_options, same_options
-from pans.trainer.paper import active, passive, passive_recipes
-from pans.trainer.paper.active_table import markdown
-from pans.trainer.paper.passive_table import markdown as passive_markdown
-from pans.trainer.paper_tables import ACTIVE, PASSIVE, ActiveRow
+from pans.trainer.paper import PAGES, active, passive, passive_recipes
+from pans.trainer.paper.page import Asked
+from pans.trainer.paper.tables import ACTIVE, PASSIVE, ActiveRow
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.data import TrainingData
 
 ROWS = [(name, row) for name, rows in ACTIVE.items() for row in rows]
 CELLS = [(name, row, dark) for name, table in PASSIVE.items() for row in table.rows for dark in table.dark]
+
+
+def quiet(name, cache):
+    return Asked(name, cache, report=lambda _line: None)
 
 
 def figures_of(row, accuracy, clicks, photons=20.0, direct=0.5):
@@ -88,16 +91,19 @@ def test_a_row_passes_only_within_the_papers_clicks():
     assert active.passed(row, figures_of(row, 0.62, 2.1), 5)[0] == pytest.approx(-1.0)
 
 
-def test_the_page_says_where_direct_imaging_is_better():
+def test_the_tables_put_ours_beside_the_papers_row_and_another_seed():
     row = ACTIVE["mnist"][0]
-    behind = markdown("mnist", [(row, figures_of(row, 0.6, 2.1, direct=0.8))])
-    assert "direct imaging is better** than the rows d_f = 4 (60.0 against 80.0 %" in behind
-    ahead = markdown("mnist", [(row, figures_of(row, 0.6, 2.1, direct=0.4))])
-    assert "every row is above noise-aware direct imaging" in ahead
-    assert "K = 1: 0 of 1 rows at or above" in ahead  # 60.00 is below 60.28
-    over = markdown("mnist", [(row, figures_of(row, 0.7, 2.5))])
-    assert "not at d_f = 4" in over
-    assert "K = 1: 0 of 1 rows" in over  # accuracy bought with clicks does not count
+    ours, other = figures_of(row, 0.6, 2.1, direct=0.8), figures_of(row, 0.61, 2.2)
+    seeds = [other | {"features": 4, "options": {"seed": 1000}}]
+    paper = {key: getattr(row, key) for key in ("features", "simulation", "experiment", "clicks", "illumination")}
+    first, whole, moved = active.active_tables([ours | {"features": 4, "paper": paper, "other_seeds": seeds}])
+    k = "60.00 / 60.00 / 60.00 / 60.00"
+    assert first.lines()[-1].startswith(
+        f"| 4 | 60.28 / 64.15 / 65.38 / 67.03 | 58.33 / 61.83 / 64.85 / 68.67 | {k} | -0.28 | 2.16"
+    )
+    assert whole.lines()[-1] == f"| 4 | {k} | 1.00 | 2.00 | 2.10 | 20.0 | 80.0 | exact | 1.0 |"
+    assert moved.lines()[-1].endswith("| 2.20 | +1.00 | +1.00 | +1.00 | +1.00 |")
+    assert len(active.active_tables([ours | {"features": 4, "paper": paper}])) == 2  # no other seed, no table of it
 
 
 def test_direct_imaging_is_interpolated_and_never_extrapolated():
@@ -128,8 +134,8 @@ def test_a_row_is_trained_measured_and_resumed(tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        active.make_row(tmp_path, "mnist", row, None, interrupt)
-    found = active.make_row(tmp_path, "mnist", row, None, lambda _line: None)
+        active.make_row(Asked("mnist", tmp_path, report=interrupt), row)
+    found = active.make_row(quiet("mnist", tmp_path), row)
     assert found["first_200"]["1"]["accuracy_mean"] > 0.5  # by chance a third
     assert found["first_200"]["1"]["objects"] == 200
     assert found["all"]["5"]["shots"] == 5
@@ -141,9 +147,7 @@ def test_a_row_is_trained_measured_and_resumed(tmp_path, monkeypatch):
 def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="needs the plot extra")
     assert main(["reproduce", "list", "--json"]) == 0
-    assert {"fashion-mnist", "mnist", "barcode", "estimators", "time"} <= set(
-        json.loads(capsys.readouterr().out)["rows"]
-    )
+    assert json.loads(capsys.readouterr().out)["rows"] == list(PAGES)
     words = ["reproduce", "mnist", "--collect", "--cache", str(tmp_path / "cache"), "--json"]
     assert main([*words, "-o", str(tmp_path / "out")]) == 0
     assert json.loads(capsys.readouterr().out)["rows"] == []
@@ -157,7 +161,7 @@ def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch)
     small = dataclasses.replace(passive.recipe("barcode", row, 0.01), restarts=1, hidden=8)
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     said = []
-    found = passive.make_cell(tmp_path, "barcode", row, 0.01, None, said.append)
+    found = passive.make_cell(Asked("barcode", tmp_path, report=said.append), row, 0.01)
     assert found["objects"] == 1024
     assert 50 < found["value"] < 90  # two classes, equally likely; three patterns cannot tell all strings apart
     assert found["error_objects"] == 0.0
@@ -165,8 +169,10 @@ def test_a_barcode_cell_is_judged_on_all_strings_and_kept(tmp_path, monkeypatch)
     assert len(said) == 1
     assert passive.finished_cell(tmp_path, "barcode", row, 0.01) == found
     assert passive.finished_cell(tmp_path, "barcode", row, 0.03) is None
-    page = passive_markdown("barcode", [(row, found)])
-    assert "of 1 measured cells (of 18 in the paper)" in page
+    (table,) = passive.passive_tables("barcode", [found])
+    assert table.lines()[-1].startswith(
+        f"| 3 | 0.01 | 69.16 | {found['value']:.2f} | {found['value'] - 69.16:+.2f} | - |"
+    )
 
 
 def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatch):
@@ -180,13 +186,13 @@ def test_pictures_given_back_are_judged_by_their_similarity(tmp_path, monkeypatc
     )
     monkeypatch.setattr(passive, "recipe", lambda *_: small)
     monkeypatch.setattr(passive, "load", lambda *_: task)
-    found = passive.make_cell(tmp_path, "mmf-mnist-image", row, 0.01, None, lambda _line: None)
+    found = passive.make_cell(quiet("mmf-mnist-image", tmp_path), row, 0.01)
     assert found["spread_trials"] is None  # of one trial
-    ((title, samples),) = passive.samples_of(tmp_path, "mmf-mnist-image", [(row, found)])
+    ((title, samples),) = passive.samples_of(tmp_path, "mmf-mnist-image", [found])
     assert title.startswith("d_f = 4, dark 0.01")
     assert np.array_equal(samples.pictures, images[:1])  # all are of one class
     assert 0 < samples.clicks.max() <= 4
-    assert not passive.samples_of(tmp_path, "mmf-mnist-image", [(row, found | {"dark": 0.1})])
+    assert not passive.samples_of(tmp_path, "mmf-mnist-image", [found | {"dark": 0.1}])
     assert 0.2 < found["value"] < 1.0
     assert found["illumination"] == 0.0
     assert found["photons"] > 0

@@ -11,8 +11,8 @@ from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import check_options
 from pans.trainer.paper import equal, passive, passive_recipes
-from pans.trainer.paper.passive_table import markdown
-from pans.trainer.paper_tables import PASSIVE
+from pans.trainer.paper.page import Asked
+from pans.trainer.paper.tables import PASSIVE
 from pans.trainer.tasks.registry import draw_task
 
 ROW = PASSIVE["cells"].rows[0]
@@ -35,9 +35,10 @@ def small_and_quick(monkeypatch):
 
 
 def test_a_cell_of_another_draw_is_kept_apart_and_named(tmp_path):
-    first = passive.make_cell(tmp_path, "cells", ROW, 0.0, None, lambda _line: None)
-    tenth = passive.make_cell(tmp_path, "cells", ROW, 0.0, None, lambda _line: None, 10)
-    other = passive.make_cell(tmp_path, "cells", ROW, 0.0, None, lambda _line: None, 7)
+    def made(seed):
+        return passive.make_cell(Asked("cells", tmp_path, report=lambda _line: None, data_seed=seed), ROW, 0.0)
+
+    first, tenth, other = made(0), made(10), made(7)
     assert (first["data_seed"], other["data_seed"]) == (0, 7)
     assert first["clicks"] != other["clicks"]  # other objects
     assert passive.finished_cell(tmp_path, "cells", ROW, 0.0) == first
@@ -45,10 +46,12 @@ def test_a_cell_of_another_draw_is_kept_apart_and_named(tmp_path):
     assert passive.finished_cell(tmp_path, "cells", ROW, 0.0, 8) is None
     assert passive.other_draws(tmp_path, "cells", ROW, 0.0) == [other, tenth]  # in the order of the numbers
     assert passive.other_draws(tmp_path, "cells", ROW, 0.01) == []
-    page = markdown("cells", [(ROW, first)], [(ROW, other)])
-    assert f"d_f = 3, dark 0, seed 7: {other['value']:.2f} @ {other['clicks']:.2f} clicks" in page
-    assert "of 1 measured cells" in page  # the verdict counts one draw alone
-    assert "seed 7" not in markdown("cells", [(ROW, first)])
+    page = passive.passive_page(Asked("cells", tmp_path, rows=(3,), dark=(0.0,)))
+    assert page.rows == [first, other, tenth]
+    one, others = passive.passive_tables("cells", page.rows)
+    assert (one.rows, others.rows) == ([first], [other, tenth])  # the table is of one draw alone
+    assert f"| 3 | 0 | 7 | 80.11 | {other['value']:.2f} |" in others.lines()[4]
+    assert len(passive.passive_tables("cells", [first])) == 1
 
 
 def test_the_command_trains_on_another_draw(tmp_path, capsys):

@@ -10,11 +10,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.options import Options
-from pans.trainer.paper import equal, information, sweeps
+from pans.trainer.paper import equal, information, passive, swept
 from pans.trainer.paper.page import Asked
 from pans.trainer.paper.passive_recipes import basis_of, recipe
-from pans.trainer.paper.passive_table import markdown as passive_page
-from pans.trainer.paper_tables import UNPRINTED
+from pans.trainer.paper.tables import UNPRINTED
 from pans.trainer.tasks.registry import Objects, Task
 
 
@@ -36,9 +35,9 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     monkeypatch.setattr(equal, "load_task", lambda *_: loaded.append(1) or columns(900, 6, 3))
     small = Options(features=3, alpha=0.0, photons=2.9, epochs=12, hidden=16, batch=50, front_rate=3e-2, head_rate=1e-2)
     monkeypatch.setattr(equal, "recipe", lambda *_: small)
-    assert equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"] == []
-    found = equal.equal_table(Asked("equal-photons", tmp_path, report=lambda _line: None))
-    rows = {row["way"]: row for row in found["rows"]}
+    assert equal.equal_page(Asked("equal-photons", tmp_path, collect=True)).rows == []
+    found = equal.equal_page(Asked("equal-photons", tmp_path, report=lambda _line: None))
+    rows = {row["way"]: row for row in found.rows}
     assert set(rows) == {"PANS", "posterior", "network"}  # light is made for an active task
     for way in ("posterior", "network"):
         assert rows[way]["photons"] == pytest.approx(3.0, rel=1e-5)
@@ -47,38 +46,32 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
     assert rows["PANS"]["illumination"] > 0
     assert {row["objects"] for row in rows.values()} == {450}  # all that were held out
     assert len(loaded) == 2
-    again = equal.equal_table(Asked("equal-photons", tmp_path))
-    assert json.dumps(again["rows"]) == json.dumps(found["rows"])
+    again = equal.equal_page(Asked("equal-photons", tmp_path))
+    assert json.dumps(again.rows) == json.dumps(found.rows)
     assert len(loaded) == 2
     for way, key in (("posterior", "frames"), ("posterior", "floor"), ("network", "epochs")):
         path = tmp_path / f"equal-columns-{way}-3.json"
         kept = path.read_text()
         path.write_text(json.dumps(json.loads(kept) | {key: "another"}))
-        left = {row["way"] for row in equal.equal_table(Asked("equal-photons", tmp_path, collect=True))["rows"]}
+        left = {row["way"] for row in equal.equal_page(Asked("equal-photons", tmp_path, collect=True)).rows}
         assert left == set(rows) - {way}  # made in another way, it counts as not made
         path.write_text(kept)
 
 
-def test_the_page_says_where_we_are_not_ahead():
+def test_ours_is_held_against_the_better_direct_way():
     def row(way, value, photons=3.0):
-        return {
-            "task": "fiber",
-            "way": way,
-            "asked": 3.0,
-            "value": value,
-            "first_200": value,
-            "photons": photons,
-        } | dict.fromkeys(("spread_trials", "error_objects", "clicks", "illumination", "cpu_seconds"), 1.0)
+        row = {"task": "fiber", "way": way, "asked": 3.0, "value": value, "first_200": value, "photons": photons}
+        return row | dict.fromkeys(("spread_trials", "error_objects", "clicks", "illumination", "cpu_seconds"), 1.0)
 
-    assert "ahead at every level measured (no network at 3)" in equal.markdown([row("PANS", 80), row("posterior", 70)])
-    behind = equal.markdown([row("PANS", 80), row("posterior", 70), row("network", 81)])
-    assert "**not ahead at 3 photons (80.0 % at 3.00, network 81.0 %)**" in behind
-    light = equal.markdown([row("equal light", 60, photons=1.0), row("posterior", 70)])
-    assert "- fiber, equal light: **not ahead at 3 photons (60.0 % at 1.00, posterior 70.0 %)**" in light
-    near = equal.markdown([row("PANS", 71.3), row("posterior", 70)])  # both with an error of 1 point: 1.41 together
-    assert "ahead at every level measured, at 3 by less than the standard error" in near
-    assert "by less than" not in equal.markdown([row("PANS", 71.5), row("posterior", 70)])
-    assert "not ahead" in equal.markdown([row("PANS", 80, photons=3.1), row("posterior", 70)])  # bought with photons
+    rows = [row("PANS", 80), row("equal light", 60, photons=1.0), row("posterior", 70), row("network", 81)]
+    assert equal.ahead(rows[0], rows[:1]) is None  # nothing to be held against
+    assert equal.ahead(rows[0], rows[:3])["ahead"] == 10
+    every, leads = equal.equal_tables(rows)
+    assert [line.split(" | ")[2] for line in every.lines()[2:]] == list(equal.WAYS)
+    assert leads.lines()[-2:] == [
+        "| fiber | 3 | PANS | network | -1.00 | 1.41 |",  # both with an error of 1 point: 1.41 together
+        "| fiber | 3 | equal light | network | -21.00 | 1.41 |",
+    ]
 
 
 def test_at_equal_light_no_light_is_made(monkeypatch):
@@ -95,14 +88,14 @@ def test_at_equal_light_no_light_is_made(monkeypatch):
 
 
 def test_light_shots_and_dark_counts_are_swept_each_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeps, "load_task", lambda *_: columns(600, 28, 10))
-    monkeypatch.setattr(sweeps, "SHOTS", (1, 2))
-    monkeypatch.setattr(sweeps, "ETAS", (0.01, 1.0, 100.0))
-    monkeypatch.setattr(sweeps, "DARKS", (1e-3, 1.0))
-    monkeypatch.setattr(sweeps, "TRIALS_OF_ALL", 2)
-    monkeypatch.setattr(sweeps, "TRIALS", {})
-    found = sweeps.sweep_table(Asked("sweeps", tmp_path, report=lambda _line: None))
-    of = {(row["sweep"], row["setting"]): row["all"] for row in found["rows"]}
+    monkeypatch.setattr(swept, "load_task", lambda *_: columns(600, 28, 10))
+    monkeypatch.setattr(swept, "SWEPT_SHOTS", (1, 2))
+    monkeypatch.setattr(swept, "ETAS", (0.01, 1.0, 100.0))
+    monkeypatch.setattr(swept, "DARKS", (1e-3, 1.0))
+    monkeypatch.setattr(swept, "TRIALS_OF_ALL", 2)
+    monkeypatch.setattr(swept, "TRIALS", {})
+    found = swept.sweeps_page(Asked("sweeps", tmp_path, report=lambda _line: None))
+    of = {(row["sweep"], row["setting"]): row["all"] for row in found.rows}
     one = of["eta", 1.0]
     assert of["K", 1.0] == one
     assert of["K", 2.0]["photons_mean"] == pytest.approx(2 * one["photons_mean"])
@@ -110,11 +103,14 @@ def test_light_shots_and_dark_counts_are_swept_each_alone(tmp_path, monkeypatch)
     assert of["eta", 0.01]["clicks_mean"] < 0.5 < 9 < of["eta", 100.0]["clicks_mean"]
     assert of["dark", 1e-3]["clicks_mean"] < of["dark", 1.0]["clicks_mean"] - 1
     assert of["dark", 1.0]["photons_mean"] == pytest.approx(one["photons_mean"])  # dark counts are no light
-    assert "## shots (K)" in found["markdown"]
+    tables = swept.sweeps_tables(found.rows)
+    assert [(table.heading, len(table.rows)) for table in tables] == [
+        ("## shots (K)", 2),
+        ("## all light times (eta)", 3),
+        ("## dark counts of an exposure (dark)", 2),
+    ]
     pytest.importorskip("matplotlib", reason="needs the plot extra")
-    from pans.trainer.paper.figures_light import sweeps as draw
-
-    draw(tmp_path / "s.png", found["rows"])
+    found.pictures[""](tmp_path / "s.png")
     assert (tmp_path / "s.png").stat().st_size > 5000
 
 
@@ -123,25 +119,26 @@ def test_information_of_frames_and_words_stands_at_the_same_photons(tmp_path, mo
     monkeypatch.setattr(information, "PHOTONS", (1.0, 30.0, 300.0))
     monkeypatch.setattr(information, "POSTERIOR_MAX", 30.0)
     monkeypatch.setattr(information, "FRAMES", 300)
-    found = information.information_table(Asked("fig-2c", tmp_path, report=lambda _line: None))
-    of = {(row["way"], row["photons"]): row for row in found["rows"]}
+    found = information.information_page(Asked("fig-2c", tmp_path, report=lambda _line: None))
+    of = {(row["way"], row["photons"]): row for row in found.rows}
     assert of["frames", 30.0]["bits"] > of["frames", 1.0]["bits"] > 0.05
     assert 0.1 < of["click words", 1.0]["bits"] < np.log2(10)
     assert of["click words", 1.0]["clicks"] < of["click words", 30.0]["clicks"] < 10
     assert "bits" not in of["frames", 300.0]
     assert of["frames", 300.0]["fisher"]["trace"] > of["frames", 1.0]["fisher"]["trace"]
     assert of["click words", 1.0]["clicks"] < 1
-    assert "what is proven at 30 photons" in found["markdown"]
+    (table,) = information.information_tables(found.rows)
+    assert table.lines()[4].startswith(
+        "| frames | 300 | - | - | - | - | "
+    )  # beyond the posterior: Fisher's ratios alone
     pytest.importorskip("matplotlib", reason="needs the plot extra")
-    from pans.trainer.paper.figures_light import information as draw
-
-    draw(tmp_path / "i.png", found["rows"])
+    found.pictures[""](tmp_path / "i.png")
     assert (tmp_path / "i.png").stat().st_size > 5000
 
 
-def test_tasks_without_printed_figures_have_pages_without_a_verdict():
-    row = UNPRINTED["nebula"].rows[0]
+def test_tasks_without_printed_figures_have_none_beside_ours():
     figures = {
+        "features": 2,
         "dark": 0.01,
         "value": 81.0,
         "first_200": 80.0,
@@ -149,9 +146,9 @@ def test_tasks_without_printed_figures_have_pages_without_a_verdict():
         "error_objects": 0.5,
         "clicks": 0.9,
     }
-    page = passive_page("nebula", [(row, figures | {"photons": 3.0, "illumination": 0.0, "cpu_seconds": 30.0})])
-    assert "| 2 | 0.01 | - | 81.00 | - | 80.00 |" in page
-    assert "at or above the paper" not in page
+    figures |= {"photons": 3.0, "illumination": 0.0, "cpu_seconds": 30.0}
+    (table,) = passive.passive_tables("nebula", [figures])
+    assert table.lines()[-1] == "| 2 | 0.01 | - | 81.00 | - | 80.00 | 0.30 | 0.50 | - | 0.90 | 3.0 | 0 | 0.5 |"
 
 
 def test_only_scenes_with_a_bright_background_start_in_a_basis():

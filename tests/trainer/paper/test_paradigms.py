@@ -19,14 +19,8 @@ from pans.trainer.baselines.compressive import clean_mlp, patterns
 from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.commands import baseline as cmd_baseline
 from pans.trainer.options import Options, check_options
-from pans.trainer.paper import alpha as reproduce_alpha
-from pans.trainer.paper import baseline_curves as curves
-from pans.trainer.paper import frames as reproduce_frames
-from pans.trainer.paper import paradigms as reproduce_paradigms
-from pans.trainer.paper import sensing as reproduce_sensing
-from pans.trainer.paper.cache import kept
-from pans.trainer.paper.page import Asked, write_page
-from pans.trainer.paper_tables import ACTIVE
+from pans.trainer.paper import Asked, alpha, page_of, paradigms, readouts, write_page
+from pans.trainer.paper.page import kept
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train import head_fit
 from pans.trainer.train.history import follow
@@ -83,7 +77,7 @@ def test_a_part_is_made_once_and_again_when_asked_for_otherwise(tmp_path):
 def test_every_curve_is_a_command_that_the_baselines_take():
     parser = argparse.ArgumentParser()
     cmd_baseline.BASELINE.configure(parser)
-    every = [*curves.CURVES, *(curves.e2e_curve(features) for features in curves.E2E_FEATURES)]
+    every = [*paradigms.CURVES, *(paradigms.e2e_curve(features) for features in paradigms.E2E_FEATURES)]
     assert len({curve.way for curve in every}) == len(every)
     for curve in every:
         args = parser.parse_args(curve.command().split()[2:])
@@ -93,18 +87,18 @@ def test_every_curve_is_a_command_that_the_baselines_take():
 
 
 def test_a_curve_is_measured_once_told_and_refused_to_none_when_collecting(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(curves, "load_task", lambda *_: task)
-    curve = curves.Curve("end-to-end, d_f = 3", BaselineOptions("e2e", "qat", 3, epochs=60, trials=2), (5.0, 1e4))
+    monkeypatch.setattr(paradigms, "load_task", lambda *_: task)
+    curve = paradigms.Curve("end-to-end, d_f = 3", BaselineOptions("e2e", "qat", 3, epochs=60, trials=2), (5.0, 1e4))
     page, said = asked(tmp_path)
-    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == []
+    assert paradigms.curve_rows(dataclasses.replace(page, collect=True), curve) == []
     assert curve.command() in said[0]
-    few, many = curves.curve_rows(page, curve)
+    few, many = paradigms.curve_rows(page, curve)
     assert few["photons_asked"] == 5
     assert few["photons_mean"] == pytest.approx(5, rel=1e-5)
     assert few["accuracy_mean"] < many["accuracy_mean"]
     assert many["features"] == 3
     assert len(said) == 3
-    assert curves.curve_rows(dataclasses.replace(page, collect=True), curve) == [few, many]
+    assert paradigms.curve_rows(dataclasses.replace(page, collect=True), curve) == [few, many]
 
 
 def row(way, photons, accuracy, features=10, **more):
@@ -115,68 +109,57 @@ def row(way, photons, accuracy, features=10, **more):
 
 def test_the_envelope_is_the_best_at_each_level():
     rows = [row("a", 5.0, 0.3, 3), row("b", 5.0, 0.2, 32), row("a", 100.0, 0.6, 3), row("b", 100.0, 0.8, 32)]
-    best = curves.envelope(rows)
+    best = paradigms.envelope(rows)
     assert [(r["photons_asked"], r["accuracy_mean"], r["features"]) for r in best] == [(5.0, 0.3, 3), (100.0, 0.8, 32)]
-    assert {r["way"] for r in best} == {curves.ENVELOPE}
+    assert {r["way"] for r in best} == {paradigms.ENVELOPE}
 
 
 def test_curves_are_read_between_their_ends_only():
     rows = [row("a", 10.0, 0.4), row("a", 1000.0, 0.8)]
-    at = partial(curves.accuracy_at, rows, of=lambda r: r["photons_mean"])
+    at = partial(paradigms.accuracy_at, rows, of="photons_mean")
     assert at(100.0) == pytest.approx(0.6)
     assert at(10.0) == pytest.approx(0.4)
     assert at(9.0) is None
     assert at(1001.0) is None
-    assert curves.accuracy_at([], 5.0, lambda r: r["photons_mean"]) is None
+    assert paradigms.accuracy_at([], 5.0, "photons_mean") is None
 
 
-def test_the_page_tells_clicks_from_photons_and_who_is_ahead(tmp_path):
-    posterior = curves.POSTERIOR.way
+def test_pans_stands_beside_the_others_at_its_own_light():
+    posterior = paradigms.POSTERIOR.way
     direct = [row(posterior, n, a, 784) for n, a in ((10.0, 0.5), (1000.0, 0.9))]
-    best = [row(curves.ENVELOPE, n, a, 6) for n, a in ((5.0, 0.3), (30.0, 0.45), (5000.0, 0.83))]
-    pans = [row("PANS", 20.0, 0.7, 4), row("PANS", 200.0, 0.72, 10)]
+    best = [row(paradigms.ENVELOPE, n, a, 6) for n, a in ((5.0, 0.3), (30.0, 0.45), (5000.0, 0.83))]
+    pans = [row("PANS", 20.0, 0.7, 4), row("PANS", 200.0, 0.72, 10), row("PANS", 2000.0, 0.9, 32)]
     for each in pans:
         del each["photons_asked"]
-    page = reproduce_paradigms.fig_2e_markdown(direct + best + pans)
-    assert (
-        "PANS is ahead of direct imaging decided by the exact posterior at d_f = 4 (70.0 against 56.0 % at 20)" in page
-    )
-    assert "behind at d_f = 10 (72.0 against 76.0 % at 200)" in page
-    assert "clicks: our ten patterns have 100.00 clicks" in page
-    assert "Ours: 30.0 % (d_f = 6), which is more: few patterns" in page
-    assert "Ours: 83.0 % there" in page
-    assert "PANS d_f = 3, 6, 16, 24, 32 (`pans reproduce fashion-mnist`)" in page  # what is missing, and how to make it
-    assert curves.CLEAN.command() in page
-    write_page(
-        tmp_path,
-        "fig-2e",
-        {
-            "rows": [],
-            "markdown": page,
-            "pictures": {
-                "": partial(
-                    reproduce_paradigms.figures_baselines.paradigms,
-                    rows=direct + best + pans,
-                    paper=ACTIVE["fashion-mnist"],
-                )
-            },
-        },
-    )
-    assert (tmp_path / "fig-2e.png").read_bytes().startswith(PNG)
+    matrix, everything, beside, commands = (table.lines() for table in paradigms.fig_2e_tables(direct + best + pans))
+    assert matrix[2:] == [
+        "| way | 5 | 10 | 30 | 1000 | 5000 |",
+        "| --- | --- | --- | --- | --- | --- |",
+        f"| {posterior} | - | 50.0 | - | 90.0 | - |",
+        f"| {paradigms.ENVELOPE} | 30.0 | - | 45.0 | - | 83.0 |",
+    ]
+    assert everything[-1].startswith("| PANS | 32 | - | 90.00 | 1.00 | 0.40 | 90.00 |")
+    assert [line.split(" | ")[1:5] for line in beside[4:]] == [
+        ["70.0", "20", "56.0", "41.6"],
+        ["72.0", "200", "76.0", "59.1"],
+        ["90.0", "2000", "-", "76.2"],  # beyond the curve
+    ]
+    assert f"| {paradigms.CLEAN.way} | `{paradigms.CLEAN.command()}` |" in commands
 
 
 def test_pages_of_curves_are_put_together_from_what_is_finished(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(curves, "load_task", lambda *_: task)
-    monkeypatch.setattr(curves, "LEVELS", (5.0, 30.0, 5000.0))
-    page, _ = asked(tmp_path / "cache", rows=(3,))
-    made = reproduce_paradigms.end_to_end_page(page)
-    assert [r["way"] for r in made["rows"]] == ["end-to-end, d_f = 3"] * 3 + [curves.ENVELOPE] * 3
-    assert "--features 64" in made["markdown"].split("Not finished yet")[1].split("\n")[0]
-    write_page(tmp_path, "end-to-end", made)
+    monkeypatch.setattr(paradigms, "load_task", lambda *_: task)
+    monkeypatch.setattr(paradigms, "LEVELS", (5.0, 30.0, 5000.0))
+    page, said = asked(tmp_path / "cache", rows=(3,))
+    made = paradigms.end_to_end_page(page)
+    assert [r["way"] for r in made.rows] == ["end-to-end, d_f = 3"] * 3 + [paradigms.ENVELOPE] * 3
+    write_page(tmp_path, "end-to-end", page_of("end-to-end"), made)
     assert (tmp_path / "end-to-end.png").read_bytes().startswith(PNG)
-    collected = reproduce_paradigms.fig_2e_page(dataclasses.replace(page, collect=True))
-    assert [r["way"] for r in collected["rows"]] == [curves.ENVELOPE] * 3
-    assert collected["rows"][0]["first_200"]["objects"] == 200
+    collected = paradigms.fig_2e_page(dataclasses.replace(page, collect=True))
+    assert [r["way"] for r in collected.rows] == [paradigms.ENVELOPE] * 3
+    assert collected.rows[0]["first_200"]["objects"] == 200
+    assert any(paradigms.CLEAN.command() in line for line in said)  # what is missing, and how to make it
+    assert "PANS d_f = 32: not trained yet (pans reproduce fashion-mnist --rows 32)" in said
 
 
 # ---- compressive sensing ----
@@ -197,56 +180,50 @@ def test_watching_a_training_changes_nothing(task):
 
 
 def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduce_sensing, "load_task", lambda *_: task)
-    monkeypatch.setattr(reproduce_sensing, "FEATURES", (4, 16))
-    monkeypatch.setattr(reproduce_sensing, "EPOCHS", 30)
+    monkeypatch.setattr(paradigms, "load_task", lambda *_: task)
+    monkeypatch.setattr(paradigms, "FEATURES", (4, 16))
+    monkeypatch.setattr(paradigms, "EPOCHS", 30)
     page, said = asked(tmp_path / "cache")
-    made = reproduce_sensing.compressive_page(page)
-    sixteen = made["rows"][1]
+    made = paradigms.compressive_page(page)
+    sixteen = made.rows[1]
     assert sixteen["epochs"]["held_out"][-1] > 80  # by chance 33
     assert len(sixteen["epochs"]["loss"]) == 30
     accuracies = [cell["accuracy_mean"] for cell in sixteen["cells"]]
     assert accuracies[0] < 0.6 < accuracies[-1]
-    assert sum(line.startswith("compressive") for line in said) == 2 * len(reproduce_sensing.PHOTONS)
-    again = reproduce_sensing.compressive_page(dataclasses.replace(page, collect=True))
-    assert again["rows"] == made["rows"]
-    write_page(tmp_path, "compressive", made)
+    assert sum(line.startswith("compressive") for line in said) == 2 * len(paradigms.PHOTONS)
+    again = paradigms.compressive_page(dataclasses.replace(page, collect=True))
+    assert again.rows == made.rows
+    write_page(tmp_path, "compressive", page_of("compressive"), made)
     assert {path.name for path in tmp_path.iterdir()} >= {
         "compressive.png",
         "compressive-training.png",
         "compressive.json",
     }
-    partly = reproduce_sensing.compressive_page(dataclasses.replace(page, rows=(4,)))
-    assert "Not finished yet (`pans reproduce compressive`): d_f = 16." in partly["markdown"]
+    (tmp_path / "cache" / "compressive-binary-16.json").unlink()
+    partly = paradigms.compressive_page(dataclasses.replace(page, collect=True))
+    assert [one["features"] for one in partly.rows] == [4]
+    assert said[-1] == "compressive: d_f = 16 is not measured yet: pans reproduce compressive"
 
 
 # ---- frames ----
 
 
-def test_neighbours_agree_where_classes_lie_apart():
-    rng = np.random.default_rng(0)
-    labels = np.repeat([0, 1], 40)
-    mixed = rng.normal(size=(80, 2))
-    assert reproduce_frames.neighbours_agree(mixed + 100 * labels[:, None], labels) == 1.0
-    assert 0.2 < reproduce_frames.neighbours_agree(mixed, labels) < 0.8
-
-
 def test_frames_are_drawn_mapped_and_judged(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduce_frames, "load_task", lambda *_: task)
-    monkeypatch.setattr(reproduce_frames, "OBJECTS", 120)
+    monkeypatch.setattr(readouts, "load_task", lambda *_: task)
+    monkeypatch.setattr(readouts, "MAPPED_FRAMES", 120)
     page, _ = asked(tmp_path / "cache")
-    made = reproduce_frames.frames_page(page)
-    many, *_, few = made["rows"]
+    made = readouts.frames_page(page)
+    many, *_, few = made.rows
     assert many["neighbours"] > 0.9
     assert few["on_the_map"]["photons_mean"] < 20
     assert few["on_the_map"]["objects"] == 120
     assert few["on_the_map"]["accuracy_mean"] > 0.5  # the posterior sees what the map does not
-    frames = reproduce_frames.drawn_frames(task)
-    assert [drawn.shape for drawn in frames.values()] == [(3, draws, 6, 6) for draws in reproduce_frames.SHOWN.values()]
+    frames = readouts.drawn_frames(task)
+    assert [drawn.shape for drawn in frames.values()] == [(3, draws, 6, 6) for draws in readouts.SHOWN.values()]
     assert frames[1e3].sum() / 9 == pytest.approx(
         1000, rel=0.3
     )  # three objects, three draws; some are brighter than others
-    write_page(tmp_path, "direct-frames", made)
+    write_page(tmp_path, "direct-frames", page_of("direct-frames"), made)
     assert (tmp_path / "direct-frames-map.png").read_bytes().startswith(PNG)
     assert (tmp_path / "direct-frames.png").read_bytes().startswith(PNG)
 
@@ -282,22 +259,22 @@ def test_a_followed_training_ends_where_an_ordinary_one_does(task):
 
 
 def test_the_recipes_of_the_courses_can_be_trained():
-    for features in reproduce_alpha.FEATURES:
-        for alpha in reproduce_alpha.ALPHAS:
-            check_options(reproduce_alpha.recipe(features, alpha), load_profile("ideal"))
-    assert reproduce_alpha.STAGES[-1] == reproduce_alpha.EPOCHS
-    assert all(a < b for a, b in pairwise(reproduce_alpha.STAGES))
+    for features in alpha.FEATURES:
+        for weight in alpha.ALPHAS:
+            check_options(alpha.recipe(features, weight), load_profile("ideal"))
+    assert alpha.STAGES[-1] == alpha.EPOCHS
+    assert all(a < b for a, b in pairwise(alpha.STAGES))
 
 
 def test_a_stage_tells_how_uneven_patterns_are():
     epochs = {key: [1.0, 2.0] for key in ("held_out", "held_out_first_200", "clicks", "photons", "illumination")}
-    even = reproduce_alpha.stage_row({"epochs": epochs}, 1, np.ones((2, 10)))
+    even = alpha.stage_row({"epochs": epochs}, 1, np.ones((2, 10)))
     assert even["peak"] == 1
     assert even["pixels_with_half_the_light"] == pytest.approx(0.5)
     assert even["pixels_below_a_tenth_of_the_mean"] == 0
     spot = np.zeros((2, 10))
     spot[0, 3] = 20.0
-    uneven = reproduce_alpha.stage_row({"epochs": epochs}, 2, spot)
+    uneven = alpha.stage_row({"epochs": epochs}, 2, spot)
     assert uneven["peak"] == 20
     assert uneven["means"] == [2.0, 0.0]
     assert uneven["pixels_with_half_the_light"] == pytest.approx(1 / 20)
@@ -306,35 +283,34 @@ def test_a_stage_tells_how_uneven_patterns_are():
 
 
 def test_growth_is_over_the_last_epochs():
-    light = [1.0] * 5 + [100.0] + [110.0] * reproduce_alpha.LATE
-    assert reproduce_alpha.growth({"epochs": {"illumination": light}}) == pytest.approx(10)
-    assert reproduce_alpha.growth({"epochs": {"illumination": [4.0, 5.0]}}) == pytest.approx(25)
+    light = [1.0] * 5 + [100.0] + [110.0] * alpha.LATE
+    assert alpha.growth({"epochs": {"illumination": light}}) == pytest.approx(10)
+    assert alpha.growth({"epochs": {"illumination": [4.0, 5.0]}}) == pytest.approx(25)
 
 
 @pytest.mark.usefixtures("short_fits")
 def test_pages_of_courses_are_made_once_and_collected(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduce_alpha, "load_task", lambda *_: task)
-    monkeypatch.setattr(reproduce_alpha, "FEATURES", (3,))
-    monkeypatch.setattr(reproduce_alpha, "ALPHAS", (0.0, 0.1))
-    monkeypatch.setattr(reproduce_alpha, "SHOWN", (3, 0.1))
-    monkeypatch.setattr(reproduce_alpha, "STAGES", (1, 6))
-    monkeypatch.setattr(reproduce_alpha, "recipe", lambda _, alpha: dataclasses.replace(SMALL, alpha=alpha))
-    page, _ = asked(tmp_path / "cache")
-    empty = reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))
-    assert empty["rows"] == []
-    assert "Not trained yet" in empty["markdown"]
-    made = reproduce_alpha.alpha_page(page)
-    free, held = made["rows"]
+    monkeypatch.setattr(alpha, "load_task", lambda *_: task)
+    monkeypatch.setattr(alpha, "FEATURES", (3,))
+    monkeypatch.setattr(alpha, "ALPHAS", (0.0, 0.1))
+    monkeypatch.setattr(alpha, "SHOWN", (3, 0.1))
+    monkeypatch.setattr(alpha, "STAGES", (1, 6))
+    monkeypatch.setattr(alpha, "recipe", lambda _, weight: dataclasses.replace(SMALL, alpha=weight))
+    page, said = asked(tmp_path / "cache")
+    assert alpha.evolution_page(dataclasses.replace(page, collect=True)).rows == []
+    assert said == ["not trained yet: pans reproduce evolution"]
+    made = alpha.alpha_page(page)
+    free, held = made.rows
     assert held["final"]["illumination"] < free["final"]["illumination"]
     assert free["final"]["objects"] == 240
-    write_page(tmp_path, "alpha", made)
+    write_page(tmp_path, "alpha", page_of("alpha"), made)
     assert (tmp_path / "alpha-3.png").read_bytes().startswith(PNG)
-    assert json.loads((tmp_path / "alpha.json").read_text())["rows"] == made["rows"]
-    evolution = reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))
-    assert [stage["epoch"] for stage in evolution["rows"]] == [1, 6]
-    assert np.mean(evolution["rows"][0]["means"]) == pytest.approx(1)
-    evolution["pictures"][""] = partial(evolution["pictures"][""], shape=task.image_shape)
-    write_page(tmp_path, "evolution", evolution)
+    assert json.loads((tmp_path / "alpha.json").read_text())["rows"] == made.rows
+    evolution = alpha.evolution_page(dataclasses.replace(page, collect=True))
+    assert [stage["epoch"] for stage in evolution.rows] == [1, 6]
+    assert np.mean(evolution.rows[0]["means"]) == pytest.approx(1)
+    drawn = {"": partial(evolution.pictures[""], shape=task.image_shape)}
+    write_page(tmp_path, "evolution", page_of("evolution"), dataclasses.replace(evolution, pictures=drawn))
     assert (tmp_path / "evolution.png").read_bytes().startswith(PNG)
     (tmp_path / "cache" / "alpha-3-0.1.npz").unlink()  # half a part is none
-    assert reproduce_alpha.evolution_page(dataclasses.replace(page, collect=True))["rows"] == []
+    assert alpha.evolution_page(dataclasses.replace(page, collect=True)).rows == []

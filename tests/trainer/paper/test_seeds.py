@@ -1,6 +1,7 @@
 """Reproduction of the active tables: other seeds of a row, restarts chosen by what they shall be good at, a fair race."""
 
 # ruff: noqa: E402  (what follows needs torch)
+import dataclasses
 import json
 
 import numpy as np
@@ -9,11 +10,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.options import Options, plain_options
-from pans.trainer.paper import active
-from pans.trainer.paper import time as race
-from pans.trainer.paper.active_table import markdown
+from pans.trainer.paper import active, training
 from pans.trainer.paper.page import Asked
-from pans.trainer.paper_tables import ACTIVE, ActiveRow
+from pans.trainer.paper.tables import ACTIVE, ActiveRow
 from pans.trainer.tasks.registry import Objects, Task
 
 ROW = ActiveRow(3, (40.0,) * 4, (40.0,) * 4, 1.5, 9.0)
@@ -37,21 +36,21 @@ def bars(monkeypatch):
 
 
 def test_a_row_is_trained_from_another_seed_too_and_both_are_kept(bars, tmp_path):
-    def said(_line):
-        pass
-
-    assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) is None
-    found = active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=False)
+    asked = Asked("mnist", tmp_path, report=lambda _line: None)
+    collecting = dataclasses.replace(asked, collect=True)
+    assert active.row_with_seeds(collecting, ROW) is None
+    found = active.row_with_seeds(asked, ROW)
     (other,) = found["other_seeds"]
     assert found["options"]["seed"] == 0
     assert other["options"]["seed"] == 1000
     assert found["sha256"] != other["sha256"]
     assert active.finished_row(tmp_path, "mnist", ROW, 1000) == json.loads(json.dumps(other))
-    assert active.row_with_seeds(tmp_path, "mnist", ROW, None, said, collect=True) == json.loads(json.dumps(found))
-    page = markdown("mnist", [(ROW, found)])
+    assert active.row_with_seeds(collecting, ROW) == json.loads(json.dumps(found))
+    paper = {"simulation": ROW.simulation, "experiment": ROW.experiment, "clicks": 1.5, "illumination": 9.0}
+    *_, seeds = active.active_tables([found | {"paper": paper}])
     moved = 100 * (other["all"]["5"]["accuracy_mean"] - found["all"]["5"]["accuracy_mean"])
-    assert "**Another seed** (1000) at d_f = 3" in page
-    assert f"and {moved:+.2f} on all" in page
+    assert seeds.lines()[-1].startswith("| 3 | 1000 | ")
+    assert seeds.lines()[-1].endswith(f" {moved:+.2f} |")
 
 
 def test_the_seeds_of_the_tables_are_not_restarts_of_one_another():
@@ -76,14 +75,16 @@ def test_the_papers_recipe_is_given_ten_times_the_seconds_of_all_our_tries(tmp_p
             numbers = ("accuracy", "best_accuracy", "accuracy_all", "clicks", "photons", "illumination")
             return figures | dict.fromkeys(numbers, 1.0)
 
-    monkeypatch.setattr(race, "_Judge", Judge)
-    found = race.time_table(Asked("time", tmp_path, rows=(32,), report=lambda _line: None))
+    monkeypatch.setattr(training, "_Judge", Judge)
+    asked = Asked("time", tmp_path, rows=(32,), report=lambda _line: None)
+    found = training.time_page(asked)
     *ours, (paper, cap) = given
     assert [options.epochs for options, _ in ours] == [8, 12, 18]  # from short to long, until one reaches the goal
     assert all((options.shots, options.mix, options.restarts) == (1, 0.0, 1) for options, _ in ours)
     assert paper.estimator == "ste"
     assert (paper.front_rate, paper.head_rate, paper.batch) == (1e-3, 1e-4, 128)
-    assert cap == pytest.approx(race.CAP * (8 + 12 + 18))
-    assert "more than 10.1 times, if the shorter schedules" in found["markdown"]
-    race.time_table(Asked("time", tmp_path, rows=(32,), report=lambda _line: None))
+    assert cap == pytest.approx(training.CAP * (8 + 12 + 18))
+    _, ratios = training.time_tables(found.rows)
+    assert ratios.lines()[-1] == "| 32 | more than 21.3 | more than 10.1 | 38 |"
+    training.time_page(asked)
     assert len(given) == 4  # kept

@@ -1,4 +1,4 @@
-"""Samples of pictures given back: whose they are, that they are kept as they were, and what is drawn of them."""
+"""Samples of pictures given back: whose they are, and that they are kept as they were."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from pans.trainer.model.heads import MlpHead  # noqa: E402
-from pans.trainer.paper.picture_samples import (  # noqa: E402
+from pans.trainer.evaluate.picture_samples import (  # noqa: E402
     PARTS,
     SAMPLES,
-    draw_samples,
     first_of_each_class,
     keep_samples,
     read_samples,
     take_samples,
 )
+from pans.trainer.model.heads import MlpHead  # noqa: E402
 from pans.trainer.tasks.registry import Objects  # noqa: E402
 
 D_F = 5
@@ -68,13 +67,3 @@ def test_they_are_read_as_they_were_kept(tmp_path):
         assert np.array_equal(getattr(found, part), getattr(samples, part))
         assert getattr(found, part).dtype == getattr(samples, part).dtype
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
-
-
-def test_every_model_adds_its_rows_to_the_figure(tmp_path):
-    image = pytest.importorskip("matplotlib.image")
-    samples = take_samples(head(), torch.full((3, D_F), 0.4, dtype=torch.float64), first_of_each_class(objects()))
-    heights = []
-    for n in (1, 2):
-        draw_samples(tmp_path / "a.png", "task", [(f"model {i}", samples) for i in range(n)])
-        heights.append(image.imread(tmp_path / "a.png").shape[0])
-    assert heights[1] / heights[0] == pytest.approx((2 + 2 * SAMPLES) / (2 + SAMPLES), rel=0.1)
