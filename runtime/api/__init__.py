@@ -14,11 +14,10 @@ packages, which have the rest (pans.runtime.bundle, .instrument, .core, .record,
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from pans.runtime import SHIPPED
 from pans.runtime import __version__ as __version__
 from pans.runtime.errors import UsageError
 from pans.runtime.lazy_names import lazy_names
@@ -125,6 +124,8 @@ def run(
     `profile` is by default the one that a `sim:` URL names. The result has `summary` (`accuracy`, `verdict`, ...; `as_json()` is what
     the command prints), `confusion`, and the paths `recording` and `report`. DeviceError and LinkError if the device cannot be armed.
     """
+    from tempfile import TemporaryDirectory
+
     from pans.runtime.commands.carry_out import run_job
     from pans.runtime.commands.job import Job
     from pans.runtime.commands.run import profile_of
@@ -151,7 +152,7 @@ def run(
 
 
 def _file_of(name: str | Path) -> Path:
-    shipped = Path(str(files("pans.runtime") / "shipped" / f"{name}.pans"))
+    shipped = SHIPPED / f"{name}.pans"
     return shipped if shipped.exists() and not Path(name).exists() else Path(name)
 
 

@@ -32,23 +32,6 @@ SOURCE = r"""
 #include <stdint.h>
 #include <math.h>
 
-void label_words(const uint8_t *restrict labels, const uint16_t *restrict words, uint8_t *restrict out, int64_t n) {
-    for (int64_t i = 0; i < n; i++) out[i] = labels[words[i]];
-}
-
-/* The loop for several shots as the kernel has it: eight rows a step, then dot products, two at a time; h hidden, c (even) outputs. */
-static void add8(const float *restrict w, const int64_t *rows, const float *f, int64_t n_rows, int64_t width, float *restrict out) {
-    for (int64_t r = 0; r < n_rows; r += 8) {
-        const float *a0 = w + rows[r] * width, *a1 = w + rows[r + 1] * width;
-        const float *a2 = w + rows[r + 2] * width, *a3 = w + rows[r + 3] * width;
-        const float *a4 = w + rows[r + 4] * width, *a5 = w + rows[r + 5] * width;
-        const float *a6 = w + rows[r + 6] * width, *a7 = w + rows[r + 7] * width;
-        float f0 = f[r], f1 = f[r + 1], f2 = f[r + 2], f3 = f[r + 3], f4 = f[r + 4], f5 = f[r + 5], f6 = f[r + 6], f7 = f[r + 7];
-        for (int64_t j = 0; j < width; j++)
-            out[j] += ((f0 * a0[j] + f1 * a1[j]) + (f2 * a2[j] + f3 * a3[j])) + ((f4 * a4[j] + f5 * a5[j]) + (f6 * a6[j] + f7 * a7[j]));
-    }
-}
-
 static void dots(const float *restrict w, const float *restrict x, int64_t n_in, int64_t n_out, float *restrict out) {
     for (int64_t k = 0; k < n_out; k += 2) {
         const float *p = w + k * n_in, *q = p + n_in;
@@ -65,25 +48,6 @@ static void win(const float *scores, int64_t classes, uint16_t *label, float *pr
     for (int64_t k = 0; k < classes; k++) total += exp((double)scores[k] - (double)scores[best]);
     *label = (uint16_t)best;
     *probability = (float)(1 / total);
-}
-
-/* counts int64 (n, d_f) -> labels and probabilities */
-void sparse_same(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
-                 const float *numbers, float *hidden, float *scores,
-                 int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
-    const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
-    for (int64_t i = 0; i < n; i++) {
-        int64_t fired = 0;
-        for (int64_t k = 0; k < d_f; k++)
-            if (counts[i * d_f + k]) { rows[fired] = k; factors[fired++] = (float)counts[i * d_f + k]; }
-        for (int64_t r = fired; r < (fired + 7) / 8 * 8; r++) { rows[r] = 0; factors[r] = 0; }
-        for (int64_t j = 0; j < h; j++) hidden[j] = b1[j];
-        add8(w1, rows, factors, fired, h, hidden);
-        for (int64_t j = 0; j < h; j++) hidden[j] = hidden[j] < 0 ? 0 : hidden[j];
-        for (int64_t j = 0; j < c; j++) scores[j] = b2[j];
-        dots(w2, hidden, h, c, scores);
-        win(scores, classes, labels + i, probabilities + i);
-    }
 }
 
 /* Single shots as the kernel has them: a row for each group of patterns, two groups at a time; `bits` patterns a group, at `tables`. */
@@ -118,7 +82,7 @@ void sparse_groups(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int
 /* The loop as one would write it down: a column at a time, then a row at a time. */
 void sparse_plain(const int64_t *counts, int64_t n, int64_t d_f, int64_t h, int64_t c, int64_t classes,
                   const float *numbers, float *restrict hidden, float *restrict scores,
-                  int64_t *rows, float *factors, uint16_t *labels, float *probabilities) {
+                  uint16_t *labels, float *probabilities) {
     const float *w1 = numbers, *w2 = numbers + d_f * h, *b1 = w2 + h * c, *b2 = b1 + h;
     for (int64_t i = 0; i < n; i++) {
         for (int64_t j = 0; j < h; j++) hidden[j] = b1[j];
@@ -144,21 +108,15 @@ class CLoops:
     library: ctypes.CDLL
     compiler: str
 
-    def label_words(self, labels: NDArray[np.uint8], words: NDArray[np.uint16], out: NDArray[np.uint8]) -> None:
-        """labels (2**d_f,), words (n,) -> out (n,)."""
-        self.library.label_words(_at(labels), _at(words), _at(out), ctypes.c_int64(len(words)))
-
     def sparse(self, loop: str, counts: NDArray[np.int64], meta: NDArray[np.int64], numbers: NDArray[np.float32],
                n_classes: int) -> NDArray[np.uint16]:  # fmt: skip
         """Decide single shots (n, d_f) with a head of two layers, padded as decide_mlp pads it; `loop` is one of the sparse_ functions."""
         n_features, hidden, columns = meta[1:4].tolist()
         labels, probabilities = np.empty(len(counts), np.uint16), np.empty(len(counts), np.float32)
-        work, rows = np.zeros((3, hidden + n_features + 8), np.float32), np.zeros(n_features + 8, np.int64)
-        groups = loop == "sparse_groups"
+        work = np.zeros((2, hidden + columns), np.float32)
         sizes = [ctypes.c_int64(n) for n in (len(counts), n_features, hidden, columns, n_classes)]
-        sizes += [ctypes.c_int64(n) for n in meta[-2:].tolist()] if groups else []
-        scratch = [] if groups else [rows, work[2]]
-        arrays = [_at(a) for a in (numbers, work[0], work[1], *scratch, labels, probabilities)]
+        sizes += [ctypes.c_int64(n) for n in meta[-2:].tolist()] if loop == "sparse_groups" else []
+        arrays = [_at(a) for a in (numbers, work[0], work[1], labels, probabilities)]
         getattr(self.library, loop)(_at(counts), *sizes, *arrays)
         return labels
 

@@ -6,41 +6,53 @@ decisions with the float64 decisions, and accuracy where the inputs have labels.
 
 from __future__ import annotations
 
-import importlib.resources
+import ctypes
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.layers import read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.kernels import float_run
 from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 
-from .alone import alone_row
 from .c import FLAGS, FREE_FLAGS, CLoops, c_loops
-from .rows import BenchOptions, Row, cpu_time, cpu_times, latencies_us, mark_pareto, per_item_ns, repeated
+from .rows import (
+    BenchOptions,
+    Row,
+    cpu_time,
+    cpu_times,
+    latencies_us,
+    mark_pareto,
+    per_item_ns,
+    percentiles_us,
+    repeated,
+)
 
 BATCH = 20_000
 PICTURES = 2_000
 SINGLE_CALLS = 20_000
 STREAM_REPEATS = 15
 CACHED_WORDS, MEMORY_WORDS = 1 << 15, 1 << 24  # 64 kB of 16-bit words, as a block of a stream; 32 to 128 MB
+CLOCK_MONOTONIC = 1  # on Linux: time.perf_counter_ns reads the same
 BACKENDS = ("table", "count-table", "sparse", "int8", "onnx", "int8-onnx", "float64")
 
 
 def bench_decide(options: BenchOptions) -> list[Row]:
     """Return the rows of every bundle (the shipped one unless others are given), then of streams."""
-    paths = options.bundles or (Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans")),)
+    paths = options.bundles or (options.first_bundle,)
     rows: list[Row] = []
     for number, path in enumerate(paths):
         bundle, _ = load_bundle(path)
@@ -159,11 +171,7 @@ def _c_rows(bundle: Bundle, decider: SparseDecider, counts: NDArray[np.int64]) -
         loops = c_loops(flags)
         if not isinstance(loops, CLoops):
             return [{"name": f"{bundle.name} C", "skipped": loops}]
-        for loop, word in (
-            ("sparse_groups", "the same loop"),
-            ("sparse_same", "row by row"),
-            ("sparse_plain", "a plain loop"),
-        ):
+        for loop, word in (("sparse_groups", "the same loop"), ("sparse_plain", "a plain loop")):
             if loop == "sparse_groups" and not decider.layers.meta[-2]:
                 continue
             spent = cpu_time(partial(loops.sparse, loop, counts, *decider.layers, decider.n_classes))
@@ -218,7 +226,6 @@ def _torch_rows(bundle: Bundle, counts: NDArray[np.int64], shots: int) -> list[R
 def _stream_rows(bundle: Bundle) -> list[Row]:
     """The table on streams of packed words against a copy of the same bytes, in the cache and out of memory."""
     decider = TableDecider(bundle)
-    loops = c_loops()
     rows: list[Row] = []
     dtypes: tuple[Any, ...] = (np.uint16, np.uint32, np.uint64)
     for dtype in dtypes:
@@ -231,10 +238,7 @@ def _stream_rows(bundle: Bundle) -> list[Row]:
                 partial(decider.decide_words, words, out),
                 partial(np.copyto, target, source),
             ]
-            in_c = dtype == np.uint16 and isinstance(loops, CLoops) and out.dtype == np.uint8
-            if in_c and isinstance(loops, CLoops):
-                works.append(partial(loops.label_words, decider.labels, words, np.empty_like(out)))
-            spent, copied, *others = cpu_times([repeated(work, inner) for work in works], STREAM_REPEATS)
+            spent, copied = cpu_times([repeated(work, inner) for work in works], STREAM_REPEATS)
             figures, copy_ns = per_item_ns(spent, n * inner), per_item_ns(copied, n * inner)
             exact = bool((out == decider.labels[words]).all())
             rows.append(
@@ -243,8 +247,50 @@ def _stream_rows(bundle: Bundle) -> list[Row]:
                  "of_copy_rate_median": round(copied.median_s / spent.median_s, 3), "changed_percent": 0.0 if exact else 100.0,
                  "checksum": int(out.sum(dtype=np.int64))}
             )  # fmt: skip
-            for other in others:
-                figures = per_item_ns(other, n * inner)
-                name = f"the same look-up in C, unchecked, {place}"
-                rows.append({"name": name, **figures, "rate": round(1e9 / figures["ns"])})
     return rows
+
+
+def alone_row(decider: SparseDecider, counts: NDArray[np.int64], shots: int) -> Row:
+    """Percentiles of single decisions on counts (n, d_f) in wall time, us, and `clock_us`, what reading the clock costs in each."""
+    run = _timed_calls()
+    if run is None:
+        return {"skipped": "this system has no clock_gettime"}
+    times, clock = np.zeros(len(counts), np.int64), np.zeros(len(counts), np.int64)
+    out = np.empty((1, decider.n_classes), np.float32), np.empty(1, np.uint16), np.empty(1, np.float32)
+    labels = np.zeros(len(counts), np.uint16)
+    spec = np.zeros(2, np.int64)
+    for _ in range(2):  # the first time compiles
+        run(counts, shots, *decider.layers, decider.room, *out, (spec, times, clock, labels))
+    return {
+        **percentiles_us(times),
+        "clock_us": percentiles_us(clock)["p50_us"],
+        "checksum": int(labels.sum(dtype=np.int64)),
+    }
+
+
+@cache
+def _timed_calls() -> Any:
+    """Compile a loop that times each call by itself; both clock readings are within its time, as where Python times a call."""
+    try:
+        gettime = ctypes.CDLL(None).clock_gettime
+    except (AttributeError, TypeError, OSError):
+        return None
+    gettime.argtypes, gettime.restype = [ctypes.c_int, ctypes.c_void_p], ctypes.c_int
+
+    @njit
+    def now_ns(spec):  # type: ignore[no-untyped-def]
+        gettime(CLOCK_MONOTONIC, spec.ctypes)
+        return spec[0] * 1_000_000_000 + spec[1]
+
+    @njit
+    def timed_calls(counts, shots, meta, numbers, room, scores, labels, probabilities, book):  # type: ignore[no-untyped-def]
+        spec, times, clock, decided = book
+        for i in range(counts.shape[0]):
+            start = now_ns(spec)
+            float_run(counts[i : i + 1], shots, meta, numbers, room, scores, labels, probabilities)
+            times[i] = now_ns(spec) - start
+            decided[i] = labels[0]
+            start = now_ns(spec)
+            clock[i] = now_ns(spec) - start
+
+    return timed_calls

@@ -8,7 +8,6 @@ allocates nothing.
 from __future__ import annotations
 
 import gc
-import importlib.resources
 import os
 import tempfile
 import time
@@ -48,12 +47,7 @@ MIB = 1 << 20
 def bench_ingest(options: BenchOptions) -> list[Row]:
     """Return the rows of decoding at several densities of zeros, then of the whole way for several windows."""
     rows: list[Row] = [_decode_row(zeros) for zeros in ZEROS] + [_plain_row(), _crc_row(), _copy_row()]
-    path = (
-        options.bundles[0]
-        if options.bundles
-        else Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans"))
-    )
-    bundle, _ = load_bundle(path)
+    bundle, _ = load_bundle(options.first_bundle)
     for shots, backend in ((1, "table"), (2, "auto"), (5, "auto"), (10, "auto"), (20, "auto")):
         if backend == "table" and bundle.table is None:
             backend = "auto"

@@ -8,7 +8,6 @@ took away. Every row is told on stderr as soon as it is there: forty minutes mus
 
 from __future__ import annotations
 
-import importlib.resources
 import os
 import subprocess
 import sys
@@ -41,12 +40,7 @@ RECOVER_S = 30.0
 
 def bench_loop(options: BenchOptions) -> list[Row]:
     """Return one row for each slot length, with and without asking for real-time privileges; each takes `seconds`."""
-    path = (
-        options.bundles[0]
-        if options.bundles
-        else Path(str(importlib.resources.files("pans.runtime") / "shipped" / "fashion10.pans"))
-    )
-    bundle, _ = load_bundle(path)
+    bundle, _ = load_bundle(options.first_bundle)
     runs = [(slot, realtime) for slot in SLOTS_US for realtime in (True, False)]
     rows = []
     with _busy(BUSY_PROCESSES if options.load else 0):

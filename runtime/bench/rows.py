@@ -13,7 +13,6 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -21,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
+from pans.runtime import SHIPPED
+from pans.runtime.report.figures import pyplot
 
 Row = dict[str, Any]
 REPEATS = 7
@@ -38,6 +38,11 @@ class BenchOptions:
     frames: int = 0
     load: bool = False
     quick: bool = False
+
+    @property
+    def first_bundle(self) -> Path:
+        """The first of `bundles`, by default the shipped one."""
+        return self.bundles[0] if self.bundles else SHIPPED / "fashion10.pans"
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,15 +164,7 @@ def mark_pareto(rows: list[Row], speed: str, error: str) -> None:
 
 def write_plot(rows: list[Row], path: Path) -> None:
     """Draw speed against error of the rows that have both (`ns`, `score_error`), and plain speed of the others."""
-    try:
-        mpl = import_module("matplotlib")  # an extra that only a picture needs
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            "--plot needs matplotlib, which is not installed", remedy="pip install 'pans-runtime[plot]'"
-        ) from error
-    mpl.use("Agg")
-    plt = import_module("matplotlib.pyplot")
-
+    plt = pyplot("--plot")
     points = [row for row in rows if "ns" in row and "score_error" in row]
     others = [row for row in rows if "rate" in row]
     figure, axes = plt.subplots(1, 2, figsize=(14, 6), layout="constrained")

@@ -6,7 +6,6 @@ itself fails is a finding too. `needed` tells what stops a run from what only ma
 
 from __future__ import annotations
 
-import importlib.resources
 import itertools
 import os
 import sys
@@ -17,6 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from pans.runtime import SHIPPED
 from pans.runtime.link.serial import FTDI_SLOW_MS, latency_timer_ms
 
 RULE = "70-pans.rules"
@@ -50,7 +50,7 @@ class PortState:
 
 def udev_rule() -> str:
     """Return the text of the shipped udev rule."""
-    return (importlib.resources.files("pans.runtime") / "shipped" / RULE).read_text(encoding="utf-8")
+    return (SHIPPED / RULE).read_text(encoding="utf-8")
 
 
 # -- ports -------------------------------------------------------------------------------------------------------------

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
-from pans.runtime.record import Recording, read_recording, replay
-from pans.runtime.record.parts import parts_in
-from pans.runtime.record.pictures import PictureLog
-from pans.runtime.record.replay import Replayed
-from pans.runtime.report.words import passage_words
+
+if TYPE_CHECKING:  # `pans replay --help` loads no kernels
+    from pans.runtime.record import Recording
+    from pans.runtime.record.pictures import PictureLog
+    from pans.runtime.record.replay import Replayed
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +32,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     if args.recording.is_dir():
         return _run_parts(args)
+    from pans.runtime.record.pictures import PictureLog
+
     pictures = PictureLog() if args.pictures or args.truth else None
     recording, found = _replayed(args, args.recording, pictures)
     identical = found.sha256 == recording.decisions_sha256
@@ -56,6 +57,8 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_parts(args: argparse.Namespace) -> int:
     """Replay each part of a recording by itself."""
+    from pans.runtime.record.parts import parts_in
+
     rows: list[dict[str, Any]] = []
     lines: list[str] = []
     for path in parts_in(args.recording):
@@ -71,6 +74,9 @@ def _run_parts(args: argparse.Namespace) -> int:
 
 
 def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None = None) -> tuple[Recording, Replayed]:
+    from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.record import read_recording, replay
+
     recording = read_recording(path)
     bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
     return recording, replay(recording, bundle, pictures)
@@ -81,6 +87,8 @@ def _figures(found: Replayed) -> dict[str, Any]:
 
 
 def _words(found: Replayed) -> list[str]:
+    from pans.runtime.report.words import passage_words
+
     return [] if found.passages is None else passage_words(found.passages)
 
 

@@ -7,11 +7,11 @@ shipped bundle, the shipped scene and the simulated instrument at real pace.
 from __future__ import annotations
 
 import argparse
-import importlib.resources
 import shlex
 import sys
 from pathlib import Path
 
+from pans.runtime import SHIPPED
 from pans.runtime.cli import Command
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError
@@ -85,9 +85,10 @@ def _run(args: argparse.Namespace) -> int:
 
 def _demo(args: argparse.Namespace) -> int:
     device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
-    bundle = Path(str(importlib.resources.files("pans.runtime") / "shipped" / DEMO_BUNDLE))
     decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials
-    return carry_out(args, _job(args, bundle, device, args.profile, args.out or Path("pans-demo"), decisions, None))
+    return carry_out(
+        args, _job(args, SHIPPED / DEMO_BUNDLE, device, args.profile, args.out or Path("pans-demo"), decisions, None)
+    )
 
 
 def _job(

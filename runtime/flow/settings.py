@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pans.runtime import SHIPPED
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.instrument.checked_toml import position_of, read_toml
 from pans.runtime.intervals import binomial_tail
 
-SHIPPED = Path(__file__).parent.parent / "shipped"
 KINDS = ("cells", "tape")
 MAX_RING = 1 << 18  # frames that are remembered
 BACKGROUND_BITS = 16  # after the point, of the clicks that the background gives per frame

@@ -23,24 +23,25 @@ CLASSES_MAX = 100
 LEAST_US = 0.1
 
 
-def _pyplot() -> Any:
+def pyplot(what: str = "a report") -> Any:
+    """Return matplotlib.pyplot, which draws into memory; UsageError where it is not installed."""
     try:
         importlib.import_module("matplotlib").use("Agg")
         return importlib.import_module("matplotlib.pyplot")
     except ModuleNotFoundError as error:
         raise UsageError(
-            "a report needs the package matplotlib, which is not installed", remedy="pip install 'pans-runtime[plot]'"
+            f"{what} needs the package matplotlib, which is not installed", remedy="pip install 'pans-runtime[plot]'"
         ) from error
 
 
 def _new(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
-    return _pyplot().subplots(rows, columns, figsize=(width, height), layout="constrained", squeeze=False)
+    return pyplot().subplots(rows, columns, figsize=(width, height), layout="constrained", squeeze=False)
 
 
 def _done(figure: Any, form: str = "svg") -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format=form, dpi=DPI, metadata={"Date": None} if form == "svg" else None)
-    _pyplot().close(figure)
+    pyplot().close(figure)
     return stream.getvalue()
 
 
@@ -93,8 +94,7 @@ def click_rates(seconds: F64, clicks: F64, exposures: F64, what: str) -> bytes:
     with np.errstate(invalid="ignore", divide="ignore"):
         rate = np.where(exposures > 0, clicks / exposures, np.nan)
         mean = clicks.sum(axis=0) / np.maximum(exposures.sum(axis=0), 1)
-    pyplot = _pyplot()
-    figure, (left, right) = pyplot.subplots(
+    figure, (left, right) = pyplot().subplots(
         1,
         2,
         figsize=(9.0, min(6.0, 2.2 + 0.16 * clicks.shape[1])),

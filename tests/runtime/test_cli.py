@@ -128,3 +128,9 @@ def test_version_and_help_of_the_installed_program() -> None:
         )
         assert done.returncode == 0
         assert wanted in done.stdout
+
+
+def test_the_list_of_commands_loads_none_of_them() -> None:
+    code = "import sys; from pans.runtime.cli import main; main([]); print('numpy' in sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr == "False\n"

@@ -11,9 +11,8 @@ from heads import head_bundle, onnx_chain, random_layers
 
 from pans.runtime.bench import decide as bench_decide
 from pans.runtime.bench import ingest as bench_ingest
-from pans.runtime.bench.alone import alone_row
 from pans.runtime.bench.c import FREE_FLAGS, CLoops, c_loops
-from pans.runtime.bench.decide import _bundle_rows
+from pans.runtime.bench.decide import _bundle_rows, alone_row
 from pans.runtime.bench.rows import (
     BenchOptions,
     Spent,
@@ -70,11 +69,8 @@ def test_c_decides_as_our_kernel_does() -> None:
     decider = SparseDecider(head_bundle(random_layers([10, 32, 7])))
     counts = np.random.default_rng(0).integers(0, 2, (200, 10))
     wanted = decider.decide_batch(counts, 1)
-    for loop in ("sparse_groups", "sparse_same", "sparse_plain"):
+    for loop in ("sparse_groups", "sparse_plain"):
         assert (loops.sparse(loop, counts, *decider.layers, 7) == wanted).all()
-    words, out = np.arange(256, dtype=np.uint16), np.zeros(256, np.uint8)
-    loops.label_words(np.arange(256, dtype=np.uint8)[::-1].copy(), words, out)
-    assert (out == 255 - words).all()
 
 
 def test_single_decisions_are_timed_and_right() -> None:
