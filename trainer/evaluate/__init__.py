@@ -4,8 +4,6 @@ Owns the sampled and the exact evaluation through a profile's optics and detecto
 It needs numpy and the runtime alone, and never trains. All figures are SIMULATED.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from pans.runtime.lazy_names import lazy_names
@@ -18,6 +16,13 @@ __all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "evaluate", "l
 
 __getattr__ = lazy_names(
     __name__,
-    {name: ".accuracy" for name in ("Light", "Measured", "MeasuredPictures", "light_of")}
-    | {name: ".held_out" for name in ("Conditions", "evaluate", "measure")},
+    {
+        "Light": ".accuracy",
+        "Measured": ".accuracy",
+        "MeasuredPictures": ".accuracy",
+        "light_of": ".accuracy",
+        "Conditions": ".held_out",
+        "evaluate": ".held_out",
+        "measure": ".held_out",
+    },
 )

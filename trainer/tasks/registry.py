@@ -102,6 +102,7 @@ _SPLIT_BY_POSITION = f"every {HOLD_OUT_EVERY}th object held out"
 _SPLIT_OF_FILE = "the test part of the data"
 _SPLIT_OF_SEED = "drawn from other random streams"
 FIBRE_TASKS = {"mmf-mnist": "class", "mmf-mnist-image": "image"}  # MNIST behind a multimode fibre: what is asked for
+TASKS = (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)  # the names of our own
 
 
 def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_seed: int = 0) -> Task:
@@ -140,13 +141,12 @@ def physical_encoder(task: Task) -> str:
 
 def task_names() -> tuple[str, ...]:
     """Return the names that `load_task` knows."""
-    return (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS, *sorted(_offered_tasks()))
+    return (*TASKS, *sorted(_offered_tasks()))
 
 
 def _offered_tasks() -> dict[str, EntryPoint]:
     """Tasks of other packages by name; a name of ours cannot be taken."""
-    ours = (*PUBLIC_SETS, *FIBRE_TASKS, *GENERATORS)
-    return {point.name: point for point in entry_points(group=GROUP) if point.name not in ours}
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in TASKS}
 
 
 def _checked_task(task: Task, name: str) -> Task:
