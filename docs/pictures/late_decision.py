@@ -17,7 +17,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import RunConfig, run_live
-from pans.runtime.timing import attribution as blame
+from pans.runtime.timing import attribution
 from pans.runtime.timing.attribution import Verdict
 from pans.runtime.timing.evidence import IDLE, OVERSLEPT, Facts
 
@@ -33,7 +33,7 @@ MS = 1e6
 def witnessed(faults: str) -> tuple[Facts, Verdict]:
     """Return what was known about the first late decision of a run in virtual time, and the verdict."""
     heard: list[tuple[Facts, Verdict]] = []
-    judge = blame.judge
+    judge = attribution.judge
 
     def listen(facts: Facts) -> Verdict:
         verdict = judge(facts)
@@ -43,13 +43,13 @@ def witnessed(faults: str) -> tuple[Facts, Verdict]:
     profile, bundle, plan = small_setup("sequential")
     config = RunConfig(n_cycles=4000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
-    blame.judge = listen
+    attribution.judge = listen
     try:
         run_live(
             open_sim(f"sim:ideal?scene=uniform&pace=fast&seed=2&faults={faults}"), profile, bundle, plan, core, config
         )
     finally:
-        blame.judge = judge
+        attribution.judge = judge
     return heard[0]
 
 

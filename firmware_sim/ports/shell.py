@@ -15,7 +15,7 @@ from typing import Protocol
 
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
 from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.timing.cpu import kept_awake
+from pans.runtime.timing.cpu import busy_core
 
 READ_BYTES = 1 << 16
 MAX_BACKLOG_BYTES = 1 << 20
@@ -169,7 +169,7 @@ def serve(
 ) -> None:
     """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given."""
     ask_for_priority()
-    with kept_awake(core):
+    with busy_core(core):
         _serve(device, clock, port, stopped)
 
 

@@ -24,7 +24,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Finding
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch, WatchSettings
 from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
-from pans.runtime.instrument.dead_channels import LitWatch, Silence
+from pans.runtime.instrument.dead_channels import DeadChannelTest, Silence
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
@@ -48,7 +48,7 @@ class DarkGuard:
         bundle: Bundle | None = None,
         shots: int = 1,
         afterpulses: bool = False,
-        lit: LitWatch | None = None,
+        lit: DeadChannelTest | None = None,
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
@@ -267,7 +267,7 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     watch = ChannelWatch(len(expected), expected, settings, low, high)
     lit = None
     if "lit" in header:  # recordings made before have none
-        lit = LitWatch(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
+        lit = DeadChannelTest(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
     return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)
 
 

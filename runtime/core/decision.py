@@ -8,12 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-
-from pans.runtime.instrument.channel_health import Finding
-from pans.runtime.wire.tracker import Gap
 
 NO_LABEL = 0xFFFF  # the label of a decision that abstained
 
@@ -109,7 +106,11 @@ class StreamEndUnknown:
         return {"kind": "stream_end_unknown", "first_exposure": self.first_exposure}
 
 
-CoreEvent = Gap | BeyondPlan | StreamEndUnknown | Finding
+class CoreEvent(Protocol):
+    """What a core tells beside its decisions: a `Gap`, a `Finding` of the dark counts, and the two above."""
+
+    def event(self) -> dict[str, Any]:
+        """Return it as an event for the recording: its `kind` and its facts."""
 
 
 class Output(NamedTuple):

@@ -1,1 +1,21 @@
-"""The core for objects that pass by: onset, best window, release, pulses asked."""
+"""The core for objects that pass by, cells or a tape of bars: onset, best window, release, and the pulses asked for.
+
+Owns the search for passages in a stream of frames, one decision for each, and the comparison of decisions with the device's marks
+afterwards. Like core it does no input or output and reads no clock; pulses are sent by live. `make_flow_core` makes the core that a flow's
+settings (`read_flow`) ask for, `build_flow_plan` its plan.
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+from .plan import build_flow_plan
+from .settings import FlowSettings, read_flow
+
+if TYPE_CHECKING:
+    from .core import FlowCore
+    from .make import make_flow_core
+
+__all__ = ["FlowCore", "FlowSettings", "build_flow_plan", "make_flow_core", "read_flow"]
+
+__getattr__ = lazy_names(__name__, {"FlowCore": ".core", "make_flow_core": ".make"})

@@ -1,1 +1,37 @@
-"""What an instrument can do, when it clicks, how it was measured, and whether it still is so."""
+"""What an instrument can do, when its detector clicks, how it was measured, and whether it still is so.
+
+Owns hardware profiles, the click law, calibrations and the statistical tests that a run holds against them (dark counts, dead channels,
+the level of light). It talks to no device and decides nothing: a test returns findings, core/dark_guard.py acts on them.
+
+>>> from pans.runtime.instrument import load_profile
+>>> load_profile("oled-qcmos").mode
+'sequential'
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+from .calibration import Calibration, load_calibration
+from .click_law import ClickLaw, click_law, click_probability
+from .profile import Profile, load_profile, parse_profile, shipped_profiles
+
+if TYPE_CHECKING:
+    from .cusum import ChannelWatch
+    from .dead_channels import DeadChannelTest
+
+__all__ = [
+    "Calibration",
+    "ChannelWatch",
+    "ClickLaw",
+    "DeadChannelTest",
+    "Profile",
+    "click_law",
+    "click_probability",
+    "load_calibration",
+    "load_profile",
+    "parse_profile",
+    "shipped_profiles",
+]
+
+__getattr__ = lazy_names(__name__, {"ChannelWatch": ".cusum", "DeadChannelTest": ".dead_channels"})

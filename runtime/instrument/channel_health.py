@@ -27,7 +27,7 @@ I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 BURST_RATIO = 5.0
 WARNING_RATIO = 1.5
-MOST = 0.5  # of the excess: a channel with more of it is the one to blame
+MOST = 0.5  # of the excess: a channel with more of it is the cause
 RETURN_EVIDENCE = 14.0  # log likelihood ratio for the expected rate at which a state is over: e^14 to one
 LEAST_CHANGE = 1.5  # times, that a state which lasts is taken to differ from what is expected
 _UNIT = 1e-6  # of the log likelihood ratio, so that sums are whole numbers
@@ -177,7 +177,7 @@ class ChannelHealth:
         return Finding(kind, level, channels, alarm.exposure, alarm.since, rate, expected, words)
 
     def _concerned(self, alarm: Alarm) -> tuple[tuple[int, ...], float, float]:
-        """Return the channels to blame, their rate since the change, and the expected one."""
+        """Return the channels concerned, their rate since the change, and the expected one."""
         watch = self._watch
         everyone = tuple(range(watch.n_channels))
         if watch.n_channels == 1:

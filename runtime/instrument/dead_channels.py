@@ -52,7 +52,7 @@ class Silence(NamedTuple):
     rate: float
 
 
-class LitWatch:
+class DeadChannelTest:
     """Follows the silence of `n` channels; all memory is allocated here, before arming.
 
     `dark_low` float64 (n,) are the lower ends of their dark rates; `arl_exposures` lie between false proofs and `arl_objects`

@@ -26,7 +26,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection, check_device
 from pans.runtime.record import AnyRecorder
-from pans.runtime.timing.cpu import kept_awake
+from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 
 from .config import RunConfig, RunResult
@@ -92,7 +92,7 @@ def run_live(
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
         with (
-            kept_awake(None if link.virtual else config.core) as awake,
+            busy_core(None if link.virtual else config.core) as awake,
             arm_realtime(wanted, [] if reader is None else [reader]) as granted,
         ):
             run.realtime = granted | awake

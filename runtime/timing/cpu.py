@@ -32,7 +32,7 @@ def check_core(core: int | None) -> None:
 
 
 @contextmanager
-def kept_awake(core: int | None) -> Iterator[dict[str, Any]]:
+def busy_core(core: int | None) -> Iterator[dict[str, Any]]:
     """Bind the calling thread to `core` and keep that awake while the block runs; yield {what: "granted" or why not}, {} for None."""
     if core is None or not hasattr(os, "sched_setaffinity"):
         yield {}

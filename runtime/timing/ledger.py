@@ -69,7 +69,7 @@ STAGES = ("link", "decode", "decide", "record")
 
 @dataclass(slots=True)
 class TimingLedger:
-    """Latencies per stage and in total, late decisions and the stage that each one is blamed on.
+    """Latencies per stage and in total, late decisions and the stage that took longest in each (JSON: `blame`).
 
     link: end of the last exposure (device tick, converted) -> bytes read; decode: -> message ready; decide: -> decision made;
     record: -> handed to the recorder. A decision is late when its total, less the clock's uncertainty, exceeds the deadline.

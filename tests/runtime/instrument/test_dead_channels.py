@@ -14,7 +14,7 @@ from tree import ROOT
 from pans.runtime.cli import main
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.instrument.cusum import ChannelWatch
-from pans.runtime.instrument.dead_channels import LitWatch, note_silence, silence_limit
+from pans.runtime.instrument.dead_channels import DeadChannelTest, note_silence, silence_limit
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 F64 = NDArray[np.float64]
@@ -28,9 +28,11 @@ def objects(seed: int, n: int, shares: F64 = SHARES) -> NDArray[np.int64]:
     return (rng.random((n, shares.shape[1])) < shares[rng.integers(len(shares), size=n)]).astype(np.int64)
 
 
-def watched(rows: NDArray[np.int64], arl: float = 1e6, dark: float = 1e-9) -> tuple[LitWatch, list[tuple[int, int]]]:
+def watched(
+    rows: NDArray[np.int64], arl: float = 1e6, dark: float = 1e-9
+) -> tuple[DeadChannelTest, list[tuple[int, int]]]:
     """Follow objects of one exposure each; return the watch and (object, channel) of what was found dead."""
-    watch = LitWatch(np.full(rows.shape[1], dark), 1e12, arl)
+    watch = DeadChannelTest(np.full(rows.shape[1], dark), 1e12, arl)
     words = np.packbits(rows.astype(np.uint8), axis=1, bitorder="little")
     found = []
     for number, row in enumerate(rows):
@@ -56,7 +58,7 @@ def test_a_silence_is_as_long_as_its_false_alarms_ask_for() -> None:
 def test_false_proofs_come_as_often_as_stated() -> None:
     rate, channels, arl = 0.01, 4, 20_000.0
     rng = np.random.default_rng(1)
-    watch = LitWatch(np.full(channels, 2 * rate), arl, 1e12)  # half of it is what a living channel must do
+    watch = DeadChannelTest(np.full(channels, 2 * rate), arl, 1e12)  # half of it is what a living channel must do
     n, found = 1_000_000, 0
     for _ in range(0, n, 50_000):
         words = np.packbits(rng.random((50_000, channels)) < rate, axis=1, bitorder="little")
@@ -113,7 +115,7 @@ def test_the_dark_counts_prove_it_whatever_the_scene() -> None:
     """Objects that leave channel 0 without light: it lives as long as it has dark counts, and is dead without."""
     rng = np.random.default_rng(22)
     for alive in (True, False):
-        watch = LitWatch(np.full(2, 1e-3), 1e8, 1e8)
+        watch = DeadChannelTest(np.full(2, 1e-3), 1e8, 1e8)
         found = []
         for first in range(0, 100_000, 100):
             bits = rng.random((100, 2)) < (1e-3 if alive or first < 20_000 else 0.0, 0.4)
@@ -126,7 +128,7 @@ def test_the_dark_counts_prove_it_whatever_the_scene() -> None:
 
 
 def test_windows_of_one_object_are_one_object() -> None:
-    watch = LitWatch(np.full(1, 1e-9), 1e12, 1e6)
+    watch = DeadChannelTest(np.full(1, 1e-9), 1e12, 1e6)
     for number in range(100):
         for shot in range(5):
             watch.take_object(np.array([shot == 3 and number % 2]), number)
@@ -148,7 +150,7 @@ def test_a_channel_that_returns_is_alive() -> None:
 
 def test_the_guard_names_it_and_says_when_it_is_over() -> None:
     plan = parallel(N, 3)  # a dark frame, then three shots
-    lit = LitWatch(np.full(N, 1e-4), 1e9, 1e6)
+    lit = DeadChannelTest(np.full(N, 1e-4), 1e9, 1e6)
     guard = DarkGuard(plan, ChannelWatch(N, np.full(N, 1e-4)), lit=lit)
     rng = np.random.default_rng(40)
     events = []
@@ -169,7 +171,7 @@ def test_the_guard_names_it_and_says_when_it_is_over() -> None:
 
 def test_one_detector_is_dead_when_nothing_clicks() -> None:
     plan = shot_major(3, 1)
-    guard = DarkGuard(plan, ChannelWatch(1, np.array([1e-4])), lit=LitWatch(np.array([1e-4]), 1e9, 1e6))
+    guard = DarkGuard(plan, ChannelWatch(1, np.array([1e-4])), lit=DeadChannelTest(np.array([1e-4]), 1e9, 1e6))
     rng = np.random.default_rng(41)
     events = []
     for number in range(3000):

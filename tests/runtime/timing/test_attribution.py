@@ -1,4 +1,4 @@
-"""Who is to blame: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
+"""Attribution: every cause from evidence made by hand, and evidence from real collections, waits and threads."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from pans.runtime.errors import UsageError
-from pans.runtime.timing.cpu import check_core, kept_awake
+from pans.runtime.timing.cpu import busy_core, check_core
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="this system does not bind threads to cores"
@@ -23,7 +23,7 @@ def spinners() -> list[threading.Thread]:
 def test_the_thread_is_bound_and_its_core_spins_until_the_end() -> None:
     before = os.sched_getaffinity(0)
     core = max(before)
-    with kept_awake(core) as granted:
+    with busy_core(core) as granted:
         assert granted == {"core": core, "kept_awake": "granted"}
         assert os.sched_getaffinity(0) == {core}
         (spinner,) = spinners()
@@ -45,7 +45,7 @@ def test_the_thread_is_bound_and_its_core_spins_until_the_end() -> None:
 
 def test_it_is_undone_when_the_run_breaks() -> None:
     before = os.sched_getaffinity(0)
-    with pytest.raises(RuntimeError), kept_awake(min(before)):
+    with pytest.raises(RuntimeError), busy_core(min(before)):
         raise RuntimeError
     assert os.sched_getaffinity(0) == before
     assert spinners() == []
@@ -53,7 +53,7 @@ def test_it_is_undone_when_the_run_breaks() -> None:
 
 def test_nothing_is_done_unasked() -> None:
     before = os.sched_getaffinity(0)
-    with kept_awake(None) as granted:
+    with busy_core(None) as granted:
         assert granted == {}
         assert os.sched_getaffinity(0) == before
         assert spinners() == []
@@ -63,7 +63,7 @@ def test_a_core_that_is_not_there_is_refused_with_those_that_are() -> None:
     allowed = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     with pytest.raises(UsageError, match=f"--core 4095, allowed: {allowed}"):
         check_core(4095)
-    with kept_awake(4095) as granted:
+    with busy_core(4095) as granted:
         assert granted["core"].startswith("refused: ")
     check_core(None)
     check_core(min(os.sched_getaffinity(0)))
