@@ -1,8 +1,8 @@
 """What was going on while work became late: spans of the loop's time, the scheduler's counters, messages that say when they left.
 
 Owns the collecting, in bounded memory: nothing here looks at a photon, and a thread of its own reads the system (counters.py). Never
-judges (attribution.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept: none of
-them alone can make anything late. In virtual time the machine is no witness and is not asked.
+judges (attribution.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept:
+none of them alone can make anything late. In virtual time the machine is no witness and is not asked.
 """
 
 from __future__ import annotations
