@@ -6,20 +6,15 @@ for any graph that is more than that: onnxruntime runs those. What was read is h
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import DamagedFileError
-
-from .head import protobuf_fields
-
-_GRAPH, _NODE, _INITIALIZER, _INPUT, _OUTPUT = 7, 1, 5, 11, 12
-_FLOAT = 1
+from .onnx_file import Node, read_model
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,19 +26,11 @@ class Layer:
     relu: bool
 
 
-@dataclass(slots=True)
-class _Node:
-    op: str = ""
-    inputs: list[str] = field(default_factory=list)
-    outputs: list[str] = field(default_factory=list)
-    attributes: dict[str, Any] = field(default_factory=dict)
-
-
 def read_layers(model: bytes, n_features: int, n_classes: int) -> tuple[Layer, ...] | None:
     """Return the layers of `model`, a chain of Gemm, MatMul, Add and Relu from its input to its first output, or None."""
     try:
         layers = _chain(model)
-    except (DamagedFileError, ValueError, KeyError, IndexError, UnicodeDecodeError, struct.error):
+    except (ValueError, KeyError, IndexError):
         return None
     if not layers or layers[0].weights.shape[0] != n_features or layers[-1].weights.shape[1] != n_classes:
         return None
@@ -62,32 +49,22 @@ def reference_scores(layers: tuple[Layer, ...], means: NDArray[np.floating[Any]]
     return values
 
 
-def _chain(model: bytes) -> tuple[Layer, ...]:
-    graph = next(value for number, value in _messages(memoryview(model)) if number == _GRAPH)
-    nodes, tensors, source, result = [], {}, "", ""
-    for number, value in _messages(graph):
-        if number == _NODE:
-            nodes.append(_node(value))
-        elif number == _INITIALIZER:
-            name, array = _tensor(value)
-            tensors[name] = array
-        elif number == _INPUT:
-            source = source or _text(value, 1)
-        elif number == _OUTPUT:
-            result = result or _text(value, 1)
+def _chain(data: bytes) -> tuple[Layer, ...]:
+    model = read_model(data)
+    tensors = {name: values for name, values in model.tensors.items() if values.dtype == np.float32}
     layers: list[Layer] = []
-    current = source
-    for node in nodes:
+    current = model.inputs[0].name
+    for node in model.nodes:
         if current not in node.inputs:
             raise ValueError(f"{node.op} does not continue the chain")
         _append(layers, node, current, tensors)
         current = node.outputs[0]
-    if current != result:
+    if current != model.outputs[0].name:
         raise ValueError("the chain does not end at the output")
     return tuple(layers)
 
 
-def _append(layers: list[Layer], node: _Node, current: str, tensors: dict[str, NDArray[np.float32]]) -> None:
+def _append(layers: list[Layer], node: Node, current: str, tensors: Mapping[str, NDArray[np.float32]]) -> None:
     if node.op == "Identity":
         return
     if node.op == "Relu":
@@ -114,60 +91,3 @@ def _append(layers: list[Layer], node: _Node, current: str, tensors: dict[str, N
     if bias.shape != (weights.shape[1],):
         raise ValueError("a bias of another length")
     layers.append(Layer(np.ascontiguousarray(weights), bias, False))
-
-
-def _messages(data: memoryview) -> list[tuple[int, memoryview]]:
-    return [(number, value) for number, value in protobuf_fields(data, "head") if isinstance(value, memoryview)]
-
-
-def _text(data: memoryview, wanted: int) -> str:
-    return next(bytes(value).decode() for number, value in _messages(data) if number == wanted)
-
-
-def _node(data: memoryview) -> _Node:
-    node = _Node()
-    for number, value in _messages(data):
-        if number == 1:
-            node.inputs.append(bytes(value).decode())
-        elif number == 2:
-            node.outputs.append(bytes(value).decode())
-        elif number == 4:
-            node.op = bytes(value).decode()
-        elif number == 5:
-            name, content = _attribute(value)
-            node.attributes[name] = content
-    return node
-
-
-def _attribute(data: memoryview) -> tuple[str, Any]:
-    name, content = "", None
-    for number, value in protobuf_fields(data, "head"):
-        if number == 1 and isinstance(value, memoryview):
-            name = bytes(value).decode()
-        elif number == 2 and isinstance(value, memoryview):
-            content = struct.unpack("<f", value)[0]
-        elif number == 3:
-            content = value
-    return name, content
-
-
-def _tensor(data: memoryview) -> tuple[str, NDArray[np.float32]]:
-    dims, name, raw, packed = [], "", b"", b""
-    for number, value in protobuf_fields(data, "head"):
-        if number == 1 and isinstance(value, int):
-            dims.append(value)
-        elif number == 1 and isinstance(value, memoryview):
-            raise ValueError("packed dims")  # no exporter writes them so
-        elif number == 2 and value != _FLOAT:
-            return _late_name(data), np.zeros(0, np.float32)  # shapes and the like: no weights
-        elif number == 4 and isinstance(value, memoryview):
-            packed += bytes(value)
-        elif number == 8 and isinstance(value, memoryview):
-            name = bytes(value).decode()
-        elif number == 9 and isinstance(value, memoryview):
-            raw = bytes(value)
-    return name, np.frombuffer(raw or packed, "<f4").reshape(dims).astype(np.float32)
-
-
-def _late_name(data: memoryview) -> str:
-    return _text(data, 8)

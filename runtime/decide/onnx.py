@@ -44,8 +44,8 @@ class OnnxDecider:
         self._run = self._head.session.run_with_iobinding
         self._binding = self._head.session.io_binding()
         make = onnxruntime.OrtValue.ortvalue_from_numpy  # on the CPU a view of the array, not a copy
-        self._binding.bind_ortvalue_input(self._head.input_name, make(self._input))
-        self._binding.bind_ortvalue_output(self._head.output_name, make(self._output))
+        self._binding.bind_ortvalue_input(self._head.cost.input_name, make(self._input))
+        self._binding.bind_ortvalue_output(self._head.cost.output_name, make(self._output))
         if not int8:  # golden scores are the float head's
             self._check_golden(bundle)
         for _ in range(WARM_UP_CALLS):

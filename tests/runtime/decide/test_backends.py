@@ -205,7 +205,7 @@ def test_golden_vectors_are_held_against_the_back_end(backend: str) -> None:
         make_decider(replaced(made, golden_scores=scores), backend=backend)
 
 
-def test_golden_vectors_catch_a_head_that_rolls_dice() -> None:
+def test_a_head_that_rolls_dice_is_refused() -> None:
     pytest.importorskip("onnx")
     from onnx import helper
 
@@ -214,9 +214,8 @@ def test_golden_vectors_catch_a_head_that_rolls_dice() -> None:
         helper.make_node("Add", ["means", "noise"], ["scores"]),
     ]
     dice = onnx_model(nodes, [tensor("means", ["n", 13])], [tensor("scores", ["n", 13])], [])
-    made = made_bundle(13, 13, head_onnx=dice)
-    with pytest.raises(DamagedFileError, match="golden"):
-        make_decider(made, backend="onnx")
+    with pytest.raises(DamagedFileError, match="operator 'Random"):
+        made_bundle(13, 13, head_onnx=dice)
 
 
 def hostile_heads() -> dict[str, tuple[bytes, str]]:
@@ -253,15 +252,18 @@ def hostile_heads() -> dict[str, tuple[bytes, str]]:
             "tensor",
         ),
         "two inputs": (head([helper.make_node("Add", ["x", "z"], ["y"])], [x, tensor("z", ["n", 2])], [y]), "2 inputs"),
-        "rows mixed": (head([flat], [x], [tensor("y", None)]), "output for 1 rows"),
+        "rows mixed": (head([flat], [x], [tensor("y", None)]), "ReduceSum works along the rows"),
         "weights elsewhere": (
             head([helper.make_node("MatMul", ["x", "w"], ["y"])], [x], [y], [outside]),
             "another file",
         ),
         "a name that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"means", b"\xf0eans"), "ONNX head"),
         "an initial that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"n", b"\xad"), "ONNX head"),
-        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "refuses it"),
-        "unknown operator": (head([helper.make_node("Teleport", ["x"], ["y"])], [x], [y]), "onnxruntime"),
+        "an operator that is no text": (affine_head(np.eye(2), np.zeros(2)).replace(b"Gemm", b"\xf0emm"), "not UTF-8"),
+        "unknown operator": (
+            head([helper.make_node("Teleport", ["x"], ["y"])], [x], [y]),
+            "operator 'Teleport', allowed: Abs",
+        ),
     }
 
 
@@ -287,26 +289,6 @@ def test_hostile_heads_are_refused_with_the_reason(kind: str, capfd: pytest.Capt
     with pytest.raises(DamagedFileError, match=reason):
         OnnxDecider(replaced(good, head_onnx=model))
     assert capfd.readouterr() == ("", "")
-
-
-def test_weights_elsewhere_are_found_inside_attributes_and_branches() -> None:
-    onnx = pytest.importorskip("onnx")
-    from onnx import helper, numpy_helper
-
-    outside = numpy_helper.from_array(np.ones((1, 2), dtype=np.float32), "c")
-    outside.ClearField("raw_data")
-    outside.data_location = 1
-    outside.external_data.add(key="location", value="secret.bin")
-    constant = helper.make_node("Constant", [], ["c"], value=outside)
-    branch = helper.make_graph([constant], "branch", [], [tensor("c", [1, 2])])
-    choose = helper.make_node("If", ["yes"], ["c2"], then_branch=branch, else_branch=branch)
-    nodes = [choose, helper.make_node("Add", ["x", "c2"], ["y"])]
-    yes = numpy_helper.from_array(np.array(True), "yes")
-    model = onnx_model(nodes, [tensor("x", ["n", 2])], [tensor("y", ["n", 2])], [yes])
-    assert onnx.load_from_string(model)
-    good, _, _ = affine_bundle(2, 2)
-    with pytest.raises(DamagedFileError, match="another file"):
-        OnnxDecider(replaced(good, head_onnx=model))
 
 
 def test_the_table_path_needs_neither_numba_nor_onnxruntime(tmp_path: Path) -> None:

@@ -1,0 +1,140 @@
+"""No head runs away: what is refused before a session is made, and what is let through costs what it says."""
+
+from __future__ import annotations
+
+import random
+import secrets
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+
+from heads import onnx_chain, random_layers
+from models import hostile_models, model, random_model
+from onnx import helper
+
+from pans.runtime.bundle.head import open_head
+from pans.runtime.bundle.onnx_check import check_head
+from pans.runtime.bundle.onnx_file import read_model
+from pans.runtime.bundle.onnx_shapes import ROWS, Known, known_constant, outcome_of
+from pans.runtime.errors import DamagedFileError
+
+HOSTILE = hostile_models()
+ANSWER_S = 2.0  # of processor time; the largest of them is 7 MB
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_heads_that_would_run_away_are_refused_unrun(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import onnxruntime
+
+    def no_session(*args: Any, **kwargs: Any) -> Any:
+        raise AssertionError("a session was made")
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", no_session)
+    data, reason = HOSTILE[name]
+    started = time.process_time()
+    with pytest.raises(DamagedFileError, match=reason):
+        open_head(data, {"foreign domain": 2, "convolution": 4096}.get(name, 4), 2, "here")
+    assert time.process_time() - started < ANSWER_S
+
+
+def test_the_check_needs_neither_onnx_nor_onnxruntime() -> None:
+    code = (
+        "import sys; from pans.runtime.bundle.onnx_check import check_head; print(check_head(sys.stdin.buffer.read(), 3, 2));"
+        "assert not {'onnx', 'onnxruntime'} & set(sys.modules)"
+    )
+    data = onnx_chain(random_layers([3, 5, 2]))
+    done = subprocess.run([sys.executable, "-c", code], input=data, capture_output=True, check=True)
+    assert b"input_name='means', output_name='scores', row_by_row=False" in done.stdout
+
+
+def convolutional(batch: Any, dynamic: bool) -> bytes:
+    """What a trainer exports for a small convolutional network, its flattening by constants or by the shape at run time."""
+    node = helper.make_node
+    rng = np.random.default_rng(1)
+    weights: dict[str, Any] = {
+        "image": np.array([-1 if batch == "n" else 1, 1, 4, 4], np.int64),
+        "k": rng.normal(size=(3, 1, 3, 3)).astype(np.float32),
+        "w": rng.normal(size=(12, 2)).astype(np.float32),
+        **{name: np.ones(3, np.float32) for name in ("scale", "offset", "mean", "variance")},
+        **{"first": np.array(0, np.int64), "axis": np.array([0], np.int64), "rest": np.array([-1], np.int64)},
+        **{"flat": np.array([0, 12], np.int64), "q": np.float32(0.1), "zero": np.uint8(0)},
+    }
+    nodes = [
+        node("Reshape", ["means", "image"], ["x"]),
+        node("Conv", ["x", "k"], ["c"], pads=[1, 1, 1, 1]),
+        node("BatchNormalization", ["c", "scale", "offset", "mean", "variance"], ["b"]),
+        node("Relu", ["b"], ["r"]),
+        node("MaxPool", ["r"], ["p"], kernel_shape=[2, 2], strides=[2, 2]),
+        node("QuantizeLinear", ["p", "q", "zero"], ["quantised"]),
+        node("DequantizeLinear", ["quantised", "q", "zero"], ["d"]),
+    ]
+    if dynamic:
+        nodes += [
+            node("Shape", ["d"], ["s"]),
+            node("Gather", ["s", "first"], ["rows"], axis=0),
+            node("Unsqueeze", ["rows", "axis"], ["one"]),
+            node("Concat", ["one", "rest"], ["flat2"], axis=0),
+        ]
+    nodes += [node("Reshape", ["d", "flat2" if dynamic else "flat"], ["f"]), node("MatMul", ["f", "w"], ["scores"])]
+    return bytes(model(nodes, weights, d_f=16, batch=batch).SerializeToString())
+
+
+@pytest.mark.parametrize(("batch", "dynamic"), [("n", False), ("n", True), (1, False), (1, True)])
+def test_what_usual_trainers_export_runs(batch: Any, dynamic: bool) -> None:
+    head = open_head(convolutional(batch, dynamic), 16, 2, "here")
+    assert head.cost.row_by_row == (batch == 1)
+    means = np.random.default_rng(2).random((5, 16)).astype(np.float32)
+    together = head.scores(means)
+    np.testing.assert_allclose(together, np.concatenate([head.scores(row[None]) for row in means]), rtol=1e-5)
+
+
+def test_the_cost_of_a_chain_is_its_products() -> None:
+    cost = check_head(onnx_chain(random_layers([10, 512, 10])), 10, 10)
+    assert cost.operations == 10 * 512 + 512 * 10 + 8 * (512 + 512 + 10)
+    assert cost.values == 10 + 512 + 512 + 10
+
+
+def shapes_of(data: bytes, d_f: int) -> dict[str, tuple[int, ...]]:
+    read = read_model(data)
+    known = {name: known_constant(values) for name, values in read.tensors.items()}
+    known["means"] = Known((ROWS, d_f))
+    for node in read.nodes:
+        known[node.outputs[0]] = outcome_of(node, [known[name] for name in node.inputs], read.opset).output
+    return {name: item.dims for name, item in known.items()}
+
+
+def check_random_models(seed: int, count: int) -> int:
+    """Hold the shapes of random models against those of onnxruntime; return how many both let through."""
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(4)
+    dice, agreed = random.Random(seed), 0
+    for number in range(count):
+        data, d_f, n_out, names = random_model(dice)
+        try:
+            check_head(data, d_f, n_out)
+        except ValueError:
+            continue
+        try:
+            session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+            found = {rows: session.run(names, {"means": np.ones((rows, d_f), np.float32)}) for rows in (1, 3)}
+        except Exception:
+            continue  # it refuses what we let through: that is its right
+        shapes = shapes_of(data, d_f)
+        for rows, arrays in found.items():
+            for name, array in zip(names, arrays):
+                wanted = tuple(rows if size == ROWS else size for size in shapes[name])
+                assert array.shape == wanted, f"seed {seed}, model {number}: {name} is {array.shape}, expected {wanted}"
+        agreed += 1
+    return agreed
+
+
+def test_shapes_are_those_of_onnxruntime() -> None:
+    seed = secrets.randbits(32)
+    assert check_random_models(seed, 300) > 60, f"seed {seed}"
