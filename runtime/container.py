@@ -20,6 +20,7 @@ from .errors import DamagedFileError, UsageError
 
 MIB = 1 << 20
 FILE_MAX_BYTES = 256 * MIB
+JSON_DEPTH_MAX = 64  # our own headers need about six
 
 
 def canonical_json(value: Any) -> bytes:
@@ -48,9 +49,20 @@ def _refuse_strange(value: Any, path: str) -> None:
 
 
 def parse_json_object(data: bytes, where: str) -> dict[str, Any]:
-    """Decode one JSON object strictly (no NaN, no double keys); DamagedFileError otherwise."""
+    """Decode one JSON object strictly; DamagedFileError otherwise.
+
+    Strictly: no NaN, no number beyond float64 or 64 bits, no double keys, at most JSON_DEPTH_MAX levels.
+    """
     try:
-        value = json.loads(data.decode("utf-8"), object_pairs_hook=_without_doubles, parse_constant=_refuse_constant)
+        value = json.loads(
+            data.decode("utf-8"),
+            object_pairs_hook=_without_doubles,
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+            parse_int=_within_64_bits,
+        )
+        if isinstance(value, dict):
+            _demand_flat(value)
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(f"{where}: the JSON text is not readable: {error}") from error
     if not isinstance(value, dict):
@@ -63,6 +75,34 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(result) != len(pairs):
         raise ValueError("the same key stands twice in one object")
     return result
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError(f"{text[:40]} is beyond the range of float64")
+    return value
+
+
+def _within_64_bits(text: str) -> int:
+    value = int(text) if len(text) <= 20 else 1 << 64
+    if not -(1 << 63) <= value < 1 << 64:
+        raise ValueError(f"{text[:40]} is a whole number beyond 64 bits")
+    return value
+
+
+def _demand_flat(value: Any) -> None:
+    """Refuse what is nested deeper than anything that we write: later readers go through it by recursion."""
+    level, depth = [value], 0
+    while level := [
+        item
+        for one in level
+        for item in (one.values() if isinstance(one, dict) else one)
+        if isinstance(item, dict | list)
+    ]:
+        depth += 1
+        if depth >= JSON_DEPTH_MAX:
+            raise ValueError(f"nested more than {JSON_DEPTH_MAX} deep")
 
 
 def _refuse_constant(name: str) -> Any:

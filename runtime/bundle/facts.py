@@ -15,9 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.ranges import Range
+
 from .head import HEAD_MAX_BYTES
 from .int8 import STEP_MAX, WEIGHT_MAX, Int8Head
-from .optics import Analyser, check_analyser
+from .onnx_check import check_head
+from .optics import LIGHT_RANGE, Analyser, check_analyser
 
 ENCODERS = ("active", "coherent", "incoherent")  # the last two are passive: nothing is shown
 FEATURES_MAX = 4096
@@ -29,6 +32,10 @@ TEXT_MAX_CHARACTERS = 200
 TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
 LAYERS_MAX = 16
+# Numbers of the header; docs/reference/formats.md states the same.
+RANGES = {"levels": Range(2, LEVELS_MAX, whole=True), "photons_per_level": LIGHT_RANGE}
+GOLDEN_WORK_MAX = 1 << 36  # multiply-adds for all golden vectors together: about ten seconds
+AFFINE_MAX = 1e20  # of an int8 head: its sums, below 2**31, stay finite in float32
 GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
 
 
@@ -149,14 +156,14 @@ def _check_facts(bundle: Bundle) -> None:
     demand(
         (bundle.encoder == "active") == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none"
     )
-    scale = bundle.photons_per_level
     if bundle.analyser is not None:
         demand(
-            bundle.levels == 0 and scale == 0, "a passive sensor has no projector: levels and photons_per_level are 0"
+            bundle.levels == 0 and bundle.photons_per_level == 0,
+            "a passive sensor has no projector: levels and photons_per_level are 0",
         )
         return
-    demand(2 <= bundle.levels <= LEVELS_MAX, f"levels is {bundle.levels}, allowed: 2 to {LEVELS_MAX}")
-    demand(math.isfinite(scale) and scale > 0, f"photons_per_level is {scale}, allowed: finite and above 0")
+    for name in ("levels", "photons_per_level"):
+        RANGES[name].checked(getattr(bundle, name), name)
 
 
 def _check_outputs(bundle: Bundle) -> None:
@@ -199,15 +206,26 @@ def check_bundle(bundle: Bundle) -> None:
     if bundle.head_onnx is not None:
         size = len(bundle.head_onnx)
         demand(0 < size <= HEAD_MAX_BYTES, f"the head has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+        _check_cost(bundle.head_onnx, "ONNX head", bundle)
     if bundle.int8_onnx is not None:
         size = len(bundle.int8_onnx)
         demand(0 < size <= HEAD_MAX_BYTES, f"the int8 model has {size} bytes, allowed: 1 to {HEAD_MAX_BYTES}")
+        _check_cost(bundle.int8_onnx, "int8 model", bundle)
     if bundle.int8_head is not None:
         _check_int8(bundle.int8_head, d_f, bundle.n_outputs)
     if bundle.table is not None:
         check_table_shape(bundle.table.shape, d_f, bundle.n_outputs)
-        demand(bool(np.isfinite(bundle.table).all()), "the table holds scores that are not finite")
+        demand(_finite(bundle.table), "the table holds scores that are not finite")
     _check_golden(bundle)
+
+
+def _check_cost(model: bytes, what: str, bundle: Bundle) -> None:
+    try:
+        cost = check_head(model, bundle.n_features, bundle.n_outputs)
+    except ValueError as error:
+        raise ValueError(f"the {what} cannot be used: {error}") from None
+    work = cost.operations * len(bundle.golden_means)
+    demand(work <= GOLDEN_WORK_MAX, f"{work} multiply-adds for the golden vectors, allowed: {GOLDEN_WORK_MAX}")
 
 
 def _check_int8(head: Int8Head, n_features: int, n_classes: int) -> None:
@@ -218,12 +236,17 @@ def _check_int8(head: Int8Head, n_features: int, n_classes: int) -> None:
     demand(ends == (n_features, n_classes), f"the int8 head maps {ends}, allowed: {(n_features, n_classes)}")
     n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
     demand(head.weights.shape == (n_weights,), f"the int8 head has {head.weights.size} weights, needs {n_weights}")
+    demand(int(head.weights.min()) >= -WEIGHT_MAX, f"an int8 weight is below -{WEIGHT_MAX}")
     wanted = (2, sum(sizes[1:]))
     demand(head.affine.shape == wanted, f"int8_affine has shape {head.affine.shape}, allowed: {wanted}")
-    demand(bool(np.isfinite(head.affine).all()), "the int8 head holds scales that are not finite")
+    demand(bool((np.abs(head.affine) <= AFFINE_MAX).all()), f"the int8 head holds scales beyond {AFFINE_MAX:g}")
     # a sum of integers stays exact: the kernel adds in int32
     largest = max(n_in for n_in in sizes[1:-1]) * STEP_MAX * WEIGHT_MAX if len(sizes) > 2 else 0
     demand(largest < 1 << 31, f"an int8 layer of {max(sizes[1:])} inputs could leave int32")
+
+
+def _finite(scores: NDArray[np.float32]) -> bool:
+    return bool(np.isfinite(scores.min()) and np.isfinite(scores.max()))  # a NaN is minimum and maximum
 
 
 def _check_golden(bundle: Bundle) -> None:
@@ -236,7 +259,7 @@ def _check_golden(bundle: Bundle) -> None:
     wanted = (count, bundle.n_outputs)
     demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
     demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
-    demand(bool(np.isfinite(scores).all()), "the golden scores are not finite (does the head answer NaN?)")
+    demand(_finite(scores), "the golden scores are not finite (does the head answer NaN?)")
     if bundle.table is not None:
         binary = ((means == 0) | (means == 1)).all(axis=1)
         found = bundle.table[row_index(means[binary])]

@@ -20,7 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
 from pans.runtime.errors import UsageError
 
-from .facts import LEVELS_MAX, Bundle, check_bundle, check_table_shape, frozen, golden_violation, row_index
+from .facts import (
+    GOLDEN_WORK_MAX,
+    LEVELS_MAX,
+    Bundle,
+    check_bundle,
+    check_table_shape,
+    frozen,
+    golden_violation,
+    row_index,
+)
 from .format import bundle_bytes, parse_bundle
 from .head import OnnxHead, open_head
 from .int8 import Int8Head
@@ -155,7 +164,8 @@ def _evaluate_back_end(
         return means, table[row_index(means)], table
     head = open_head(head_onnx, n_features, n_outputs, "head")
     means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
-    if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX:
+    affordable = head.cost.operations << min(n_features, TABLE_BUILD_FEATURES_MAX) <= GOLDEN_WORK_MAX
+    if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX and affordable:
         table = head.scores(word_means(np.arange(1 << n_features), n_features))
     elif table is not None:
         _demand_agreement(head, table, n_features)

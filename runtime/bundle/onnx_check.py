@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .onnx_file import FLOAT, Model, Value, read_model
-from .onnx_shapes import ROWS, Known, known_constant, outcome_of, per_row, shape_text
+from .onnx_layout import known_constant, outcome_of
+from .onnx_shapes import ROWS, Known, per_row, shape_text
 
 OPSETS = (7, 30)  # operators before 7 broadcast by attributes; what onnxruntime does not know it refuses itself
 OPERATIONS_MAX = 1 << 27  # multiply-adds per decision, about 0.05 s on one core

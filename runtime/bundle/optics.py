@@ -9,7 +9,6 @@ Coherent: light = |W x|**2 of fields x, W real or complex (Ma et al., passive PA
 from __future__ import annotations
 
 import hashlib
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import UsageError
+from pans.runtime.ranges import Range
 
 from .incident import LIGHTS, OPTICS, incident_field, incident_intensity
 
+# Photoelectrons of one pixel, or of one of its levels, in one exposure: from where 2**22 pixels at 65 535 levels give one in 10**8
+# exposures to far beyond what a single-photon detector counts.
+LIGHT_RANGE = Range(1e-20, 1e9)
+EXPOSURE_US_RANGE = Range(1e-3, 1e9)
+MATRIX_MAX = 1e6  # of an entry of W; passive optics that conserve light have singular values of at most 1
 KINDS = ("coherent", "incoherent")
 _AT_ONCE = 2048
 
@@ -74,11 +79,10 @@ def check_analyser(analyser: Analyser) -> None:
     if matrix.ndim != 2 or not (matrix.dtype == np.float32 or (complex_field and kind == "coherent")):
         allowed_types = "float32 or complex64" if kind == "coherent" else "float32"
         raise ValueError(f"the matrix is {matrix.dtype} {matrix.shape}, allowed: {allowed_types} (d_f, pixels)")
-    if not np.isfinite(matrix).all():
-        raise ValueError("the matrix holds numbers that are not finite")
+    parts = (matrix.real, matrix.imag) if complex_field else (matrix,)
+    if not all(part.min() >= -MATRIX_MAX and part.max() <= MATRIX_MAX for part in parts):
+        raise ValueError(f"the matrix holds numbers that are not finite, or beyond {MATRIX_MAX:g}")
     if kind == "incoherent" and matrix.min() < 0:
         raise ValueError(f"the matrix goes down to {matrix.min():g}: an intensity cannot be negative")
-    for name in ("full_scale_photoelectrons", "exposure_us"):
-        value = getattr(analyser, name)
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}, allowed: finite and above 0")
+    for name, allowed_range in (("full_scale_photoelectrons", LIGHT_RANGE), ("exposure_us", EXPOSURE_US_RANGE)):
+        allowed_range.checked(getattr(analyser, name), name)

@@ -95,10 +95,11 @@ def _choose(bundle: Bundle, shots: int) -> Decider:
             f"{bundle.name} has only a table of single clicks, which cannot answer {shots} shots",
             remedy="use --shots 1, or a bundle with an ONNX head",
         )
-    candidates: list[Decider] = [OnnxDecider(bundle)]
+    onnx = OnnxDecider(bundle)
+    candidates: list[Decider] = [onnx]
     with suppress(UsageError):  # a head that is no plain chain of layers: onnxruntime runs it
         candidates.append(_make(bundle, shots, "sparse"))
-    if fits_count_table(bundle.n_features, shots):
+    if fits_count_table(bundle.n_features, shots) and onnx.affords((shots + 1) ** bundle.n_features):
         candidates.append(CountTableDecider(bundle, shots))
     medians = {decider.name: median_us(decider, shots) for decider in candidates}
     best = min(candidates, key=lambda decider: medians[decider.name])

@@ -6,6 +6,7 @@ never looks into a model (bundle/head.py) and never measures how good a picture 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,9 @@ from pans.runtime.errors import UsageError
 from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_winner
 
 WARM_UP_CALLS = 500  # of a few microseconds each
+WARM_UP_S = 0.5  # or as many as fit into this: the slowest head that is allowed takes about 0.05 s
+TABLE_WORK_MAX = 1 << 33  # multiply-adds, about a second
+TABLE_SCORES_MAX = 1 << 23  # 32 MiB
 PICTURE_WARM_UP_CALLS = 20  # heads of pictures are far larger
 
 
@@ -38,6 +42,7 @@ class OnnxDecider:
         self.n_features = bundle.n_features
         self.n_classes = bundle.n_classes
         self._head = open_head(model, bundle.n_features, bundle.n_classes, bundle.name)
+        self.operations = self._head.cost.operations
         self._input = np.zeros((1, bundle.n_features), dtype=np.float32)
         self._output = np.zeros((1, bundle.n_classes), dtype=np.float32)
         self._means, self._scores = self._input[0], self._output[0]
@@ -48,8 +53,15 @@ class OnnxDecider:
         self._binding.bind_ortvalue_output(self._head.cost.output_name, make(self._output))
         if not int8:  # golden scores are the float head's
             self._check_golden(bundle)
+        until = time.perf_counter() + WARM_UP_S
         for _ in range(WARM_UP_CALLS):
             self._run(self._binding)
+            if time.perf_counter() > until:
+                break
+
+    def affords(self, rows: int) -> bool:
+        """Whether a table of the scores of `rows` click vectors is made within a second or so, and is small."""
+        return rows * self._head.cost.operations <= TABLE_WORK_MAX and rows * self.n_classes <= TABLE_SCORES_MAX
 
     def _check_golden(self, bundle: Bundle) -> None:
         """Hold the batch path and the bound path against the golden vectors: they are different code in onnxruntime."""

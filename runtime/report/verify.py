@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.facts import GOLDEN_WORK_MAX
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
 from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, parse_bundle, word_means
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.onnx import OnnxDecider
 from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
@@ -27,6 +29,7 @@ from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
 from pans.runtime.record.parts import chain_violations, first_decision, parts_in
 
 _COMPARE_FEATURES_MAX = 16
+_COMPARE_SCORES = 1 << 20  # at once
 _ABSTAIN_CAUSES = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
 
 
@@ -123,12 +126,25 @@ def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
                 verdict.violations.append(error.message)
     if verdict.violations:
         return
-    if bundle.table is not None and bundle.head_onnx is not None and bundle.n_features <= _COMPARE_FEATURES_MAX:
-        words = word_means(np.arange(1 << bundle.n_features), bundle.n_features).astype(np.int64)
-        difference = golden_violation(bundle.table, make_decider(bundle, backend="onnx").scores_batch(words, 1))
-        if difference:
-            verdict.violations.append(f"table and head disagree: {difference}")
+    verdict.violations += _table_differences(bundle)
     verdict.alerts += _bundle_alerts(bundle)
+
+
+def _table_differences(bundle: Bundle) -> list[str]:
+    """Compare table and head on click words, on all of them where that is not too much work, else on some, evenly spread."""
+    if bundle.table is None or bundle.head_onnx is None or bundle.n_features > _COMPARE_FEATURES_MAX:
+        return []
+    decider = OnnxDecider(bundle)
+    n_words, at_once = len(bundle.table), max(1, _COMPARE_SCORES // bundle.n_classes)
+    count = max(1, min(n_words, GOLDEN_WORK_MAX // decider.operations))
+    chosen = np.arange(count) * n_words // count
+    for start in range(0, count, at_once):
+        words = chosen[start : start + at_once]
+        clicks = word_means(words, bundle.n_features).astype(np.int64)
+        difference = golden_violation(bundle.table[words], decider.scores_batch(clicks, 1))
+        if difference:
+            return [f"table and head disagree from word {int(words[0])} on: {difference}"]
+    return []
 
 
 def _bundle_alerts(bundle: Bundle) -> Iterator[str]:

@@ -21,7 +21,8 @@ from onnx import helper
 from pans.runtime.bundle.head import open_head
 from pans.runtime.bundle.onnx_check import check_head
 from pans.runtime.bundle.onnx_file import read_model
-from pans.runtime.bundle.onnx_shapes import ROWS, Known, known_constant, outcome_of
+from pans.runtime.bundle.onnx_layout import known_constant, outcome_of
+from pans.runtime.bundle.onnx_shapes import ROWS, Known
 from pans.runtime.errors import DamagedFileError
 
 HOSTILE = hostile_models()
@@ -137,4 +138,4 @@ def check_random_models(seed: int, count: int) -> int:
 
 def test_shapes_are_those_of_onnxruntime() -> None:
     seed = secrets.randbits(32)
-    assert check_random_models(seed, 300) > 60, f"seed {seed}"
+    assert check_random_models(seed, 150) > 60, f"seed {seed}"

@@ -1,0 +1,68 @@
+"""Ranges: what a number that arrives from outside may be, and the words of its refusal.
+
+Owns the check that options of commands and fields of files share. A range never holds nan or infinity. ValueError says what was
+found and what is allowed; the caller says where.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Numbers from `low` to `high`, both allowed; `whole` ones only, or not.
+
+    >>> Range(0, 100, whole=True).checked(7, "label")
+    7
+    >>> Range(1e-6, 1e6).checked(float("inf"), "scale")
+    Traceback (most recent call last):
+    ValueError: scale is inf, allowed: a number from 1e-06 to 1e+06
+    """
+
+    low: float
+    high: float
+    whole: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """What is allowed, in words."""
+        noun = "a whole number" if self.whole else "a number"
+        return f"{noun} from {_shown(self.low)} to {_shown(self.high)}"
+
+    def holds(self, value: Any) -> bool:
+        """Whether `value` is a number of this range; a boolean is none."""
+        kinds = int if self.whole else (int, float)
+        return isinstance(value, kinds) and not isinstance(value, bool) and bool(self.low <= value <= self.high)
+
+    def checked(self, value: Any, what: str) -> Any:
+        """Return `value`; ValueError if it is not in the range."""
+        if not self.holds(value):
+            raise ValueError(f"{what} is {number_text(value)}, allowed: {self.allowed}")
+        return value
+
+    def option(self, text: str) -> Any:
+        """Return the number that an option's `text` stands for: the `type` of an argparse argument."""
+        try:
+            value: float = int(text) if self.whole else float(text)
+        except ValueError:
+            value = math.nan
+        if not self.holds(value):
+            raise argparse.ArgumentTypeError(f"{ascii(text)[1:-1][:40]!r} is not {self.allowed}")
+        return value
+
+
+def number_text(value: Any) -> str:
+    """Return what was found where a number should be, never longer than a line."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 64:
+        return "a whole number beyond 64 bits"
+    return ascii(value)[:60]
+
+
+def _shown(value: float) -> str:
+    if isinstance(value, int):
+        return str(value)
+    return f"{value:g}"
