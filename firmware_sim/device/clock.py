@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-DEFAULT_OFFSET_TICKS = 123_456_789
-DEFAULT_DRIFT_PPM = 20.0
+DEFAULT_OFFSET_TICKS = 123_456_789  # any number that is not 0: device time is not host time
+DEFAULT_DRIFT_PPM = 20.0  # the tolerance of an ordinary quartz crystal
 _E18 = 10**18
 
 

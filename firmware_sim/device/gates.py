@@ -1,6 +1,6 @@
 """The actuation outputs: which pulses were accepted, and which output is open when.
 
-Owns the pulses and refusals, bounded, as the ground truth of what was actuated; never decides whether the state allows one (device.py).
+Owns the pulses and refusals, bounded, as the ground truth of what was actuated; never decides whether the state allows one (instrument.py).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pans.runtime.wire.messages import AckStatus
 
 from .upload import Refused
 
-GATE_CHANNELS = 8
+GATE_CHANNELS = 8  # this simulator's; a device says its number in WELCOME
 MAX_PENDING_GATES = 256
 MAX_KEPT_PULSES = 4096
 

@@ -1,6 +1,6 @@
 """One armed run of an instrument that exposes all channels at once: its stream, made ahead of time in stretches.
 
-Owns the stretches that are not yet sent and the place in them; never knows about windows or buffers (stream.py) and never reads a clock.
+Owns the stretches that are not yet sent and the place in them; never knows about windows or buffers (stream_buffer.py), reads no clock.
 The future of a scene is fixed, so that clicks and the order of messages are made before they are due. Sequence numbers, drop counts and the
 session are stamped on when the first message of a stretch leaves, and again when one of them turns out otherwise for the rest of it.
 What is not yet due can be forgotten at any time: numbers drawn ahead belong to exposures, and change nothing for those of later runs.
@@ -103,7 +103,7 @@ class FrameRun(Timetable):
             max(1, min(most, STRETCH_NUMBERS // program.channels) * len(program.blocks) // program.n_slots)
             for most in (STRETCH_EXPOSURES, AHEAD_EXPOSURES)
         )
-        self._at_once = self._due_blocks  # how many to make; fewer as soon as somebody makes them ahead
+        self._at_once = self._due_blocks  # how many to make; fewer as soon as the shell has them made ahead
         self._before = np.zeros(program.channels, np.uint8)
         self._ahead: deque[Stretch] = deque()
         self._broken_off = False

@@ -1,8 +1,8 @@
 """One armed run of a program, pattern after pattern: which stream message is due at which tick, and what is in it.
 
-Owns the schedule of exposures, objects and blocks; never knows about sessions, windows or buffers (device.py). `Measurement.emit` returns
+Owns the schedule of exposures, objects and blocks; knows no sessions, windows or buffers (instrument.py). `Measurement.emit` returns
 messages without sequence number and drop count, which the device adds. Clicks are drawn in batches. Instruments that expose all
-channels at once have a run of their own (frame_run.py).
+channels at once have a run of their own (parallel.py).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from pans.runtime.wire.messages import NO_OBJECT, AckStatus, ClickBlock, FrameBl
 from .upload import Refused
 
 BATCH_NUMBERS = 1 << 14  # clicks drawn at a time
-MAX_LEASE_MS = 3_600_000
+MAX_LEASE_MS = 3_600_000  # an hour without a word from the host
 MAX_ARM_AHEAD_S = 3600
-MAX_TICK = 1 << 62
+MAX_TICK = 1 << 62  # ticks are signed 64-bit numbers in the kernels; a cycle more does not overflow
 
 StreamMessage = ClickBlock | FrameBlock | Mark
 

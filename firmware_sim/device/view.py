@@ -84,8 +84,8 @@ class View:
             assert isinstance(self.scene.what, Scene)  # see check_and_warm_up
             photons = passive_photoelectrons(self.optics, self.scene.what, exposure_us)
             return tabulate(self.profile, photons, exposure_us)
-        except ConfigError as error:
-            raise Refused(AckStatus.OUT_OF_RANGE, error.message) from error
+        except ValueError as error:
+            raise Refused(AckStatus.OUT_OF_RANGE, str(error)) from error
 
     def light_and_clicks(
         self, program: Program, n_cycles: int, table: Table, first_draw: int = 0

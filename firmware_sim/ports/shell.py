@@ -34,7 +34,7 @@ class Port(Protocol):
     def write(self, data: bytes) -> int: ...
 
     def wait(self, timeout_s: float, wants_to_write: bool) -> bool:
-        """Wait until there is something to read, or room to write for who wants to; whether there is something to read."""
+        """Wait for something to read, or with `wants_to_write` for room to write; whether there is something to read."""
 
     def close(self) -> None: ...
 

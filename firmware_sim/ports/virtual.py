@@ -54,7 +54,7 @@ class VirtualLink:
         return self._now_ns
 
     def pause(self, seconds: float) -> None:
-        """Let virtual time pass while nobody reads: what the device sends meanwhile is lost with the closed port."""
+        """Let virtual time pass while the host does not read: what the device sends meanwhile is lost with the closed port."""
         until_ns = self._now_ns + round(seconds * NS_PER_S)
         while self._now_ns < until_ns:
             due = self.device.next_event_tick()

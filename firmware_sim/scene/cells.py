@@ -1,6 +1,6 @@
 """Cells in flow: when each one comes, how fast and how far off, and what light the field passes while they cross.
 
-Owns the flow of one run and the marks that tell the truth about it; never draws a click (measurement.py). Everything about arrival
+Owns the flow of one run and the marks that tell the truth about it; never draws a click (drawing.py). Everything about arrival
 number n is a function of (seed, n) alone, except its time, which is a running sum of such functions: batches change nothing.
 
 Model: a cell is centred at its arrival; its shift in pixels is velocity times the time since, from -width to +width, beyond which it
@@ -29,8 +29,8 @@ from .shifts import ShiftTable
 
 ARRIVAL_STREAM = 16  # five numbers per arrival: waiting time, picture, offset, two for the velocity
 CHUNK = 32  # arrivals drawn at a time: more would hold a block up
-CUT_SIGMA = 4.0
-MAX_HALF_EXPOSURES = 0xFFFF
+CUT_SIGMA = 4.0  # of the log-normal velocity, 6e-5 of the cells: the slowest one bounds how far ahead cells are drawn
+MAX_HALF_EXPOSURES = 0xFFFF  # the field of MARK has 16 bits
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -56,7 +56,7 @@ class RunLight(Protocol):
 
 
 def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], exposure_us: float) -> LightTable:
-    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ConfigError when it does not fit the scene."""
+    """Tabulate a loaded pattern set, uint16 (patterns, pixels); ValueError when it does not fit the scene."""
     return tabulate(profile, expected_photoelectrons(profile, scene, levels, exposure_us), exposure_us)
 
 
@@ -67,7 +67,7 @@ def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
 
 
 def prepare(profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float) -> Table:
-    """Make what `scene` needs to know of the patterns, uint16 (patterns, pixels); ConfigError when they do not fit it."""
+    """Make what `scene` needs to know of the patterns, uint16 (patterns, pixels); ValueError when they do not fit it."""
     what = scene.what
     if isinstance(what, Cells):
         from .shifts import shift_table

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 
 from .still import Scene
@@ -33,18 +32,17 @@ def expected_photoelectrons(
 ) -> NDArray[np.float64]:
     """Return lambda, float64 (n_objects, n_patterns): photoelectrons per exposure of each object under each pattern.
 
-    `pattern_levels` is uint16 (n_patterns, n_pixels); the transmission is that of `clicks.object_transmission`. ConfigError
+    `pattern_levels` is uint16 (n_patterns, n_pixels); the transmission is that of `clicks.object_transmission`. ValueError
     when the patterns do not fit the scene's images, or the table would exceed MAX_TABLE_ENTRIES.
     """
     n_patterns, n_pixels = pattern_levels.shape
     if not scene.any_shape and scene.n_pixels != n_pixels:
         height, width = scene.images.shape[1:]
-        raise ConfigError(
-            f"patterns have {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels} ({height} x {width})",
-            remedy="choose a scene of the same image shape",
+        raise ValueError(
+            f"patterns have {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels} ({height} x {width})"
         )
     if scene.n_objects * n_patterns > MAX_TABLE_ENTRIES:
-        raise ConfigError(
+        raise ValueError(
             f"{scene.n_objects} objects x {n_patterns} patterns: the simulator's table holds {MAX_TABLE_ENTRIES} entries"
         )
     if not scene.lit:
@@ -58,7 +56,7 @@ def expected_photoelectrons(
 
 
 def passive_photoelectrons(analyser: Analyser, scene: Scene, exposure_us: float) -> NDArray[np.float64]:
-    """Return lambda, float64 (n_objects, n_detectors): photoelectrons per exposure behind passive optics; ConfigError as above.
+    """Return lambda, float64 (n_objects, n_detectors): photoelectrons per exposure behind passive optics; ValueError as above.
 
     A target fills the field with full scale; light grows with the exposure.
     """
@@ -69,10 +67,7 @@ def passive_photoelectrons(analyser: Analyser, scene: Scene, exposure_us: float)
         shape = (side, side) if side * side == n_pixels else (1, n_pixels)
         images = np.broadcast_to(images, (len(images), *shape))
     elif scene.n_pixels != n_pixels:
-        raise ConfigError(
-            f"the passive optics see {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels}",
-            remedy="choose a scene of the same image shape",
-        )
+        raise ValueError(f"the passive optics see {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels}")
     if not scene.lit:
         return np.zeros((scene.n_objects, n_detectors))
     return analyser.photoelectrons(images) * (exposure_us / analyser.exposure_us)

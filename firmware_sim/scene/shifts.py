@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 
 from .optics import grey_steps, photons_per_level
@@ -48,23 +47,21 @@ def shift_table(
 ) -> ShiftTable:
     """Tabulate `scene`'s pictures under `levels`, uint16 (patterns, pixels), at vertical offsets -offset_px..offset_px.
 
-    `background` is the transmission of the field where no picture stands. ConfigError when the patterns are of another size or the table
+    `background` is the transmission of the field where no picture stands. ValueError when the patterns are of another size or the table
     would be larger than MAX_TABLE_BYTES.
     """
     n_patterns, n_pixels = levels.shape
     n, height, width = scene.images.shape
     if n_pixels != height * width:
-        raise ConfigError(
-            f"patterns have {n_pixels} pixels, the cells of {scene.name!r} have {height * width} ({height} x {width})",
-            remedy="choose cells of the same image shape",
+        raise ValueError(
+            f"patterns have {n_pixels} pixels, the cells of {scene.name!r} have {height * width} ({height} x {width})"
         )
     _check_size(scene, n_patterns, offset_px)
     grey, white = grey_steps(profile)
     totals = levels.sum(axis=1, dtype=np.float64)
     if totals.max() * white > _U32_MAX:
-        raise ConfigError(
-            f"a pattern's levels sum to {totals.max():.0f}: with {white} grey steps the table holds at most {_U32_MAX // white}",
-            remedy="fewer levels, or darker patterns",
+        raise ValueError(
+            f"a pattern's levels sum to {totals.max():.0f}: with {white} grey steps the table holds at most {_U32_MAX // white}"
         )
     shape = (n, 2 * offset_px + 1, 2 * width + 1, n_patterns)
     sums = np.empty(shape, np.uint32)
@@ -88,10 +85,10 @@ def _check_size(scene: Scene, n_patterns: int, offset_px: int) -> None:
     n, _, width = scene.images.shape
     n_bytes = 4 * n * (2 * offset_px + 1) * (2 * width + 1) * n_patterns
     if n_bytes > MAX_TABLE_BYTES:
-        raise ConfigError(
+        raise ValueError(
             f"{n} pictures x {2 * offset_px + 1} offsets x {2 * width + 1} shifts x {n_patterns} patterns need {n_bytes >> 20} MiB,"
-            f" the simulator's table holds {MAX_TABLE_BYTES >> 20} MiB",
-            remedy=f"at most {n * MAX_TABLE_BYTES // n_bytes} pictures, or a smaller offset_px",
+            f" the simulator's table holds {MAX_TABLE_BYTES >> 20} MiB"
+            f" (at most {n * MAX_TABLE_BYTES // n_bytes} pictures, or a smaller offset_px)"
         )
 
 

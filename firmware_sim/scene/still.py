@@ -2,7 +2,7 @@
 
 Owns the scene file (`.npz` with `images`, `labels`, `classes`), the shipped scenes, the targets `uniform` and `dark`.
 Never computes light or clicks (optics.py, detector.py). `load_scene` returns a frozen `Scene` or raises ConfigError; a
-scene file from a stranger is measured before anything is allocated, and never unpickled.
+scene file is measured before anything is allocated, and never unpickled.
 """
 
 from __future__ import annotations

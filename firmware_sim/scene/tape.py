@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.messages import NO_OBJECT
 
@@ -47,9 +46,8 @@ class BarTable:
         n_patterns, n_pixels = levels.shape
         width = tape.bars * tape.pixels_per_bar
         if n_pixels % width:
-            raise ConfigError(
-                f"patterns have {n_pixels} pixels, the tape needs a multiple of {width} ({tape.bars} bars of {tape.pixels_per_bar})",
-                remedy="patterns and tape must agree on bars and pixels_per_bar",
+            raise ValueError(
+                f"patterns have {n_pixels} pixels, the tape needs a multiple of {width} ({tape.bars} bars of {tape.pixels_per_bar})"
             )
         columns = levels.reshape(n_patterns, -1, width).sum(axis=1, dtype=np.float64)
         unit, t_min = photons_per_level(profile, exposure_us), profile.min_transmission

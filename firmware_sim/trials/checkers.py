@@ -1,4 +1,4 @@
-"""What must hold whatever the link does: the instrument's own books against what the host concluded, while the run goes on.
+"""What must hold whatever the link does: what the instrument logged against what the host concluded, while the run goes on.
 
 Owns the ledger of what was emitted and executed, and the comparison; never changes a byte. It sees the instrument from inside and
 the host's core from its calls, and shares no code with either's accounting. `Checker.violations` lists what was found, at most 20.
@@ -141,7 +141,7 @@ class Checker:
         if gate in self._executed:
             self.fail(f"the gate for tick {gate.tick} was executed twice")
         if gate not in self._asked:
-            self.fail(f"a gate for tick {gate.tick} was executed that nobody asked for")
+            self.fail(f"a gate for tick {gate.tick} was executed without a command")
         self._executed[gate] = None
         _forget_oldest(self._executed, MAX_GATES)
 
@@ -348,6 +348,6 @@ def _window_members(plan: Plan, shots: int) -> tuple[list[NDArray[np.int64]], li
     return [np.array(one, np.int64) for one in members], [np.array(one, np.int64) for one in features]
 
 
-def _forget_oldest(books: dict[Any, Any], most: int) -> None:
-    while len(books) > most:
-        del books[next(iter(books))]
+def _forget_oldest(log: dict[Any, Any], most: int) -> None:
+    while len(log) > most:
+        del log[next(iter(log))]

@@ -23,7 +23,7 @@ from pans.runtime.intervals import wilson_interval
 from . import Report, Trial, option, rows_report
 
 BATCH = 1 << 20
-FACTOR, DELAY_FACTOR = 1.5, 1.25
+FACTOR, DELAY_FACTOR = 1.5, 1.25  # the bars: of the stated false-alarm rate, and of the optimal delay
 DOUBLED = 2.0
 
 

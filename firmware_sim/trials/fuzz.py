@@ -1,4 +1,4 @@
-"""Bytes and frames that nobody would send (`pans fuzz`), at the decoder, the instrument and the host's session and core.
+"""Bytes and frames that no host or instrument sends (`pans fuzz`), at the decoder, the instrument and the host's session and core.
 
 Owns the making of strange input and the limits that must hold; never changes what it tests. Random bytes go to the decoder and through the
 whole instrument; structured frames have a right CRC and strange contents. After every batch the limits are checked: held bytes, queued
@@ -60,7 +60,7 @@ class LimitBroken(AssertionError):
 
 @dataclass(slots=True)
 class FuzzCounts:
-    """How much was thrown, and how far it came: a fuzzer that is always refused at the door proves little."""
+    """How much was sent, and how far it came: a fuzzer whose input is always refused at once proves little."""
 
     bytes: int = 0
     frames: int = 0
@@ -88,7 +88,7 @@ class Fuzzer:
         self._fresh_host()
 
     def random_bytes(self, size: int) -> None:
-        """Throw `size` bytes at the decoder, the instrument and the host, in pieces of all sizes."""
+        """Send `size` bytes at the decoder, the instrument and the host, in pieces of all sizes."""
         data = self._strange_bytes(size)
         decoder, compiled = self._decoder, self._compiled
         position = 0
@@ -109,7 +109,7 @@ class Fuzzer:
             raise LimitBroken(f"the decoders counted {decoder.counters} and, compiled, {compiled.counters}")
 
     def structured_frames(self, count: int) -> None:
-        """Throw `count` frames with a right CRC at the instrument and at the host, and what the instrument answers at the host."""
+        """Send `count` frames with a right CRC at the instrument and at the host, and what the instrument answers at the host."""
         for _ in range(count // 2):
             self._device_takes(self._frame_for_device())
             self._host_takes(self._frame_for_host())
@@ -318,7 +318,7 @@ class _AnyDecider:
 
 
 def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:
-    """Throw that much; return the counts and "" or what went wrong, with a traceback."""
+    """Send that much; return the counts and "" or what went wrong, with a traceback."""
     fuzzer = Fuzzer(seed)
     counts = fuzzer.counts
     try:
@@ -335,7 +335,7 @@ def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How much to throw, divided over how many seeds."""
+    """How much to send, divided over how many seeds."""
 
     bytes: int = option(100_000_000, "random bytes (default 100 million)")
     frames: int = option(1_000_000, "structured frames (default one million)")
@@ -344,7 +344,7 @@ class Settings:
 
 
 def run(settings: Settings) -> Report:
-    """Throw it, seed by seed, until something is found."""
+    """Send it, seed by seed, until something is found."""
     started = time.perf_counter()
     total: dict[str, float] = {}
     parts = settings.parts

@@ -68,7 +68,7 @@ class LightLog(Instrument):
 
 
 def lit_host(url: str) -> None:
-    """A host that runs until somebody ends it."""
+    """A host that runs until it is killed."""
     profile, bundle, plan = small_setup("sequential")
     config = RunConfig(deadline_us=1e9, lease_ms=LEASE_MS, realtime=False)
     run_live(open_link(url), profile, bundle, plan, Core(plan, make_decider(bundle), 1, 0), config)

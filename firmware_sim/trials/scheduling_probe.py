@@ -1,7 +1,7 @@
 """A scheduling probe: a process of high priority on a core, which wakes at a fixed pace and notes when it was kept from waking.
 
-Owns the probe, both ends of it; never says who is to blame for a gap (the field's tool of this kind is cyclictest). Two things keep a
-process of the highest priority from a core: the hypervisor runs somebody else (its timer then fires late), or the kernel lets others run
+Owns the probe, both ends of it; never attributes a gap (the usual tool of this kind is cyclictest). Two things keep a
+process of the highest priority from a core: the hypervisor runs another machine (its timer then fires late), or the kernel runs others
 before it (it then waits in the run queue: real-time throttling, the share that kernels from 6.12 on keep for ordinary programs). It
 runs as a `Child` until SIGTERM (or until its parent is gone), then says one JSON object. Linux, with the right to SCHED_FIFO. Times are
 those of time.perf_counter_ns, common to all processes.

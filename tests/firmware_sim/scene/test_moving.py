@@ -26,7 +26,7 @@ from moving_scenes import (
 from naive_moving import mean_light, shifted, tape_field
 
 from pans.firmware_sim.commands import bench_flow
-from pans.firmware_sim.device import parallel as frame_run
+from pans.firmware_sim.device import parallel
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.parallel import FrameRun
 from pans.firmware_sim.device.sequential import Measurement
@@ -163,9 +163,9 @@ def test_cells_that_overlap_add_up_to_the_open_field_at_most() -> None:
 
 def test_a_table_too_large_is_refused_with_the_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shifts, "MAX_TABLE_BYTES", 4 * 2 * 5 * 17 * 3)
-    with pytest.raises(ConfigError, match=r"5 pictures x 5 offsets x 17 shifts x 3 patterns need 0 MiB") as caught:
+    size = r"5 pictures x 5 offsets x 17 shifts x 3 patterns need 0 MiB.*at most 2 pictures"
+    with pytest.raises(ValueError, match=size):
         shift_table(FLOW, PICTURES, LEVELS, 2.0, 2, 0.0)
-    assert "at most 2 pictures" in caught.value.remedy
 
 
 def test_tape_light_is_the_mean_of_the_drawn_bars() -> None:
@@ -322,7 +322,7 @@ def test_batches_and_chunks_change_nothing(what: Any, monkeypatch: pytest.Monkey
     whole = story()
     assert len(whole) > 120
     for size in (1, 37, 10_000):
-        monkeypatch.setattr(frame_run, "STRETCH_EXPOSURES", size)
+        monkeypatch.setattr(parallel, "STRETCH_EXPOSURES", size)
         assert story() == whole
         assert story(ahead=True) == whole
 
@@ -407,7 +407,7 @@ def test_a_moving_scene_needs_all_channels_at_once(tmp_path: Path) -> None:
 
 
 def test_bars_that_do_not_fit_the_patterns_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"patterns have 48 pixels, the tape needs a multiple of 40"):
+    with pytest.raises(ValueError, match=r"patterns have 48 pixels, the tape needs a multiple of 40"):
         BarTable(FLOW, TAPE, LEVELS, 2.0)
 
 

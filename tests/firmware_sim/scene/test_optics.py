@@ -10,7 +10,6 @@ import pytest
 from pans.firmware_sim.scene import optics
 from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
 from pans.firmware_sim.scene.still import Scene, load_scene, scene_from_arrays
-from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import ObjectModulator, Profile, load_profile
 
@@ -56,11 +55,11 @@ def test_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_patterns_of_another_shape_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"patterns have 41 pixels, scene 'noise' has 42 \(7 x 6\)"):
+    with pytest.raises(ValueError, match=r"patterns have 41 pixels, scene 'noise' has 42 \(7 x 6\)"):
         expected_photoelectrons(load_profile("ideal"), SCENE, LEVELS[:, :41], 1000.0)
 
 
 def test_the_table_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optics, "MAX_TABLE_ENTRIES", 35)
-    with pytest.raises(ConfigError, match="9 objects x 4 patterns"):
+    with pytest.raises(ValueError, match="9 objects x 4 patterns"):
         expected_photoelectrons(load_profile("ideal"), SCENE, LEVELS, 1000.0)

@@ -1,4 +1,4 @@
-"""Strange input at every door, in short; `pans fuzz` throws a hundred million bytes. Planted bugs must be found."""
+"""Strange input at every interface, in short; `pans fuzz` throws a hundred million bytes. Planted bugs must be found."""
 
 from __future__ import annotations
 
