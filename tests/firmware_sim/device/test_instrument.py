@@ -113,8 +113,19 @@ class Bench:
         self.upload(levels, [0, 1, DARK_PATTERN] if shown is None else shown, **changes)
         return self
 
-    def arm(self, start: int = 2000, cycles: int = 2, lease_ms: int = 100) -> None:
+    def arm(self, start: int = 2000, cycles: int = 2, lease_ms: int = 100) -> Bench:
         self.done(Opcode.ARM, pack_arm(Arm(start, cycles, lease_ms)))
+        return self
+
+    def granted(self) -> Bench:
+        self.grant()
+        return self
+
+
+def greeted(*args: Any, **options: Any) -> Bench:
+    bench = Bench(*args, **options)
+    bench.hello()
+    return bench
 
 
 def slots_at(patterns: list[int], period: int = 100) -> np.ndarray:
@@ -154,8 +165,7 @@ def test_handshake() -> None:
 def test_a_whole_run_tick_by_tick() -> None:
     bench = Bench().ready(np.array([[0, 0], [FULL, FULL]], np.uint16))
     bench.got.clear()
-    bench.arm(start=2000, cycles=2)
-    bench.grant()
+    bench.arm(start=2000, cycles=2).granted()
     bench.run_to(3000)
     photons = 2 * 10_000.0 * 80e-6
     story = [(tick, message) for tick, message in bench.got if not isinstance(message, wire.ClickBlock | wire.Ack)]
@@ -177,9 +187,7 @@ def test_a_whole_run_tick_by_tick() -> None:
 
 def test_the_first_block_byte_by_byte() -> None:
     """Written from docs/reference/protocol.md with struct and zlib alone."""
-    bench = Bench().ready(np.full((2, 1), FULL, np.uint16), exposure_ticks=90)
-    bench.arm(start=2000, cycles=1)
-    bench.grant()
+    bench = Bench().ready(np.full((2, 1), FULL, np.uint16), exposure_ticks=90).arm(start=2000, cycles=1).granted()
     bench.device.step(2289, b"")
     sent = bench.device.step(2290, b"")
     frame = uncobs(sent[: sent.index(0)])
@@ -201,15 +209,13 @@ def uncobs(data: bytes) -> bytes:
 
 
 def test_ping_is_answered_with_the_tick_of_its_arrival() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     bench.run_to(5000)
     assert bench.send(wire.encode_ping(7, 123456789, NONCE)) == [wire.Pong(7, 123456789, 5000, 5000)]
 
 
 def test_status_comes_once_per_second() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     bench.got.clear()
     bench.run_to(POWER_ON + 3_500_000)
     assert [tick for tick, _ in bench.got] == [POWER_ON + 1_000_000 * second for second in (1, 2, 3)]
@@ -224,9 +230,7 @@ def test_before_a_session_the_device_is_silent() -> None:
 
 def test_an_object_lasts_its_cycles() -> None:
     scene = scene_from_arrays("three", np.zeros((3, 2, 2), np.uint8), np.array([5, 6, 7]), tuple("abcdefgh"))
-    bench = Bench(scene=scene).ready(cycles_per_object=2)
-    bench.arm(cycles=9)
-    bench.grant()
+    bench = Bench(scene=scene).ready(cycles_per_object=2).arm(cycles=9).granted()
     marks = of_type(bench.run_to(10_000), wire.Mark)
     assert [(mark.object_index, mark.truth, mark.exposure_index, mark.tick) for mark in marks] == [
         (0, 5, 0, 2000), (1, 6, 6, 2600), (2, 7, 12, 3200), (3, 5, 18, 3800), (4, 6, 24, 4400),
@@ -238,8 +242,7 @@ def test_blocks_end_at_their_length_at_a_gap_and_at_the_cycle() -> None:
     slots["offset_ticks"][4:] += 50
     bench = Bench().ready()
     bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0] * 6, slots=slots, cycle_ticks=650, block_exposures=3)))
-    bench.arm(cycles=1)
-    bench.grant()
+    bench.arm(cycles=1).granted()
     blocks = of_type(bench.run_to(4000), wire.ClickBlock)
     assert [(block.exposure_index, block.tick, len(block.bits)) for block in blocks] == [
         (0, 2000, 3), (3, 2300, 1), (4, 2450, 2),
@@ -318,9 +321,7 @@ def parallel_bench(n_channels: int = 10, **options: Any) -> Bench:
 
 
 def test_parallel_frames_pack_one_bit_per_channel() -> None:
-    bench = parallel_bench()
-    bench.arm(start=2000, cycles=1000, lease_ms=1000)
-    bench.grant()
+    bench = parallel_bench().arm(start=2000, cycles=1000, lease_ms=1000).granted()
     blocks = of_type(bench.run_to(2000 + 1000 * 30_000), wire.FrameBlock)
     assert len(blocks) == 1000
     assert all(block.words.shape == (3, 2) for block in blocks)
@@ -381,9 +382,7 @@ def test_time_does_not_go_back() -> None:
 
 
 def test_a_repeated_command_is_acknowledged_and_not_executed_again() -> None:
-    bench = Bench().ready()
-    bench.arm(start=2000, cycles=0)
-    bench.grant()
+    bench = Bench().ready().arm(start=2000, cycles=0).granted()
     bench.run_to(2500)
     arm_id = bench.command_id
     bench.done(Opcode.STOP)
@@ -393,8 +392,7 @@ def test_a_repeated_command_is_acknowledged_and_not_executed_again() -> None:
 
 
 def test_a_command_after_a_lost_one_waits_for_its_turn() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     body = pack_pattern(PatternChunk(0, 0, 1, np.array([1], np.uint16)))
     assert bench.command(Opcode.LOAD_PATTERN, body, command_id=2).last_id == 0
     assert bench.command(Opcode.LOAD_PATTERN, body, command_id=1).last_id == 1
@@ -403,8 +401,7 @@ def test_a_command_after_a_lost_one_waits_for_its_turn() -> None:
 
 
 def test_the_latest_refusal_stays_in_later_acknowledgements() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     bench.refused(0x77)
     ack = bench.command(Opcode.STOP)
     assert (ack.last_id, ack.refused_id, ack.status, ack.refused_mask) == (2, 1, AckStatus.UNKNOWN_OPCODE, 2)
@@ -427,8 +424,7 @@ PATTERN_FAULTS = [
 
 @pytest.mark.parametrize(("changes", "text"), PATTERN_FAULTS)
 def test_an_impossible_pattern_is_refused(changes: dict[str, Any], text: str) -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     status, said = bench.refused(Opcode.LOAD_PATTERN, pattern_body(**changes))
     assert status == AckStatus.OUT_OF_RANGE
     assert text in said
@@ -442,8 +438,7 @@ def test_levels_above_the_projector_are_refused() -> None:
 
 
 def test_pattern_memory_is_limited_in_bytes() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     statuses = []
     for index in range(33):
         ack = bench.command(Opcode.LOAD_PATTERN, pattern_body(pattern=index, n_pixels=1 << 22))
@@ -493,8 +488,7 @@ def test_a_plan_in_two_chunks() -> None:
     other = whole._replace(first_slot=3, slots=whole.slots[3:])
     assert "does not continue" in bench.refused(Opcode.LOAD_PLAN, pack_plan(other._replace(exposure_ticks=90)))[1]
     bench.done(Opcode.LOAD_PLAN, pack_plan(other))
-    bench.arm(cycles=1)
-    bench.grant()
+    bench.arm(cycles=1).granted()
     assert len(of_type(bench.run_to(3000), wire.ClickBlock)[0].bits) == 4
 
 
@@ -514,8 +508,7 @@ def test_an_impossible_arm_is_refused(arm: Arm, status: int, text: str) -> None:
 
 
 def test_arming_needs_a_plan_and_all_its_patterns() -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     arm = pack_arm(Arm(2000, 1, 100))
     assert bench.refused(Opcode.ARM, arm) == (AckStatus.WRONG_STATE, "no complete plan is loaded")
     bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [0, 1])))
@@ -536,8 +529,7 @@ def test_a_scene_of_another_shape_is_refused_with_the_numbers() -> None:
 
 
 def test_uploads_need_idle() -> None:
-    bench = Bench().ready()
-    bench.arm()
+    bench = Bench().ready().arm()
     for opcode, body in [(Opcode.LOAD_PATTERN, pattern_body()), (Opcode.ARM, pack_arm(Arm(9000, 1, 9)))]:
         assert bench.refused(opcode, body)[0] == AckStatus.WRONG_STATE
 
@@ -545,8 +537,7 @@ def test_uploads_need_idle() -> None:
 @given(st.binary(max_size=200), st.sampled_from([*Opcode, 0, 200]))
 @settings(max_examples=200, deadline=None)
 def test_no_command_body_brings_the_device_down(body: bytes, opcode: int) -> None:
-    bench = Bench()
-    bench.hello()
+    bench = greeted()
     assert bench.command(opcode, body).last_id == 1
 
 
@@ -562,8 +553,7 @@ def test_no_frame_brings_the_device_down(payload: bytes, kind: int) -> None:
 
 
 def test_an_expired_lease_latches_the_device_dark() -> None:
-    bench = Bench().ready()
-    bench.arm(start=2000, cycles=0, lease_ms=10)
+    bench = Bench().ready().arm(start=2000, cycles=0, lease_ms=10)
     bench.grant(lease_ms=0)  # no renewal
     bench.done(Opcode.GATE, pack_gate(Gate(10_500, 5000, 2)))
     bench.run_to(10_900)
@@ -585,8 +575,7 @@ def test_an_expired_lease_latches_the_device_dark() -> None:
 
 
 def test_a_renewed_lease_keeps_the_run_going() -> None:
-    bench = Bench().ready()
-    bench.arm(start=2000, cycles=0, lease_ms=10)
+    bench = Bench().ready().arm(start=2000, cycles=0, lease_ms=10)
     for tick in range(10_000, 100_000, 9_000):
         bench.run_to(tick)
         bench.grant(lease_ms=10)
@@ -596,15 +585,13 @@ def test_a_renewed_lease_keeps_the_run_going() -> None:
 
 
 def test_the_lease_runs_while_armed() -> None:
-    bench = Bench().ready()
-    bench.arm(start=500_000, lease_ms=10)
+    bench = Bench().ready().arm(start=500_000, lease_ms=10)
     bench.run_to(11_000)
     assert bench.device.state is DeviceState.SAFE
 
 
 def test_hello_ends_a_run_and_forgets_uploads() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=0)
+    bench = Bench().ready().arm(cycles=0)
     bench.run_to(2100)
     bench.send(wire.encode_hello(NONCE))  # a repetition changes nothing
     assert bench.device.state is DeviceState.RUNNING
@@ -614,9 +601,7 @@ def test_hello_ends_a_run_and_forgets_uploads() -> None:
 
 
 def test_stop_sends_what_was_exposed() -> None:
-    bench = Bench().ready()
-    bench.arm(start=2000, cycles=0)
-    bench.grant()
+    bench = Bench().ready().arm(start=2000, cycles=0).granted()
     bench.run_to(2190)  # two exposures have ended, the third has not begun
     answers = bench.send(wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE))
     block, status, ack = answers
@@ -626,9 +611,7 @@ def test_stop_sends_what_was_exposed() -> None:
 
 
 def test_an_exposure_broken_off_is_no_exposure() -> None:
-    bench = Bench().ready()
-    bench.arm(start=2000, cycles=0)
-    bench.grant()
+    bench = Bench().ready().arm(start=2000, cycles=0).granted()
     bench.run_to(2150)
     answers = bench.send(wire.encode_command(bench.command_id + 1, Opcode.STOP, b"", NONCE))
     assert [block.patterns.tolist() for block in of_type(answers, wire.ClickBlock)] == [[0]]
@@ -639,8 +622,7 @@ def test_an_exposure_broken_off_is_no_exposure() -> None:
 
 
 def test_a_gate_opens_at_its_tick_for_its_time() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=0)
+    bench = Bench().ready().arm(cycles=0)
     bench.done(Opcode.GATE, pack_gate(Gate(3000, 50, 1)))
     assert list(bench.device.gates.pulses) == [GatePulse(3000, 3050, 1)]
     states = []
@@ -670,8 +652,7 @@ def test_a_late_gate_is_not_executed() -> None:
 
 
 def test_stop_closes_gates_and_cancels_those_to_come() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=0)
+    bench = Bench().ready().arm(cycles=0)
     bench.done(Opcode.GATE, pack_gate(Gate(3000, 5000, 1)))
     bench.done(Opcode.GATE, pack_gate(Gate(9000, 50, 2)))
     bench.run_to(4000)
@@ -680,8 +661,7 @@ def test_stop_closes_gates_and_cancels_those_to_come() -> None:
 
 
 def test_pending_gates_are_limited() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=0)
+    bench = Bench().ready().arm(cycles=0)
     for number in range(MAX_PENDING_GATES):
         bench.done(Opcode.GATE, pack_gate(Gate(5000 + number, 1, 0)))
     assert "pending" in bench.refused(Opcode.GATE, pack_gate(Gate(9000, 1, 0)))[1]
@@ -695,8 +675,7 @@ def test_pending_gates_are_limited() -> None:
 
 
 def test_nothing_is_streamed_without_a_grant() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=3)
+    bench = Bench().ready().arm(cycles=3)
     assert of_type(bench.run_to(5000), wire.ClickBlock) == []
     released = bench.grant(limit=3)
     assert [message.seq for message in released] == [0, 1, 2]
@@ -712,8 +691,7 @@ def test_a_grant_just_before_arm_counts() -> None:
 
 
 def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
-    bench = Bench(buffer_messages=4).ready()
-    bench.arm(cycles=10)
+    bench = Bench(buffer_messages=4).ready().arm(cycles=10)
     bench.run_to(2000 + 5 * 300 - 1)  # five marks and blocks: four messages are held, three blocks and marks dropped
     kept = bench.grant(limit=100)
     assert [message.seq for message in kept] == [0, 1, 2, 3]
@@ -727,8 +705,7 @@ def test_a_full_buffer_drops_whole_blocks_and_says_so() -> None:
 
 
 def test_every_exposure_is_delivered_or_counted() -> None:
-    bench = Bench(buffer_messages=3).ready()
-    bench.arm(cycles=40)
+    bench = Bench(buffer_messages=3).ready().arm(cycles=40)
     rng = np.random.default_rng(0)
     limit, delivered = 0, 0
     messages = []
@@ -744,8 +721,7 @@ def test_every_exposure_is_delivered_or_counted() -> None:
 
 
 def test_the_window_compares_modulo_2_to_the_32() -> None:
-    bench = Bench().ready()
-    bench.arm(cycles=0)
+    bench = Bench().ready().arm(cycles=0)
     bench.device.stream.sequence = 0xFFFFFFFE
     bench.grant(limit=0xFFFFFFFF)
     assert [message.seq for message in bench.run_to(2599) if hasattr(message, "seq")] == [0xFFFFFFFE]
