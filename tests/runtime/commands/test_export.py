@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import json_of
 
 from pans.runtime.cli import main
 from pans.runtime.record import read_recording
@@ -68,10 +69,7 @@ def make_parallel(path: Path) -> None:
 
 
 def exported(path: Path, form: str, out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main(["export", str(path), "--format", form, "-o", str(out), "--json"]) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
+    return json_of(capsys, "export", path, "--format", form, "-o", out)
 
 
 def test_csv_holds_every_click_and_decision(run_of: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,23 +33,11 @@ def test_a_recording_s_page(demo: Path, tmp_path: Path) -> None:
     words = words_of(page)
     summary = read_recording(demo).summary
     assert "SIMULATED" in words
-    for text in (
-        f"{100 * summary['accuracy']:.2f} %",
-        f"{summary['clicks_mean']:.3f}",
-        f"{summary['photons_mean']:.3f}",
-    ):
+    for text in (f"{100 * summary['accuracy']:.2f} %", *(f"{summary[k]:.3f}" for k in ("clicks_mean", "photons_mean"))):
         assert text in words
     assert summary["decisions_sha256"] in words
-    for section in (
-        "Results",
-        "Decisions by class",
-        "Timing",
-        "Clicks over time",
-        "Dark counts",
-        "Clock",
-        "Events",
-        "What was run",
-    ):
+    sections = ("Results", "Decisions by class", "Timing", "Clicks over time", "Dark counts", "Clock", "Events")
+    for section in (*sections, "What was run"):
         assert f"<h2>{section}</h2>" in page
     assert len(re.findall(r"<img [^>]*src=\"data:image/", page)) == 7
     outside = re.findall(r'(?:src|href)="(?!data:)[^"]*"|url\(|<script|@import', page)

@@ -26,8 +26,6 @@ from pans.firmware_sim.ports.protocol_panssim import register
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.testing import small_setup
-from pans.runtime.bundle.model import Bundle
-from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError, UsageError
@@ -38,7 +36,7 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import LinkReader
 from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link.usb import UsbLink, usb_target
-from pans.runtime.live import Observers, Recovery, RunConfig, run_live
+from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
 from pans.runtime.wire import messages as wire
 
 PATIENCE_S = 20.0
@@ -177,14 +175,16 @@ def test_when_the_instrument_vanishes_the_reader_ends_loudly(rigged: Rig) -> Non
     reader.stop()
 
 
-def one_shot_core(plan: Plan, bundle: Bundle, config: RunConfig) -> Core:
-    return Core(plan, make_decider(bundle), 1, config.n_cycles)
+def run_on(link: Link, n_cycles: int, recovery: Recovery | None = None, pull: Any = None) -> RunResult:
+    """Run `n_cycles` one-shot cycles of the small set-up on `link`; `pull` observes each block."""
+    profile, bundle, plan = small_setup("sequential")
+    core = Core(plan, make_decider(bundle), 1, n_cycles)
+    config = RunConfig(n_cycles=n_cycles, deadline_us=1e9, realtime=False)
+    return run_live(link, profile, bundle, plan, core, config, recovery=recovery, observers=Observers(pull))
 
 
 def test_a_whole_run_decides(rigged: Rig) -> None:
-    profile, bundle, plan = small_setup("sequential")
-    config = RunConfig(n_cycles=200, deadline_us=1e9, realtime=False)
-    result = run_live(rigged.link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
+    result = run_on(rigged.link, 200)
     assert (result.ended, result.tally.decisions, result.tally.abstained) == ("completed", 200, 0)
     assert result.stream["lost_exposures"] == 0
     assert result.device["simulated"] is True
@@ -193,7 +193,6 @@ def test_a_whole_run_decides(rigged: Rig) -> None:
 def test_a_device_that_comes_back_is_found_again() -> None:
     """Over pyusb: the cable is pulled after some blocks and plugged in again; the run goes on and completes."""
     made = rig("usb")
-    profile, bundle, plan = small_setup("sequential")
     seen = [0]
 
     def pull(run: Any, output: Any) -> None:
@@ -207,18 +206,8 @@ def test_a_device_that_comes_back_is_found_again() -> None:
 
     recovery = Recovery.of(made.link, made.url, 10.0)
     recovery = Recovery(recovery.reopen, 10.0, plug)
-    config = RunConfig(n_cycles=400, deadline_us=1e9, realtime=False)
     try:
-        result = run_live(
-            made.link,
-            profile,
-            bundle,
-            plan,
-            one_shot_core(plan, bundle, config),
-            config,
-            recovery=recovery,
-            observers=Observers(pull),
-        )
+        result = run_on(made.link, 400, recovery, pull)
     finally:
         made.link.close()
     assert (result.ended, result.reconnects, result.link_lost) == ("completed", 1, False)
@@ -230,26 +219,12 @@ def test_a_device_that_comes_back_is_found_again() -> None:
 
 def test_a_device_that_stays_away_ends_the_run_loudly() -> None:
     made = rig("virtual")
-    profile, bundle, plan = small_setup("sequential")
-
-    def pull(run: Any, output: Any) -> None:
-        made.vanish()
 
     def absent(lost: Link) -> Link:
         raise LinkError("it is not there")
 
     recovery = Recovery(absent, 5.0, made.link.pause)  # type: ignore[attr-defined]
-    config = RunConfig(n_cycles=400, deadline_us=1e9)
-    result = run_live(
-        made.link,
-        profile,
-        bundle,
-        plan,
-        one_shot_core(plan, bundle, config),
-        config,
-        recovery=recovery,
-        observers=Observers(pull),
-    )
+    result = run_on(made.link, 400, recovery, lambda run, output: made.vanish())
     assert result.link_lost
     assert result.ended == "the link was lost: it is not there (5 attempts in 5 s)"
 
@@ -350,6 +325,12 @@ def test_an_ftdi_adapters_latency_is_read(tmp_path: Any) -> None:
 # -- the reader --------------------------------------------------------------------------------------------------------
 
 
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition() and time.monotonic() < deadline:
+        threading.Event().wait(0.001)
+
+
 class Flood:
     """A link that never runs dry."""
 
@@ -376,9 +357,7 @@ def test_the_readers_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_reader, "MAX_QUEUED_BYTES", 10_000)
     flood = Flood()
     reader = LinkReader(flood)
-    deadline = time.monotonic() + PATIENCE_S
-    while reader._queued_bytes <= 10_000 and time.monotonic() < deadline:
-        threading.Event().wait(0.001)
+    wait_for(lambda: reader._queued_bytes > 10_000)
     first = flood.reads
     threading.Event().wait(0.02)
     assert flood.reads <= first + 1  # the thread has stopped reading
@@ -426,9 +405,7 @@ def test_a_link_that_breaks_while_the_loop_is_busy_ends_every_further_wait() -> 
     reader = LinkReader(link)
     assert reader.wait(0.1)
     link.broken = True
-    deadline = time.monotonic() + PATIENCE_S
-    while reader._death is None and time.monotonic() < deadline:
-        threading.Event().wait(0.001)
+    wait_for(lambda: reader._death is not None)
     for _ in range(3):
         with pytest.raises(LinkError, match="the cable was pulled"):
             while True:
@@ -498,9 +475,7 @@ def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypa
     thread.start()
     try:
         link = open_link(f"pipe:{tmp_path}/lab")
-        profile, bundle, plan = small_setup("sequential")
-        config = RunConfig(n_cycles=100, deadline_us=1e9, realtime=False)
-        result = run_live(link, profile, bundle, plan, one_shot_core(plan, bundle, config), config)
+        result = run_on(link, 100)
         assert (result.ended, result.tally.decisions) == ("completed", 100)
         link.close()
         with pytest.raises(LinkError, match="is closed"):

@@ -115,17 +115,8 @@ def bundle_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.skipif(not hasattr(signal, "SIGTERM") or sys.platform == "win32", reason="needs signals")
 @pytest.mark.parametrize(("limit", "code"), [([], 0), (["--seconds", "60"], 130)])
 def test_sigterm_ends_a_continuous_run_well(bundle_file: Path, tmp_path: Path, limit: list[str], code: int) -> None:
-    words = [
-        "run",
-        str(bundle_file),
-        "--device",
-        "sim:ideal?scene=uniform&seed=3",
-        "--out",
-        str(tmp_path / "out"),
-        "--no-realtime",
-        "--json",
-    ]
-    words += ["--rotate-mb", "0.02", "--state", str(tmp_path / "state.json"), *limit]
+    fixed = ["run", "--device", "sim:ideal?scene=uniform&seed=3", "--no-realtime", "--json", "--rotate-mb", "0.02"]
+    words = [*fixed, str(bundle_file), "--out", str(tmp_path / "out"), "--state", str(tmp_path / "state.json"), *limit]
     command = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen([sys.executable, "-c", command, *words], stdout=subprocess.PIPE, text=True)
     try:

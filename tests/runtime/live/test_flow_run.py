@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import json_of
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
@@ -30,22 +31,11 @@ FIELDS_PER_S = 20_000.0
 
 
 def run_command(
-    flow_folder: Path, capsys: pytest.CaptureFixture[str], *more: str, seconds: str = "0.1"
+    folder: Path, capsys: pytest.CaptureFixture[str], *more: str | Path, faults: str = "", code: int = 0
 ) -> dict[str, Any]:
-    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast"
-    command = [
-        "run",
-        str(flow_folder / "thirds.pans"),
-        "--device",
-        device,
-        "--flow",
-        str(flow_folder / "flow.toml"),
-        "--seconds",
-        seconds,
-    ]
-    assert main([*command, "--out", str(flow_folder / "out"), "--json", *more]) == 0
-    summary: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return summary
+    device = f"sim:flow-snspd?scene={folder / 'cells.toml'}&seed=4&pace=fast&faults={faults}"
+    words = (folder / "thirds.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder / "out")
+    return json_of(capsys, "run --seconds 0.1", *words, *more, code=code)
 
 
 def test_cells_are_decided_once_gated_on_time_and_replayed(
@@ -67,8 +57,7 @@ def test_cells_are_decided_once_gated_on_time_and_replayed(
     assert "yield (targets pulsed)" in page
     recording = read_recording(Path(summary["recording"]))
     assert recording.n_decisions == counts["decisions"]
-    assert main(["replay", summary["recording"], "--json"]) == 0
-    replayed = json.loads(capsys.readouterr().out)
+    replayed = json_of(capsys, "replay", summary["recording"])
     assert replayed["identical"] is True
     for key in ("accuracy", "passages", "aborted", "yield", "purity", "missed", "clicks_mean"):
         assert replayed[key] == summary[key]
@@ -99,24 +88,34 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
 
 
 def test_lost_blocks_are_never_decided_over(flow_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    device = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast&faults=loss:0.02"
-    command = [
-        "run",
-        str(flow_folder / "thirds.pans"),
-        "--device",
-        device,
-        "--flow",
-        str(flow_folder / "flow.toml"),
-        "--seconds",
-        "0.1",
-    ]
-    assert main([*command, "--out", str(flow_folder / "lossy"), "--json"]) != 0
-    summary = json.loads(capsys.readouterr().out)
+    summary = run_command(flow_folder, capsys, faults="loss:0.02", code=4)
     assert summary["lost"] > 0
     assert summary["aborted"]["gap"] > 0
     assert summary["accuracy_labelled"] > 0.97
     assert summary["passages"]["in_gaps"] > 0
-    assert main(["replay", summary["recording"], "--json"]) == 0
+    json_of(capsys, "replay", summary["recording"])
+
+
+def run_tape(
+    folder: Path, capsys: pytest.CaptureFixture[str], *, dark: float, bars_per_s: float, more: str = "", seconds: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a tape without crosstalk, 50 000 bars per second being said; return the summary and the enumerated figures."""
+    text = PROFILE.text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
+    if dark >= 0:
+        text = text.replace("dark_rate_hz = 130.0", f"dark_rate_hz = {dark / 5e-6:.6f}")
+    (folder / "tape-profile.toml").write_text(text)
+    (folder / "tape.toml").write_text(
+        f'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = {bars_per_s}\njitter_bars = 0.02\njitter_time_s = 0.01\n'
+    )
+    (folder / "flow.toml").write_text(f'kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\n{more}')
+    profile = load_profile(str(folder / "tape-profile.toml"))
+    bundle, figures = tape_bundle(
+        profile, photons=8.0, dark=max(dark, 0.0), pixels_per_bar=8, lit_px=2, exposure_us=5.0
+    )
+    write_bundle(bundle, folder / "tape.pans")
+    device = f"sim:{folder / 'tape-profile.toml'}?scene={folder / 'tape.toml'}&seed=9&pace=fast"
+    words = (folder / "tape.pans", "--device", device, "--flow", folder / "flow.toml", "--out", folder)
+    return json_of(capsys, f"run --seconds {seconds}", *words), figures
 
 
 @pytest.mark.parametrize("dark", [0.0, 0.01])
@@ -124,58 +123,22 @@ def test_a_tape_is_read_as_well_as_the_exact_optimum(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], dark: float
 ) -> None:
     """No crosstalk and a stated dark rate: then nothing but chance may lie between 12 000 bars and the enumerated accuracy."""
-    text = PROFILE.text.replace("dark_rate_hz = 130.0", f"dark_rate_hz = {dark / 5e-6:.6f}")
-    text = text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
-    (tmp_path / "dark.toml").write_text(text)
-    (tmp_path / "tape.toml").write_text(
-        'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = 50000.0\njitter_bars = 0.02\njitter_time_s = 0.01\n'
-    )
-    (tmp_path / "flow.toml").write_text('kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\n')
-    profile = load_profile(str(tmp_path / "dark.toml"))
-    bundle, figures = tape_bundle(profile, photons=8.0, dark=dark, pixels_per_bar=8, lit_px=2, exposure_us=5.0)
-    write_bundle(bundle, tmp_path / "tape.pans")
-    device = f"sim:{tmp_path / 'dark.toml'}?scene={tmp_path / 'tape.toml'}&seed=9&pace=fast"
-    command = [
-        "run",
-        str(tmp_path / "tape.pans"),
-        "--device",
-        device,
-        "--flow",
-        str(tmp_path / "flow.toml"),
-        "--seconds",
-        "0.24",
-    ]
-    assert main([*command, "--out", str(tmp_path), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary, figures = run_tape(tmp_path, capsys, dark=dark, bars_per_s=50_000.0, seconds="0.24")
     n, exact = summary["passages"]["alone"], figures["exact_accuracy"]
     assert n >= 11_990
     assert (summary["missed"], summary["doubled"]) == (0.0, 0.0)
     assert abs(summary["accuracy"] - exact) < 5 * math.sqrt(exact * (1 - exact) / n) + 0.0005
-    assert (
-        abs(summary["clicks_mean"] - figures["clicks_mean"]) < 5 * math.sqrt(2.5 / n) * 3 + 0.02
-    )  # neighbouring windows share bars
+    # neighbouring windows share bars
+    assert abs(summary["clicks_mean"] - figures["clicks_mean"]) < 5 * math.sqrt(2.5 / n) * 3 + 0.02
     assert summary["clicks_mean"] < 5.3
 
 
 def test_a_tape_that_is_faster_than_said_is_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = PROFILE.text.replace("crosstalk_probability = 0.001", "crosstalk_probability = 0.0")
-    (tmp_path / "even.toml").write_text(text)
-    (tmp_path / "tape.toml").write_text(
-        'kind = "tape"\nbars = 10\npixels_per_bar = 8\nspeed_bars_per_s = 50500.0\njitter_bars = 0.02\njitter_time_s = 0.01\n'
-    )
-    (tmp_path / "flow.toml").write_text('kind = "tape"\nbars_per_s = 50000.0\nblock_us = 500.0\ntrack = 3\n')
-    profile = load_profile(str(tmp_path / "even.toml"))
-    bundle, _ = tape_bundle(profile, photons=8.0, dark=0.0, pixels_per_bar=8, lit_px=2, exposure_us=5.0)
-    write_bundle(bundle, tmp_path / "tape.pans")
-    device = f"sim:{tmp_path / 'even.toml'}?scene={tmp_path / 'tape.toml'}&seed=9&pace=fast"
-    command = ["run", str(tmp_path / "tape.pans"), "--device", device, "--flow", str(tmp_path / "flow.toml")]
-    assert main([*command, "--seconds", "0.06", "--out", str(tmp_path), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
+    summary, _ = run_tape(tmp_path, capsys, dark=-1, bars_per_s=50_500.0, more="track = 3\n", seconds="0.06")
     assert summary["passages"]["alone"] > 3000
     assert summary["accuracy"] > 0.995  # not followed it is lost within 50 bars
     assert summary["flow"]["bars_per_s"] == pytest.approx(50_500.0, rel=0.005)
-    assert main(["replay", str(tmp_path / "run.pansrec"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["identical"]
+    assert json_of(capsys, "replay", tmp_path / "run.pansrec")["identical"]
 
 
 def test_the_exact_table_without_dark_counts_and_with_endless_light_is_the_truth() -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bundles import made_bundle
+from commands import json_of
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
-from pans.runtime.cli import main
 from pans.runtime.core.plan import build_plan
 from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks
 from pans.runtime.core.still import Core
@@ -55,6 +54,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def shown(bundle: Bundle) -> dict[str, Any]:
+    """What another bundle needs to show the same."""
+    names = ("classes", "image_shape", "levels", "pattern_levels", "photons_per_level")
+    return {name: getattr(bundle, name) for name in names}
+
+
 class Disturbed:
     """A link that passes every chunk from the device through `disturb`."""
 
@@ -68,21 +73,11 @@ class Disturbed:
 
 
 def run(
-    bundle: Bundle,
-    scene: Path,
-    n_objects: int = 6,
-    trials: int = 3,
-    shots: int = 1,
-    disturb: Any = None,
-    wrap: Any = None,
-    **options: Any,
+    bundle: Bundle, scene: Path, n_objects: int = 6, trials: int = 3, shots: int = 1, wrap: Any = None, **options: Any
 ) -> RunResult:
     plan = build_plan(PROFILE, bundle, shots_per_object=trials * shots, **options)
     link: Link = open_sim(f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast")
-    if disturb is not None:
-        link = Disturbed(link, disturb)
-    if wrap is not None:
-        link = wrap(link)
+    link = link if wrap is None else wrap(link)
     config = RunConfig(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
     return run_live(
         link, PROFILE, bundle, plan, Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles), config
@@ -134,7 +129,7 @@ def test_damaged_frames_become_flagged_decisions_never_wrong_ones(bundle: Bundle
             noisy[int(rng.integers(5, len(noisy) - 1))] ^= 0x10
         return bytes(noisy)
 
-    result = run(bundle, scene, n_objects=40, disturb=flip)
+    result = run(bundle, scene, n_objects=40, wrap=lambda link: Disturbed(link, flip))
     assert result.decoder["crc_errors"] + result.decoder["cobs_errors"] + result.decoder["short_frames"] > 0
     assert result.stream["lost_exposures"] > 0
     assert result.tally.decisions == 120
@@ -145,7 +140,7 @@ def test_damaged_frames_become_flagged_decisions_never_wrong_ones(bundle: Bundle
 
 def test_a_silent_device_is_a_link_error(bundle: Bundle, scene: Path) -> None:
     with pytest.raises(LinkError, match="no WELCOME"):
-        run(bundle, scene, disturb=lambda data: b"")
+        run(bundle, scene, wrap=lambda link: Disturbed(link, lambda data: b""))
 
 
 def test_a_device_that_dies_ends_the_run_loudly(bundle: Bundle, scene: Path) -> None:
@@ -155,7 +150,7 @@ def test_a_device_that_dies_ends_the_run_loudly(bundle: Bundle, scene: Path) -> 
         seen[0] += len(data)
         return data if seen[0] < 6000 else b""
 
-    result = run(bundle, scene, n_objects=200, disturb=die)
+    result = run(bundle, scene, n_objects=200, wrap=lambda link: Disturbed(link, die))
     assert result.ended == "the link was lost: the device fell silent"
     assert result.link_lost
 
@@ -169,7 +164,7 @@ def test_a_cable_that_is_pulled_still_gives_the_figures_so_far(bundle: Bundle, s
             raise LinkError("the cable was pulled")
         return data
 
-    result = run(bundle, scene, n_objects=200, disturb=pull)
+    result = run(bundle, scene, n_objects=200, wrap=lambda link: Disturbed(link, pull))
     assert result.link_lost
     assert "the cable was pulled" in result.ended
     assert 0 < result.tally.decisions < 600
@@ -196,11 +191,7 @@ def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     headed = made_bundle(
         name="headed",
-        classes=bundle.classes,
-        image_shape=bundle.image_shape,
-        levels=124,
-        pattern_levels=bundle.pattern_levels,
-        photons_per_level=bundle.photons_per_level,
+        **shown(bundle),
         head_onnx=model.SerializeToString(),
     )
     result = run(headed, scene, shots=4, trials=2)
@@ -222,53 +213,23 @@ def test_a_recording_replays_to_the_same_hash_and_another_bundle_does_not(
     path = tmp_path / "test.pans"
     write_bundle(bundle, path)
     device = f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast"
-    assert (
-        main(
-            [
-                "run",
-                str(path),
-                "--device",
-                device,
-                "--trials",
-                "2",
-                "--decisions",
-                "12",
-                "--out",
-                str(tmp_path),
-                "--json",
-            ]
-        )
-        == 0
-    )
-    summary = json.loads(capsys.readouterr().out)
+    words = ("--device", device, "--out", tmp_path)
+    summary = json_of(capsys, "run --trials 2 --decisions 12", path, *words)
     for key in (
-        "accuracy",
-        "clicks_mean",
-        "photons_mean",
-        "decisions",
-        "late",
-        "lost",
-        "latency_us",
-        "verdict",
-        "recording",
-        "report",
+        *("accuracy", "clicks_mean", "photons_mean", "decisions", "late", "lost", "latency_us"),
+        *("verdict", "recording", "report"),
     ):
         assert key in summary
     assert summary["simulated"] is True
     assert "SIMULATED" in Path(summary["report"]).read_text()
-    assert main(["replay", summary["recording"], "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["identical"] is True
+    assert json_of(capsys, "replay", summary["recording"])["identical"] is True
     assert len(read_recording(summary["recording"]).decisions()) == 12
 
     other = made_bundle(
         name="other",
-        classes=bundle.classes,
-        image_shape=bundle.image_shape,
-        levels=124,
-        pattern_levels=bundle.pattern_levels,
-        photons_per_level=bundle.photons_per_level,
+        **shown(bundle),
         table=-np.asarray(bundle.table),
     )
     write_bundle(other, tmp_path / "other.pans")
-    assert main(["replay", summary["recording"], "--bundle", str(tmp_path / "other.pans"), "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["identical"] is False
+    again = json_of(capsys, "replay", summary["recording"], "--bundle", tmp_path / "other.pans", code=1)
+    assert again["identical"] is False

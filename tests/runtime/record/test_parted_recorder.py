@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import json_of
 
 from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.testing import small_setup
@@ -84,10 +85,8 @@ def test_parts_hold_what_one_recording_would(parts: Path, tmp_path: Path) -> Non
 
 
 def test_the_commands_take_a_folder(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["verify", str(parts), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["ok"]
-    assert main(["replay", str(parts), "--json"]) == 0
-    payload = json.loads(capsys.readouterr().out)
+    assert json_of(capsys, "verify", parts)["ok"]
+    payload = json_of(capsys, "replay", parts)
     assert payload["identical"]
     assert len(payload["parts"]) == len(parts_in(parts))
     assert main(["verify", str(parts.parent), "--json"]) in (0, 2)

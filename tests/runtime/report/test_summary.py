@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from pans.runtime.cli import main
+from commands import json_of
 
 MEASURED = ("armed_after_s", "realtime", "recording", "report")  # of this machine and this run
 DEMO = ("demo", "--pace", "fast", "--trials", "2")
@@ -25,8 +24,7 @@ def test_the_summary_has_the_contracts_keys_order_and_values(
     kind: str, flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = DEMO if kind == "still" else of_a_flow(flow_folder)
-    assert main([*words, "--out", str(tmp_path), "--json"]) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    found = json_of(capsys, "", *words, "--out", tmp_path)
     wanted: dict[str, Any] = json.loads((Path(__file__).parent / f"summary_{kind}.json").read_text())
     assert list(found) == list(wanted)
     for key in wanted:
