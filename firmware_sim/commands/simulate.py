@@ -15,31 +15,17 @@ import time
 from types import FrameType
 from typing import NoReturn
 
-from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS
+from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.ports.faults import check_possible, parse_faults
-from pans.firmware_sim.ports.serve import DEFAULT_SCENE, SimOptions, build_instrument, check_options
+from pans.firmware_sim.ports.serve import SimOptions, build_instrument, check_options
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.cli import Command, emit, say
 from pans.runtime.timing.cpu import check_core
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--profile", required=True, help="a shipped profile's name or a .toml file")
-    parser.add_argument("--scene", default=DEFAULT_SCENE, help="a shipped scene, uniform, dark, a .npz or a .toml file")
-    parser.add_argument("--faults", default="", help="like loss:0.01,stall:600ms/5s, or all, or a .toml file")
-    parser.add_argument(
-        "--changes", default="", help="like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the detector's clicks (default 0)")
+    add_options(parser, SimOptions)
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
-    parser.add_argument("--offset", type=int, default=DEFAULT_OFFSET_TICKS, help="device ticks at host time 0")
-    parser.add_argument("--drift-ppm", type=float, default=DEFAULT_DRIFT_PPM, help="rate error of the device's clock")
-    parser.add_argument(
-        "--optics", default="", metavar="BUNDLE", help="look through the passive optics of this bundle: no projector"
-    )
-    parser.add_argument(
-        "--buffer", type=int, default=256, help="stream messages that the device can hold back (default 256)"
-    )
     parser.add_argument("--core", type=int, metavar="N", help="bind it to processor core N and keep that awake")
     parser.add_argument(
         "--echo", type=int, metavar="BYTES", help="no instrument: answer each frame with BYTES bytes (for benchmarks)"
@@ -48,19 +34,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    options = check_options(
-        SimOptions(
-            args.profile,
-            args.scene,
-            args.seed,
-            offset=args.offset,
-            drift_ppm=args.drift_ppm,
-            faults=args.faults,
-            buffer=args.buffer,
-            optics=args.optics,
-            changes=args.changes,
-        )
-    )
+    options = check_options(settings_from(args, SimOptions))
     check_core(args.core)
     check_possible(parse_faults(args.faults), pace="real", listen=args.listen)
     instrument, clock = build_instrument(options, time.perf_counter_ns())

@@ -8,37 +8,20 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from pans.firmware_sim.trials import TRIALS, Report, load_trial
+from pans.firmware_sim.options import add_options, settings_from
+from pans.firmware_sim.trials import TRIALS, load_trial
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
 from pans.runtime.errors import PansError
-
-
-def add_options(parser: argparse.ArgumentParser, settings: type[Any]) -> None:
-    """Add one option for each field of `settings`; a field without `--` in its flag is an argument by place."""
-    for one in fields(settings):
-        words = dict(one.metadata)
-        flag = words.pop("flag", "--" + one.name.replace("_", "-"))
-        if flag.startswith("--"):
-            words["dest"] = one.name
-            if one.default is MISSING:
-                words["required"] = True
-            elif words.get("action") != "store_true":
-                words["default"] = list(one.default) if words.get("action") == "append" else one.default
-        if not {"type", "action", "choices"} & set(words):
-            words["type"] = str if isinstance(one.default, tuple) else type(one.default)
-        parser.add_argument(flag, **words)
 
 
 def run_trial(name: str, args: argparse.Namespace) -> int:
     """Run the trial `name` with the options in `args`, print its report and return the exit code."""
     trial = load_trial(name)
-    settings = trial.settings(**{one.name: getattr(args, one.name) for one in fields(trial.settings)})
     try:
-        report: Report = trial.run(settings)
+        report = trial.run(settings_from(args, trial.settings))
     except RuntimeError as error:  # a process of the trial did not do its part: nothing was measured
         raise PansError(f"{name}: {error}") from error
     if isinstance(args.json, Path):

@@ -10,12 +10,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 from urllib.parse import parse_qsl
 
 from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
 from pans.firmware_sim.device.instrument import BUFFER_MESSAGES, Instrument
+from pans.firmware_sim.options import option, words_of
 from pans.firmware_sim.scene.scene_file import open_scene
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
@@ -35,18 +36,18 @@ MAX_BUFFER_MESSAGES = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """What a simulated instrument is made of; the field names are the URL's keys."""
+    """What a simulated instrument is made of; the field names are the URL's keys, and all but `pace` are options of `pans simulate`."""
 
-    profile: str
-    scene: str = DEFAULT_SCENE
-    seed: int = 0
+    profile: str = option(MISSING, "a shipped profile's name or a .toml file")
+    scene: str = option(DEFAULT_SCENE, "a shipped scene, uniform, dark, a .npz or a .toml file")
+    seed: int = option(0, "of the detector's clicks (default 0)")
     pace: str = "real"
-    offset: int = DEFAULT_OFFSET_TICKS
-    drift_ppm: float = DEFAULT_DRIFT_PPM
-    faults: str = ""
-    buffer: int = BUFFER_MESSAGES
-    optics: str = ""  # a bundle whose passive optics the instrument looks through
-    changes: str = ""  # what changes meanwhile, beside what the scene file says
+    offset: int = option(DEFAULT_OFFSET_TICKS, "device ticks at host time 0")
+    drift_ppm: float = option(DEFAULT_DRIFT_PPM, "rate error of the device's clock")
+    faults: str = option("", "like loss:0.01,stall:600ms/5s, or all, or a .toml file")
+    buffer: int = option(BUFFER_MESSAGES, f"stream messages that the device can hold back (default {BUFFER_MESSAGES})")
+    optics: str = option("", "look through the passive optics of this bundle: no projector", metavar="BUNDLE")
+    changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
 
 
 def parse_sim_url(url: str) -> SimOptions:
@@ -188,12 +189,7 @@ class ChildLink:
 def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
     breaks = parse_faults(options.faults).disconnect is not None  # which a pty cannot do
     listen = "pty" if hasattr(os, "openpty") and not breaks else "tcp:127.0.0.1:0"
-    words = [sys.executable, "-m", "pans.firmware_sim", "--profile", options.profile, "--scene", options.scene]
-    words += ["--seed", str(options.seed), "--offset", str(options.offset), f"--drift-ppm={options.drift_ppm!r}"]
-    words += ["--listen", listen, "--until-stdin-closes"]
-    words += ["--faults", options.faults] if options.faults else []
-    words += ["--optics", options.optics] if options.optics else []
-    words += ["--changes", options.changes] if options.changes else []
+    words = [sys.executable, "-m", "pans.firmware_sim", *words_of(options), "--listen", listen, "--until-stdin-closes"]
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
     # for the host, which then leaves the instrument in a safe state.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 __all__ = ["TRIALS", "Report", "Trial", "TrialEntry", "load_trial"]
@@ -27,7 +27,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A trial: a frozen dataclass whose fields are made by `option`, and what to do with one."""
+    """A trial: a frozen dataclass whose fields are options (pans.firmware_sim.options), and what to do with one."""
 
     settings: type[Any]
     run: Callable[[Any], Report]
@@ -69,14 +69,6 @@ def load_trial(name: str) -> Trial:
     """
     trial: Trial = importlib.import_module(TRIALS[name].module, __name__).TRIAL
     return trial
-
-
-def option(default: Any, help: str, **words: Any) -> Any:
-    """Return a field of a trial's settings; `words` are those of `ArgumentParser.add_argument`, or `flag`, the option's name.
-
-    Without `flag` an option is named like its field, without `type` it is of the default's type; MISSING makes it a required one.
-    """
-    return field(default=default, metadata={"help": help, **words})
 
 
 def rows_report(rows: Iterable[Mapping[str, Any]], passed: bool, **more: Any) -> Report:

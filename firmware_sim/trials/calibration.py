@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.options import option
 from pans.firmware_sim.scene.detector_kernels import sample_words
 from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
 from pans.runtime.core.calibration import (
@@ -34,7 +35,7 @@ from pans.runtime.instrument.estimate import CountModel, Counts, Interval, fit_l
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
-from . import Report, Trial, option, rows_report
+from . import Report, Trial, rows_report
 
 COVER = (0.94, 0.96)  # 95 %, and two standard errors of 2000 trials: sqrt(0.95 * 0.05 / 2000) = 0.5 %
 BLOCK = 1 << 16

@@ -25,10 +25,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pans.firmware_sim.options import option
 from pans.runtime.errors import UsageError
 from pans.runtime.record import read_recording
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 from .cause_processes import HOST_CORE, INSTRUMENT_CORE, Injection
 from .processes import Child, has_real_time, sleep_until
 from .scheduling_probe import SchedulingProbe

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pans.firmware_sim.options import option
 from pans.runtime.timing.clock import ClockModel
 
-from . import Report, Trial, option, rows_report
+from . import Report, Trial, rows_report
 
 TICK_HZ = 10_000_000
 PROBE_EVERY_NS = 97_000_000

@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.options import option
 from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_words
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.cusum_design import design_cusum
 from pans.runtime.intervals import wilson_interval
 
-from . import Report, Trial, option, rows_report
+from . import Report, Trial, rows_report
 
 BATCH = 1 << 20
 FACTOR, DELAY_FACTOR = 1.5, 1.25  # the bars: of the stated false-alarm rate, and of the optimal delay

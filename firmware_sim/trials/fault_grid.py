@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.faults import NAMES, parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
@@ -31,7 +32,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
 from pans.runtime.wire.commands import Gate
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 from .checkers import Checker, WatchedInstrument
 
 SHOTS = 1

@@ -19,12 +19,13 @@ from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pans.firmware_sim.options import option
 from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record import read_recording
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 from .flow_attribution import (
     MACHINE,
     OURS,

@@ -19,6 +19,7 @@ import numpy as np
 from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
+from pans.firmware_sim.options import option
 from pans.firmware_sim.scene.still import Scene, load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.cli import say
@@ -30,7 +31,7 @@ from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 
 BATCH_BYTES = 1 << 16
 BATCH_FRAMES = 200

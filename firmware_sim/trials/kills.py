@@ -26,6 +26,7 @@ import numpy as np
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.scene.still import load_scene
@@ -41,7 +42,7 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 from .processes import PATIENCE_S, wait_until
 
 LEASE_MS = 200

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.firmware_sim.options import option
 from pans.firmware_sim.scene.optics import expected_photoelectrons
 from pans.firmware_sim.scene.still import load_scene
 from pans.runtime.bundle.model import load_bundle
@@ -23,7 +24,7 @@ from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import load_profile
 
-from . import Report, Trial, option, rows_report
+from . import Report, Trial, rows_report
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"
 CHUNK = 10_000

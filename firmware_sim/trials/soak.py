@@ -21,13 +21,14 @@ from typing import Any
 
 import numpy as np
 
+from pans.firmware_sim.options import option
 from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_folder
 
-from . import Report, Trial, figures_text, option
+from . import Report, Trial, figures_text
 from .processes import start_command, wait_until
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"

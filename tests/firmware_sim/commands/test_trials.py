@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from pans.firmware_sim import trials
-from pans.firmware_sim.trials import TRIALS, Report, Trial, load_trial, option, rows_report
+from pans.firmware_sim.options import option
+from pans.firmware_sim.trials import TRIALS, Report, Trial, load_trial, rows_report
 from pans.runtime.cli import main
 
 
