@@ -192,4 +192,4 @@ def _tensor(data: bytes) -> tuple[str, NDArray[np.float32]]:
     blobs = {number: value for number, value in fields(data) if number in (4, 9)}
     floats = blobs.get(9, blobs.get(4, b""))
     assert isinstance(floats, bytes)
-    return _text(data, 8), np.frombuffer(floats, "<f4").reshape([int(size) for size in shape])  # type: ignore[arg-type]
+    return _text(data, 8), np.frombuffer(floats, "<f4").reshape([int(size) for size in shape])

@@ -1,6 +1,6 @@
 """From recorded messages to decisions, as a lab would write it from docs/reference/formats.md, "From exposures to decisions".
 
-Owns the rules of still runs and the back ends that any reader can recompute; plain loops, no speed. Imports nothing of the package.
+Owns the rules of still runs, in plain loops; the back ends are lab_backends.py's. Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -9,21 +9,18 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from lab_backends import ABSTAINED, BACKENDS, NO_LABEL, Counts, Scores, verdict
 from lab_bundle import Bundle, demand
 from lab_frames import CLICKS, COMMAND, FRAMES, MARK, STATUS, FrameCutter, open_body
 from lab_recording import ROW, Recording
 from numpy.typing import NDArray
 
-DARK, NO_LABEL, NO_OBJECT = 0xFFFF, 0xFFFF, 0xFFFFFFFF
-GAP, WRONG, INCOMPLETE, ABSTAINED, NOT_FINITE = 1, 2, 4, 8, 64
+DARK, NO_OBJECT = 0xFFFF, 0xFFFFFFFF
+GAP, WRONG, INCOMPLETE = 1, 2, 4
 IDLE, SAFE, COMPLETED = 0, 3, 1
-
-Counts = NDArray[np.int64]
-Scores = Callable[[Counts, int], NDArray[Any]]
 
 
 @dataclass
@@ -74,59 +71,6 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
     slots = list(struct.iter_unpack("<QHH", b"".join(pieces[first] for first in sorted(pieces))))
     demand(len(slots) == n_slots, "slots of the plan are missing")
     return Plan(bool(mode), patterns, exposure_ticks, cycles_per_object, slots), list(arms.values())
-
-
-# ---- back ends ----
-
-
-def table_scores(bundle: Bundle) -> Scores:
-    """Return the back end `table`."""
-    table = bundle.parts["table"]
-    return lambda counts, shots: table[sum(int(count) << i for i, count in enumerate(counts))]
-
-
-def float64_scores(bundle: Bundle) -> Scores:
-    """Return the back end `float64`."""
-    layers = bundle.layers()
-
-    def scores(counts: Counts, shots: int) -> NDArray[Any]:
-        x = counts / np.float64(shots)
-        for weights, bias, relu in layers:
-            x = x @ weights.astype(np.float64) + bias.astype(np.float64)
-            x = np.maximum(x, 0.0) if relu else x
-        return x
-
-    return scores
-
-
-def int8_scores(bundle: Bundle) -> Scores:
-    """Return the back end `int8`."""
-    sizes = bundle.parts["int8_sizes"].tolist()
-    scale, bias = bundle.parts["int8_affine"]
-
-    def scores(counts: Counts, shots: int) -> NDArray[Any]:
-        x, unit, weight_at, at = counts, np.float32(1) / np.float32(shots), 0, 0
-        for n_in, n_out in pairwise(sizes):
-            flat = bundle.parts["int8_weights"][weight_at : weight_at + n_in * n_out]
-            sums = (x @ flat.reshape(n_in, n_out).astype(np.int64)).astype(np.float32)
-            y = sums * (scale[at : at + n_out] * unit) + bias[at : at + n_out]
-            x = (np.clip(y, np.float32(0), np.float32(255)) + np.float32(0.5)).astype(np.int64)
-            weight_at, at, unit = weight_at + n_in * n_out, at + n_out, np.float32(1)
-        return y
-
-    return scores
-
-
-BACKENDS = {"table": table_scores, "float64": float64_scores, "int8": int8_scores}
-
-
-def verdict(scores: NDArray[Any]) -> tuple[int, np.float32, int]:
-    """Return label, probability and flags of one row of scores."""
-    wide = scores.astype(np.float64)
-    if np.isnan(wide).any() or np.isinf(wide.max()):
-        return NO_LABEL, np.float32(0), NOT_FINITE | ABSTAINED
-    label = int(wide.argmax())
-    return label, np.float32(1 / np.exp(wide - wide[label]).sum()), 0
 
 
 # ---- the rules ----

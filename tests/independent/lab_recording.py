@@ -145,6 +145,7 @@ class DecisionLog:
             if code in (NO_NUMBER, len(self._known)):
                 verdict = next(following, None)
                 demand(verdict is not None, "too few verdicts")
+                assert verdict is not None
                 if code != NO_NUMBER:
                     self._known.append(verdict)
             else:

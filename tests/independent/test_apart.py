@@ -6,7 +6,9 @@ import ast
 import sys
 from pathlib import Path
 
+import lab_frames
 import pytest
+from tree import ROOT
 
 HERE = Path(__file__).parent
 PROGRAMS = sorted(HERE.glob("lab_*.py"))
@@ -22,3 +24,11 @@ def test_nothing_of_the_package_is_imported(path: Path) -> None:
             names.add(str(node.module).split(".")[0])
     allowed = {"numpy", *sys.stdlib_module_names, *(program.stem for program in PROGRAMS)}
     assert names <= allowed, names - allowed
+
+
+def test_the_worked_example_of_the_page() -> None:
+    page = (ROOT / "docs" / "reference" / "protocol.md").read_text()
+    assert f"**0x{lab_frames.SCHEMA:08X}**" in page
+    assert f"`{lab_frames.SCHEMA_TEXT}`" in page
+    hello = lab_frames.frame(lab_frames.HELLO, lab_frames.SCHEMA.to_bytes(4, "little") + b"\1\0\0\0", 0x11223344)
+    assert hello.hex(" ").upper() in page
