@@ -22,8 +22,7 @@ from lab_light import Light
 from lab_recording import read_recording
 
 from pans.runtime.cli import main
-from pans.runtime.live.config import RunResult
-from pans.runtime.live.run import LiveRun, Observers
+from pans.runtime.live import LiveRun, Observers, RunResult
 from pans.runtime.wire.commands import Gate
 
 HERE = Path(__file__).parent

@@ -15,11 +15,11 @@ from lab_decisions import decide_again
 from lab_recording import read_recording
 from tree import ROOT
 
+from pans.runtime.bundle import Bundle, load_bundle, write_bundle
 from pans.runtime.bundle.int8 import quantise_head
-from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import DamagedFileError
-from pans.runtime.record import recording as ours
+from pans.runtime.record import read_recording as our_reader
 
 D_F, CLASSES, LEVELS = 6, 4, 16
 EXPOSURE_US = 100.0
@@ -142,4 +142,4 @@ def test_both_readers_notice_every_change(tmp_path: Path) -> None:
             read_recording(bytes(changed))
         path.write_bytes(changed)
         with pytest.raises(DamagedFileError, match=r"altered|expected|format version"):
-            ours.read_recording(path)
+            our_reader(path)

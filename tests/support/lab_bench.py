@@ -14,16 +14,12 @@ from lab_light import Light
 from lab_recording import read_recording
 from tree import ROOT
 
-from pans.runtime.bundle.model import load_bundle
-from pans.runtime.core.plan import build_plan
-from pans.runtime.core.still import Core
-from pans.runtime.decide.backends import make_decider
-from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.config import RunConfig, RunResult
-from pans.runtime.live.loop import run_live
-from pans.runtime.live.reconnect import Recovery
-from pans.runtime.live.run import Observers
-from pans.runtime.record.recorder import Recorder
+from pans.runtime.bundle import load_bundle
+from pans.runtime.core import Core, build_plan
+from pans.runtime.decide import make_decider
+from pans.runtime.instrument import load_profile
+from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.record import Recorder
 
 FASHION = ROOT / "runtime" / "shipped" / "fashion10.pans"
 SCENE = ROOT / "firmware_sim" / "scenes" / "fashion200.npz"
