@@ -459,11 +459,11 @@ class FifoPort:
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (ROOT / "docs" / "reference" / "links.md").read_text()
+    text = (ROOT / "docs" / "how-to" / "own-device.md").read_text()
     source = text.partition("```python\n")[2].partition("```")[0]
     assert len(source.splitlines()) <= 60
     driver = types.ModuleType("mylab_pipe")
-    exec(compile(source, "docs/reference/links.md", "exec"), driver.__dict__)
+    exec(compile(source, "docs/how-to/own-device.md", "exec"), driver.__dict__)
     monkeypatch.setitem(sys.modules, "mylab_pipe", driver)
     point = EntryPoint("pipe", "mylab_pipe:open_pipe", "pans.devices")
     monkeypatch.setattr(link_module, "entry_points", lambda group: [point])

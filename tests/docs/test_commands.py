@@ -1,0 +1,149 @@
+"""Every command and every example in README.md and docs/ is parsed, and run unless the page says why not.
+
+A page's blocks run one after the other in one empty folder. `pans` commands run in this process; a block with anything else in it is
+given to bash.
+"""
+
+from __future__ import annotations
+
+import argparse
+import doctest
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from pages import EXAMPLES, SHELL, Block, blocks, indented, pages, pans_commands, sentences, spans
+from tree import ROOT
+
+from pans.runtime import cli
+
+COMMANDS = {point.name: point for point in entry_points(group="pans.commands")}
+MOST_WORDS = 40  # of a sentence in a tutorial or a how-to
+
+
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """The parser of one command, as `pans` itself makes it."""
+    parser = argparse.ArgumentParser(prog=f"pans {name}", exit_on_error=False)
+    for option in ("--json", "--debug"):
+        parser.add_argument(option, action="store_true")
+    COMMANDS[name].load().configure(parser)
+    return parser
+
+
+def check(words: list[str], where: str, whole: bool) -> None:
+    """Parse one command line; of one that is only mentioned in a line of text, the command and its options must exist."""
+    if words[0] in ("--help", "--version", "COMMAND"):
+        return
+    assert words[0] in COMMANDS, f"{where}: pans {words[0]} is no command"
+    try:
+        parser = parser_of(words[0])
+    except ModuleNotFoundError as error:
+        pytest.skip(f"pans {words[0]} needs {error.name}")
+    known = {option for action in parser._actions for option in action.option_strings}
+    if words[0] != "trials":  # each trial has options of its own
+        assert {word.partition("=")[0] for word in words if word.startswith("--")} <= known, f"{where}: {words}"
+    if whole and "..." not in words:
+        try:
+            parser.parse_args(words[1:])
+        except (SystemExit, argparse.ArgumentError) as error:
+            pytest.fail(f"{where}: pans {' '.join(words)}: {error}")
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_line_is_one(page: Path) -> None:
+    for block in blocks(page):
+        if block.language in SHELL:
+            for words in block.commands:
+                check(words, f"{page.name}:{block.line}", whole=True)
+    for span in spans(page):
+        for words in pans_commands(span):
+            check(words, page.name, whole=page == ROOT / "README.md")
+
+
+def test_every_command_and_every_option_is_on_the_page_of_commands() -> None:
+    text = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")
+    sections = {part.split("\n", 1)[0].removeprefix("pans ").strip("` "): part for part in text.split("\n## ")[1:]}
+    for name in COMMANDS:
+        if name in sections and find_spec("torch"):
+            for action in parser_of(name)._actions:
+                longest = max(action.option_strings, key=len, default="")
+                assert longest in ("", "--help", "--json", "--debug") or f"`{longest}" in sections[name], (
+                    f"{name}: {longest}"
+                )
+    assert set(COMMANDS) <= set(sections)
+
+
+def runnable(page: Path) -> list[Block]:
+    """The blocks that the test of a page runs: all but those that say why not, and those of the results, which take hours."""
+    found = [] if page.parent.name == "results" else blocks(page)
+    return [block for block in found if block.language in (*SHELL, *EXAMPLES) and "not run" not in block.notes]
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_block_escapes(page: Path) -> None:
+    for block in blocks(page):
+        assert block.language in (*SHELL, *EXAMPLES, "text", "toml", "json"), (
+            f"line {block.line}: a block of kind {block.language!r}"
+        )
+        assert block.notes.get("not run", "why").strip(), f"line {block.line}: no reason"
+    assert not indented(page), "a command in an indented block: no test sees it"
+
+
+def marked(page: Path) -> object:
+    slow = any("slow" in block.notes for block in blocks(page))
+    return pytest.param(page, id=str(page.relative_to(ROOT)), marks=[pytest.mark.slow] if slow else [])
+
+
+@pytest.mark.parametrize("page", [marked(page) for page in pages() if runnable(page)])
+def test_the_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
+    names: dict[str, object] = {"__name__": "page"}
+    for block in runnable(page):
+        for module in block.notes.get("needs", "").split():
+            if module != "data":
+                pytest.importorskip(module)
+            elif "PANS_DATA" not in os.environ:
+                pytest.skip("needs PANS_DATA")
+        where = f"{page.relative_to(ROOT)}:{block.line}"
+        if block.language == "python":
+            exec(compile(block.text, where, "exec"), names)
+        elif block.language == "pycon":
+            example = doctest.DocTestParser().get_doctest(block.text, names, where, str(page), block.line)
+            assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, clear_globs=False).failed == 0, (
+                where
+            )
+            names.update(example.globs)
+        else:
+            assert run_block(block) == int(block.notes.get("exit", "0")), where
+
+
+def run_block(block: Block) -> int:
+    """Run a block and return the exit code of its last command; an earlier one must have gone well."""
+    lines = [
+        line for line in block.script.replace("\\\n", " ").split("\n") if line.strip() and not line.startswith("#")
+    ]
+    if not all(
+        line.startswith("pans ") and len(pans_commands(line)) == 1 and not set(line) & set("|&;<>") for line in lines
+    ):
+        return subprocess.run(["bash", "-ec", block.script], timeout=300, check=False).returncode
+    for line in lines[:-1]:
+        assert status(pans_commands(line)[0]) == 0, line
+    return status(pans_commands(lines[-1])[0])
+
+
+def status(words: list[str]) -> int:
+    try:
+        return cli.main(words)
+    except SystemExit as end:
+        return int(end.code or 0)
+
+
+@pytest.mark.parametrize("page", pages("tutorial", "how-to"), ids=lambda page: page.stem)
+def test_no_sentence_of_a_guide_is_too_long(page: Path) -> None:
+    long = [sentence for sentence in sentences(page) if len(sentence.split()) > MOST_WORDS]
+    assert not long, "\n".join(long)
