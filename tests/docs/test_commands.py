@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from pages import EXAMPLES, SHELL, Block, blocks, indented, pages, pans_commands, sentences, spans
+from documents import EXAMPLES, SHELL, Block, blocks, indented, pages, pans_commands, sentences, spans
 from tree import ROOT
 
 from pans.runtime import cli
