@@ -1,13 +1,12 @@
 """From a trained model to a bundle, and the proof that the bundle decides as the model does.
 
-Owns the folding of the normalisation, the ONNX graph and the comparison; never trains. `export` writes the file, reads it
-back and raises when a score or a decision of the file differs from the torch model.
+Owns the bundle's facts and the comparison; never trains. `export` writes the file, reads it back and raises when a score or a
+decision of the file differs from the torch model.
 """
 
 from __future__ import annotations
 
 import copy
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 
 from pans.runtime import __version__
 from pans.runtime.bundle.facts import GOLDEN_TOLERANCE
@@ -27,21 +24,17 @@ from pans.runtime.bundle.layers import read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_bundle, word_means, write_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import PansError, UsageError
+from pans.runtime.errors import PansError
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.encoders import ActiveIllumination
-from pans.trainer.model.heads import EPSILON, ConvHead, Decoders, Heads, MlpHead, PictureHead
+from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.data import encoder_input, full_scale_photoelectrons
 from pans.trainer.train.loop import Trained
 
-from .conv_onnx import conv_nodes
 from .int8_onnx import int8_onnx
-from .picture_onnx import picture_nodes
+from .onnx_heads import DEAD_VARIANCE, head_onnx
 
-OPSET = 17
-IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
-DEAD_VARIANCE = 1e-7  # a pattern that clicks, or stays dark, less than once in ten million times says nothing
 ALL_WORDS_MAX = 12
 RANDOM_WORDS = 10_000
 COMPARED_OBJECTS = 200
@@ -60,61 +53,15 @@ class Exported:
     dead_patterns: tuple[int, ...]
 
 
-def fold_normalisation(
-    weight: F64, bias: F64, gain: F64, shift: F64, click_mean: F64
-) -> tuple[F64, F64, tuple[int, ...]]:
-    """Fold normalisation by `click_mean` (d_f,) into a linear layer: weight (hidden, d_f), bias (hidden,).
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What a bundle says of itself; the names are those of `make_bundle`."""
 
-    The population variance of a click is p(1-p), exactly. A pattern that always or never clicks has none: its scale would
-    explode, so its column is dropped (set to 0) and its constant part goes into the bias. Returns the folded weight and
-    bias, float64, and the dropped patterns.
-    """
-    variance = click_mean * (1 - click_mean)
-    dead = variance < DEAD_VARIANCE
-    scale = np.where(dead, 0.0, gain / np.sqrt(variance + EPSILON))
-    folded_bias = bias + weight @ (shift - click_mean * scale)
-    return weight * scale, folded_bias, tuple(int(i) for i in np.flatnonzero(dead))
-
-
-def head_onnx(head: Heads, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
-    """Return the head as ONNX (float32 click means (n, d_f) -> scores or pixels (n, outputs)) and the dropped patterns."""
-
-    gain, shift = (np.asarray(part.detach().double().numpy()) for part in (head.norm.gain, head.norm.bias))
-    if isinstance(head, ConvHead):
-        one = np.eye(len(click_mean))
-        scale, offset, dead = fold_normalisation(one, np.zeros(len(click_mean)), gain, shift, click_mean)
-        nodes, constants = conv_nodes(head, np.diag(scale), offset)
-    elif isinstance(head, Decoders):
-        first, first_bias = (np.asarray(part.detach().double().numpy()) for part in head.hidden.parameters())
-        weight, bias, dead = fold_normalisation(first, first_bias, gain, shift, click_mean)
-        nodes, constants = picture_nodes(head, weight, bias)
-    else:
-        nodes, constants, dead = _mlp_nodes(head, gain, shift, click_mean)
-    n_outputs = math.prod(head.image_shape) if isinstance(head, PictureHead) else head.output.out_features
-    initializers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    source = helper.make_tensor_value_info("clicks", TensorProto.FLOAT, ["n", len(click_mean)])
-    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", n_outputs])
-    graph = helper.make_graph(nodes, "head", [source], [result], initializers)
-    opset = helper.make_opsetid("", OPSET)
-    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="pans-runtime")
-    onnx.checker.check_model(model, full_check=True)
-    return bytes(model.SerializeToString()), dead
-
-
-def _mlp_nodes(
-    head: MlpHead, gain: F64, shift: F64, click_mean: F64
-) -> tuple[list[onnx.NodeProto], dict[str, NDArray[Any]], tuple[int, ...]]:
-    """Nodes, constants by name, dropped patterns: the normalisation is folded into the first layer."""
-    layers = (head.hidden.weight, head.hidden.bias, head.output.weight, head.output.bias)
-    w1, b1, w2, b2 = (np.asarray(layer.detach().double().numpy()) for layer in layers)
-    w1, b1, dead = fold_normalisation(w1, b1, gain, shift, click_mean)
-    constants = {name: value.astype(np.float32) for name, value in (("w1", w1), ("b1", b1), ("w2", w2), ("b2", b2))}
-    nodes = [
-        helper.make_node("Gemm", ["clicks", "w1", "b1"], ["sums"], transB=1),
-        helper.make_node("Relu", ["sums"], ["hidden"]),
-        helper.make_node("Gemm", ["hidden", "w2", "b2"], ["scores"], transB=1),
-    ]
-    return nodes, constants, dead
+    name: str
+    task: str
+    classes: tuple[str, ...]
+    image_shape: tuple[int, int]
+    provenance: Mapping[str, Any]
 
 
 def export(
@@ -122,31 +69,26 @@ def export(
     head: Heads,
     click_mean: F64,
     optics: Shown | Analyser,
-    *,
-    name: str,
-    task: str,
-    classes: tuple[str, ...],
-    image_shape: tuple[int, int],
-    provenance: Mapping[str, Any],
+    about: Description,
     check: Callable[[Bundle], None] = lambda _: None,
 ) -> Exported:
     """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ.
 
-    A head that gives back pictures has no `classes`. `check` may refuse what was read, by PansError.
+    A head that gives back pictures decides among no classes. `check` may refuse what was read, by PansError.
     """
     graph, dead = head_onnx(head, click_mean)
     picture_shape = head.image_shape if isinstance(head, Decoders) else None
-    layers = None if picture_shape else read_layers(graph, len(click_mean), len(classes))
+    layers = None if picture_shape else read_layers(graph, len(click_mean), len(about.classes))
     int8 = None if layers is None else quantise_head(layers)
     bundle = make_bundle(
-        name=name,
-        task=task,
-        classes=() if picture_shape else classes,
+        name=about.name,
+        task=about.task,
+        classes=() if picture_shape else about.classes,
         picture_shape=picture_shape,
-        image_shape=image_shape,
+        image_shape=about.image_shape,
         optics=optics,
         back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
-        provenance={**provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
+        provenance={**about.provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
     )
     unchecked = path.with_name(path.name + ".unchecked")  # a wrong bundle must not stand where a right one may be
     try:
@@ -170,35 +112,30 @@ def export_trained(
         optics = analyser_of(trained, task, profile)
     else:
         optics = Shown(profile.projector.levels, quantised.pattern_levels, quantised.photons_per_level)
-    return export(
-        path,
-        trained.head,
-        trained.click_mean.numpy(),
-        optics,
-        name=name,
-        task=task.name,
-        classes=task.classes,
-        image_shape=task.image_shape,
-        provenance={
-            "data_sha256": task.sha256,
-            "data_split": task.split,
-            "task_light": task.light,
-            "task_optics": task.optics,
-            "task_source": task.source,
-            "profile": profile.name,
-            "profile_sha256": profile.sha256,
-            "validation_losses": list(trained.validation_losses),
-            **provenance,
-        },
-        check=lambda bundle: compare_optics(bundle, trained, task, profile),
-    )
+    facts = {
+        "data_sha256": task.sha256,
+        "data_split": task.split,
+        "task_light": task.light,
+        "task_optics": task.optics,
+        "task_source": task.source,
+        "profile": profile.name,
+        "profile_sha256": profile.sha256,
+        "validation_losses": list(trained.validation_losses),
+        **provenance,
+    }
+    about = Description(name, task.name, task.classes, task.image_shape, facts)
+
+    def check(bundle: Bundle) -> None:
+        compare_optics(bundle, trained, task, profile)
+
+    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check)
 
 
 def analyser_of(trained: Trained, task: Task, profile: Profile) -> Analyser:
     """Return the passive optics that `train` returned, for the exposure that it assumed."""
     encoder, options = trained.encoder, trained.options
     if isinstance(encoder, ActiveIllumination):
-        raise UsageError("an active encoder shows patterns, it has no optics of its own")
+        raise ValueError("an active encoder shows patterns, it has no optics of its own")
     matrix = encoder.matrix().detach().numpy()
     matrix.flags.writeable = False
     scale = full_scale_photoelectrons(task, options)

@@ -43,7 +43,23 @@ class PublicSet:
     classes: tuple[str, ...]
     source: str  # the files' names are appended
     licence: str
-    files: tuple[PinnedFile, PinnedFile, PinnedFile, PinnedFile]  # training images, labels, test images, labels
+    files: tuple[PinnedFile, ...]  # training images, labels, test images, labels
+
+
+# training images, labels, test images, labels: the same names and shapes in both sets
+_FILES = (
+    ("train-images-idx3-ubyte.gz", (60000, 28, 28)),
+    ("train-labels-idx1-ubyte.gz", (60000,)),
+    ("t10k-images-idx3-ubyte.gz", (10000, 28, 28)),
+    ("t10k-labels-idx1-ubyte.gz", (10000,)),
+)
+
+
+def _pinned(*sizes_and_sha256: tuple[int, str]) -> tuple[PinnedFile, ...]:
+    """The four files of a set, from the size in bytes and the SHA-256 of each."""
+    return tuple(
+        PinnedFile(name, n_bytes, sha256, shape) for (name, shape), (n_bytes, sha256) in zip(_FILES, sizes_and_sha256)
+    )
 
 
 PUBLIC_SETS: Mapping[str, PublicSet] = {
@@ -52,31 +68,11 @@ PUBLIC_SETS: Mapping[str, PublicSet] = {
         classes=FASHION_CLASSES,
         source="http://fashion-mnist.s3-website.eu-central-1.amazonaws.com/",
         licence="MIT, Zalando SE",
-        files=(
-            PinnedFile(
-                "train-images-idx3-ubyte.gz",
-                26421856,
-                "b0564c3eedabfbf835052cff8503ea422014ce006caf5b757f851416ee8300c7",
-                (60000, 28, 28),
-            ),
-            PinnedFile(
-                "train-labels-idx1-ubyte.gz",
-                29491,
-                "0ae29f65d86684f32d1b9c85147786c547b9c6aebcaf235f0400a0cce308b056",
-                (60000,),
-            ),
-            PinnedFile(
-                "t10k-images-idx3-ubyte.gz",
-                4422079,
-                "cc1d090a38ace84dfa1aa66e3ada7c336ef481a96936906477e6dd344da56eaa",
-                (10000, 28, 28),
-            ),
-            PinnedFile(
-                "t10k-labels-idx1-ubyte.gz",
-                5125,
-                "8d3605d196f4be44669e46906da9733c8131fef761fdbfec72c424d5222f1a05",
-                (10000,),
-            ),
+        files=_pinned(
+            (26421856, "b0564c3eedabfbf835052cff8503ea422014ce006caf5b757f851416ee8300c7"),
+            (29491, "0ae29f65d86684f32d1b9c85147786c547b9c6aebcaf235f0400a0cce308b056"),
+            (4422079, "cc1d090a38ace84dfa1aa66e3ada7c336ef481a96936906477e6dd344da56eaa"),
+            (5125, "8d3605d196f4be44669e46906da9733c8131fef761fdbfec72c424d5222f1a05"),
         ),
     ),
     "mnist": PublicSet(
@@ -84,31 +80,11 @@ PUBLIC_SETS: Mapping[str, PublicSet] = {
         classes=tuple("0123456789"),
         source="https://ossci-datasets.s3.amazonaws.com/mnist/",
         licence="CC BY-SA 3.0, Y. LeCun, C. Cortes and C. J. C. Burges",
-        files=(
-            PinnedFile(
-                "train-images-idx3-ubyte.gz",
-                9630634,
-                "db8f937d487057fb14a9f0fbe97f0bc8d311ab41b750d41e1ff37c43b9e55e19",
-                (60000, 28, 28),
-            ),
-            PinnedFile(
-                "train-labels-idx1-ubyte.gz",
-                28902,
-                "51fc562b6747b666fbf6e84ce29d43c3cb5f9c388c664d43b33f02095313405a",
-                (60000,),
-            ),
-            PinnedFile(
-                "t10k-images-idx3-ubyte.gz",
-                1602073,
-                "cfeddb84311ecf044fc6a5b0f6ee8a24d265d4e83e388400186eb114082f4209",
-                (10000, 28, 28),
-            ),
-            PinnedFile(
-                "t10k-labels-idx1-ubyte.gz",
-                4540,
-                "e41c74e484045d39b462a7790a4af51301bd9b0b24f0154798d713ec68c45920",
-                (10000,),
-            ),
+        files=_pinned(
+            (9630634, "db8f937d487057fb14a9f0fbe97f0bc8d311ab41b750d41e1ff37c43b9e55e19"),
+            (28902, "51fc562b6747b666fbf6e84ce29d43c3cb5f9c388c664d43b33f02095313405a"),
+            (1602073, "cfeddb84311ecf044fc6a5b0f6ee8a24d265d4e83e388400186eb114082f4209"),
+            (4540, "e41c74e484045d39b462a7790a4af51301bd9b0b24f0154798d713ec68c45920"),
         ),
     ),
 }

@@ -72,7 +72,7 @@ def search(task: Task, profile: Profile, options: Options, size: int) -> Trained
         p = click_probability(torch.cat([encoder(view) for view in views]).double(), law)
     random = torch.Generator().manual_seed(options.seed)
     head = new_head(options, 2, task.image_shape, random)
-    fit_head(head, p, labels.repeat(len(views)), cross_entropy, random, exact=True, n_outputs=2, rate=options.head_rate)
+    fit_head(head, p, labels.repeat(len(views)), cross_entropy, random, rate=options.head_rate)
     losses = tuple(wrong.tolist())
     return Trained(None, None, in_pixels(encoder, fields), head, p.mean(dim=0), law, min(losses), losses, options)
 

@@ -168,7 +168,7 @@ def solve(options: Options, profile: Profile) -> Trained:
     strings, labels = (torch.from_numpy(part) for part in all_strings())
     p = click_probability(strings.double() @ torch.from_numpy(shown.patterns()).T, law)
     head = new_head(options, 2, (1, N_BARS), random)
-    fit_head(head, p, labels, cross_entropy, random, exact=True, n_outputs=2, shots=options.shots)
+    fit_head(head, p, labels, cross_entropy, random, shots=options.shots)
     losses = tuple(1 - one.accuracy for one in found)
     return Trained(
         shown, best.patterns.float().numpy(), encoder, head, p.mean(dim=0), law, min(losses), losses, options

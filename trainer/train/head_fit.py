@@ -15,7 +15,8 @@ from torch import Tensor
 
 from pans.trainer.model.detection import click_words, sample_clicks, word_probabilities
 from pans.trainer.model.estimators import LossOf, cross_entropy
-from pans.trainer.model.heads import Heads
+from pans.trainer.model.heads import Heads, PictureHead
+from pans.trainer.options import EXACT_FEATURES_MAX
 
 SHOTS = (2, 3, 5, 8, 13, 21, 34, 55)  # numbers of shots that are fitted beside one, up to the largest wanted
 SHARE_OF_SHOTS = 0.3  # of the loss, for all numbers of shots beside one
@@ -110,20 +111,20 @@ def fit_head(
     loss_of: LossOf,
     random: torch.Generator,
     *,
-    exact: bool,
-    n_outputs: int,
     shots: int = 1,
     batch: int = 512,
     rate: float = 1e-3,
 ) -> None:
     """Fit `head` to click probabilities `p` (n, d_f) of all training objects, for 1 to `shots` shots.
 
-    `exact` enumerates the words of one shot (classes only). The normalisation is set to the exact mean before.
+    The words of one shot are enumerated where they are few enough and a class is asked for by cross-entropy. The normalisation is set
+    to the exact mean before.
     """
     head.norm.running_mean.copy_(p.mean(dim=0))
     more = _Shots(p, target, loss_of, random, shots) if shots > 1 else None
-    if exact and loss_of is cross_entropy:
-        fit_head_exactly(head, joint_distribution(p, target, n_outputs), more=more)
+    if p.shape[1] <= EXACT_FEATURES_MAX and loss_of is cross_entropy:
+        assert not isinstance(head, PictureHead), "pictures have no cross-entropy"
+        fit_head_exactly(head, joint_distribution(p, target, head.output.out_features), more=more)
     else:
         fit_head_by_samples(head, p, target, loss_of, random, batch=batch, rate=rate, more=more)
     head.eval()

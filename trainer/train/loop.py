@@ -275,8 +275,6 @@ class Run:
             self.data.target,
             cross_entropy if shape is None else similarity_loss(self.options.similarity, shape),
             self.random,
-            exact=self.options.features <= EXACT_FEATURES_MAX,
-            n_outputs=self.data.n_outputs,
             shots=self.options.shots,
             batch=self.options.batch,
             rate=self.options.head_rate,

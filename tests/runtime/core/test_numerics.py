@@ -143,7 +143,7 @@ def test_the_clock_keeps_its_nanoseconds_at_large_ticks() -> None:
 def test_folding_of_dead_and_saturated_channels_is_exact() -> None:
     """Folded weights against rationals: worst relative error 8 units in the last place; dead channels give their constant only."""
     pytest.importorskip("torch")
-    from pans.trainer.export.writer import EPSILON, fold_normalisation
+    from pans.trainer.export.onnx_heads import EPSILON, fold_normalisation
 
     rng = np.random.default_rng(3)
     mean = np.array([0.0, 1.0, 1e-12, 1 - 1e-12, 1e-3, 0.5, 0.999])

@@ -38,7 +38,7 @@ def bundle(d_f=4, seed=0):
 
 def head_bundle():
     torch = pytest.importorskip("torch", reason="needs the train extra")
-    from pans.trainer.export.writer import head_onnx
+    from pans.trainer.export.onnx_heads import head_onnx
     from pans.trainer.model.heads import MlpHead
 
     graph, _ = head_onnx(MlpHead(3, 8, 3, torch.Generator().manual_seed(0)), np.full(3, 0.4))

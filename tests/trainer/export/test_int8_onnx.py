@@ -32,21 +32,12 @@ def test_the_model_gives_the_scores_of_the_integers() -> None:
 def test_the_trainer_puts_both_into_the_bundle(tmp_path) -> None:  # type: ignore[no-untyped-def]
     torch = pytest.importorskip("torch")
     from pans.runtime.bundle.model import Shown, load_bundle
-    from pans.trainer.export.writer import export
+    from pans.trainer.export.writer import Description, export
     from pans.trainer.model.heads import MlpHead
 
     head = MlpHead(4, 8, 3, torch.Generator().manual_seed(1)).eval()
-    export(
-        tmp_path / "a.pans",
-        head,
-        np.full(4, 0.4),
-        Shown(2, np.ones((4, 6), np.uint16), 0.1),
-        name="a",
-        task="t",
-        classes=("x", "y", "z"),
-        image_shape=(2, 3),
-        provenance={},
-    )
+    about = Description("a", "t", ("x", "y", "z"), (2, 3), {})
+    export(tmp_path / "a.pans", head, np.full(4, 0.4), Shown(2, np.ones((4, 6), np.uint16), 0.1), about)
     bundle, _ = load_bundle(tmp_path / "a.pans")
     counts = np.array([[r >> i & 1 for i in range(4)] for r in range(16)])
     for backend in ("int8", "int8-onnx"):

@@ -9,16 +9,9 @@ onnx = pytest.importorskip("onnx", reason="needs the train extra")
 
 from pans.runtime.bundle.model import Shown, load_bundle
 from pans.runtime.errors import PansError
-from pans.trainer.export import writer as export_module
-from pans.trainer.export.writer import (
-    DEAD_VARIANCE,
-    IR_VERSION,
-    compare,
-    export,
-    fold_normalisation,
-    head_onnx,
-    reference_scores,
-)
+from pans.trainer.export import onnx_heads
+from pans.trainer.export.onnx_heads import DEAD_VARIANCE, IR_VERSION, fold_normalisation, head_onnx
+from pans.trainer.export.writer import Description, compare, export, reference_scores
 from pans.trainer.model.heads import EPSILON, ConvHead, MlpHead
 
 RNG = np.random.default_rng(0)
@@ -32,16 +25,10 @@ def trained_head(d_f, n_classes=4, seed=0):
     return head.eval()
 
 
-def written(path, head, mean, d_f, **changed):
-    facts = {
-        "name": "small",
-        "task": "own",
-        "classes": tuple("abcd"),
-        "image_shape": (2, 3),
-        "provenance": {"seed": 0},
-    }
+def written(path, head, mean, d_f):
+    about = Description("small", "own", tuple("abcd"), (2, 3), {"seed": 0})
     levels = RNG.integers(0, 124, (d_f, 6)).astype(np.uint16)
-    return export(path, head, mean, Shown(124, levels, 0.01), **(facts | changed))
+    return export(path, head, mean, Shown(124, levels, 0.01), about)
 
 
 def test_folded_layer_is_normalisation_then_layer():
@@ -120,7 +107,7 @@ def test_a_wrong_fold_never_leaves_the_export(tmp_path, monkeypatch):
     def wrong(weight, bias, gain, shift, click_mean):
         return fold_normalisation(weight, bias, gain, shift, click_mean * 1.001)
 
-    monkeypatch.setattr(export_module, "fold_normalisation", wrong)
+    monkeypatch.setattr(onnx_heads, "fold_normalisation", wrong)
     with pytest.raises(PansError, match="differs from the trained model"):
         written(tmp_path / "small.pans", trained_head(6), np.full(6, 0.4), 6)
     assert not (tmp_path / "small.pans").exists()
