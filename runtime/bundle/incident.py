@@ -1,7 +1,7 @@
 """What light reaches a passive sensor, from 8-bit images: field amplitudes or intensities, at a fixed scale.
 
 Owns the meaning of grey levels for passive sensing and the optics in front of the sensor (a multimode fibre); never the sensor's own
-optics (analyser.py) and never the modulator of active sensing (`clicks.object_transmission`). Full scale (grey 255) is amplitude 1
+optics (optics.py) and never the modulator of active sensing (`clicks.object_transmission`). Full scale (grey 255) is amplitude 1
 and intensity 1; nothing is normalised per image or per batch, so that no object depends on another.
 
 The fibre is the one of the paper's release: 2-D Fourier transform, a fixed 28 x 28 mask of phases uniform in [0, 2 pi), inverse

@@ -1,6 +1,6 @@
 """A float head in eight bits: int8 weights, integer sums, the error measured.
 
-Owns the rounding of a folded head and its layout; never decides (decide_mlp.py) and never trains. `quantise_head` returns an `Int8Head`
+Owns the rounding of a folded head and its layout; never decides (decide/mlp.py) and never trains. `quantise_head` returns an `Int8Head`
 for a chain of rectified layers; `int8_reference` is its meaning in plain numpy.
 
 Every column of a layer has its own scale. The range of each hidden value is folded into its column and out of the next layer's row,

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.decide.table import CountTableDecider, TableDecider, fits_count_table
-from pans.runtime.decide.verdict import Decider, Verdict, softmax_winner, softmax_winners
+from pans.runtime.decide.table import CountTable, CountTableDecider, TableDecider, fits_count_table, n_features_of
+from pans.runtime.decide.verdict import Decider, Verdict, softmax_winner
 from pans.runtime.errors import UsageError
 
 F64 = NDArray[np.float64]
@@ -108,14 +108,6 @@ class HeadAdapter:
         return MixedHead(ordinary, self._shots, channels, weights)
 
 
-def n_features_of(rows: int, base: int) -> int:
-    """Return d_f of a table of base**d_f `rows`."""
-    n = 0
-    while base**n < rows:
-        n += 1
-    return n
-
-
 def word_prior(seen: I64, base: int = 2) -> F64:
     """Return P(c) float64 (base**d_f,) from how often each vector was `seen`, int64 (base**d_f,): seen, and smoothed by
     independent channels.
@@ -191,23 +183,14 @@ class AdaptedTable(TableDecider):
     """A table of other scores: it is not the bundle's, so it is not held against the golden vectors."""
 
     def __init__(self, scores: NDArray[np.float32]) -> None:
-        self.choice = {"chosen": self.name, "why": "made for the present dark rates"}
-        self.n_features, self.n_classes = len(scores).bit_length() - 1, scores.shape[1]
-        self._scores = scores
-        self.radix = 1 << np.arange(self.n_features, dtype=np.int64)
-        wide, self.probabilities = softmax_winners(scores)
-        self.labels = wide.astype(np.uint8) if self.n_classes <= 256 else wide
+        CountTable.__init__(self, scores, 1, {"chosen": self.name, "why": "made for the present dark rates"})
 
 
 class AdaptedCounts(CountTableDecider):
     """A table of counts with other scores."""
 
     def __init__(self, scores: NDArray[np.float32], base: int) -> None:
-        self.choice = {"chosen": self.name, "why": "made for the present dark rates"}
-        self.n_features, self.n_classes, self.shots = n_features_of(len(scores), base), scores.shape[1], base - 1
-        self.radix = base ** np.arange(self.n_features, dtype=np.int64)
-        self.scores = scores
-        self.labels, self.probabilities = softmax_winners(scores)
+        CountTable.__init__(self, scores, base - 1, {"chosen": self.name, "why": "made for the present dark rates"})
 
 
 class MixedHead:

@@ -7,7 +7,7 @@ to a device. `build_plan` returns a `Plan` or raises PlanError. A plan repeats o
 - **pattern-major** (sequential, the paper's protocol): every pattern is displayed once and exposed `shots_per_object` times in a
   row, within a whole number of refresh periods of the projector; a cycle is one object.
 - **parallel**: all patterns shine at once, a slot exposes all channels (its pattern index is 0); a cycle is one object, its
-  frames are the shots. For objects that pass by, flow_plan.py lays out frames without end.
+  frames are the shots. For objects that pass by, flow/plan.py lays out frames without end.
 
 Dark displays stand before the patterns, spread evenly; a cycle ends with light, so that no decision waits for a dark exposure.
 The device ends a block at the end of a cycle and where the spacing changes: the last block there may be a shorter one.

@@ -1,8 +1,8 @@
 """The decision back ends behind one call, chosen by measurement when a bundle is loaded.
 
-Owns the choice and its reasons; never counts clicks (window.py) and never abstains (core.py). `make_decider` returns a back end that has
-been held against the bundle's golden vectors before it answers anything. What a decision is stands in verdict.py, the back ends in
-decide_table.py, decide_mlp.py and decide_onnx.py; numba and onnxruntime are imported only by those that need them.
+Owns the choice and its reasons; never counts clicks (core/window.py) and never abstains (core/still.py). `make_decider` returns a back
+end that has been held against the bundle's golden vectors before it answers anything. What a decision is stands in verdict.py, the back
+ends in table.py, mlp.py and onnx.py; numba and onnxruntime are imported only by those that need them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The head's own kernels as back ends: float32, int8, and the float64 reference.
 
-Owns the padded layout of a chain of layers and the room for one decision; the loops are in decide_kernels.py. A back end gives the same
+Owns the padded layout of a chain of layers and the room for one decision; the loops are in kernels.py. A back end gives the same
 bits for one object alone, in a batch and from the streaming core. Not for several threads at once: each owns its scratch.
 """
 
@@ -28,7 +28,7 @@ Room = tuple[NDArray[np.float32], NDArray[np.uint16], NDArray[np.float32]]  # sc
 
 
 class Padded(NamedTuple):
-    """A chain of layers as decide_kernels.py describes it."""
+    """A chain of layers as kernels.py describes it."""
 
     meta: NDArray[np.int64]
     numbers: Any

@@ -21,7 +21,51 @@ from .verdict import Verdict, Verdicts, checked_counts, demand_golden, softmax_w
 COUNT_TABLE_ROWS_MAX = 1 << 16  # of a table that is made when a bundle is loaded: a fraction of a second
 
 
-class TableDecider:
+class CountTable:
+    """Scores, label and probability of every vector of counts 0..`shots`: (shots+1)**d_f rows, channel 0 the lowest digit."""
+
+    name: str
+
+    def __init__(self, scores: NDArray[np.float32], shots: int, choice: Mapping[str, Any]) -> None:
+        """`scores` float32 (rows, classes); `choice` says why this back end was taken."""
+        self.choice = choice
+        self.scores, self.shots, self.n_classes = scores, shots, scores.shape[1]
+        self.n_features = n_features_of(len(scores), shots + 1)
+        self.radix: NDArray[np.int64] = (shots + 1) ** np.arange(self.n_features, dtype=np.int64)
+        self.labels: NDArray[Any]  # (rows,), uint16; of single shots uint8 up to 256 classes
+        self.probabilities: NDArray[np.float32]  # (rows,), of the winning class
+        wide, self.probabilities = softmax_winners(scores)
+        self.labels = wide.astype(np.uint8) if shots == 1 and self.n_classes <= 256 else wide
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots."""
+        self._check(shots)
+        row = int(counts @ self.radix)
+        return Verdict(int(self.labels[row]), float(self.probabilities[row]))
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """Return the table's rows, float32 (n, classes), for click counts (n, d_f)."""
+        return self.scores[self._index(counts, shots)]
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """Return the labels, int64 (n,), for click counts (n, d_f)."""
+        return self.labels[self._index(counts, shots)].astype(np.int64)
+
+    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
+        """Return labels and probabilities for click counts (n, d_f)."""
+        index = self._index(counts, shots)
+        return Verdicts(self.labels[index].astype(np.uint16), self.probabilities[index])
+
+    def _check(self, shots: int) -> None:
+        if shots != self.shots:
+            raise UsageError(f"this table of counts answers {self.shots} shots, not {shots}")
+
+    def _index(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        self._check(shots)
+        return checked_counts(counts, shots, self.n_features) @ self.radix
+
+
+class TableDecider(CountTable):
     """Every click word's label and probability, computed once: a decision is one look-up (K = 1 only, exactly the head)."""
 
     name = "table"
@@ -29,15 +73,7 @@ class TableDecider:
     def __init__(self, bundle: Bundle) -> None:
         if bundle.table is None:
             raise UsageError(f"{bundle.name} has no table")
-        self.choice: Mapping[str, Any] = {}
-        self.n_features = bundle.n_features
-        self.n_classes = bundle.n_classes
-        self._scores = bundle.table
-        self.radix: NDArray[np.int64] = 1 << np.arange(self.n_features, dtype=np.int64)
-        self.labels: NDArray[Any]  # (2**d_f,), uint8 up to 256 classes, else uint16
-        self.probabilities: NDArray[np.float32]  # (2**d_f,), of the winning class
-        wide, self.probabilities = softmax_winners(bundle.table)
-        self.labels = wide.astype(np.uint8) if self.n_classes <= 256 else wide
+        super().__init__(bundle.table, 1, {})
         binary = ((bundle.golden_means == 0) | (bundle.golden_means == 1)).all(axis=1)
         found = self.scores_batch(bundle.golden_means[binary].astype(np.int64), 1)
         demand_golden(self.name, found, bundle.golden_scores[binary], bundle)
@@ -67,26 +103,12 @@ class TableDecider:
             raise UsageError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
         return result
 
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the table's rows, float32 (n, classes), for single clicks (n, d_f)."""
-        return self._scores[self._index(counts, shots)]
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return the labels, int64 (n,), for single clicks (n, d_f)."""
-        return self.labels[self._index(counts, shots)].astype(np.int64)
-
-    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
-        """Return labels and probabilities for single clicks (n, d_f)."""
-        index = self._index(counts, shots)
-        return Verdicts(self.labels[index].astype(np.uint16), self.probabilities[index])
-
-    def _index(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+    def _check(self, shots: int) -> None:
         if shots != 1:
             raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx")
-        return checked_counts(counts, shots, self.n_features) @ self.radix
 
 
-class CountTableDecider:
+class CountTableDecider(CountTable):
     """The head's answer to every vector of counts 0..K, (K+1)^d_f rows, made when the bundle is loaded."""
 
     name = "count-table"
@@ -99,42 +121,21 @@ class CountTableDecider:
             raise UsageError(
                 f"a table of counts for {shots} shots of {bundle.n_features} patterns has {rows:.3g} rows, allowed {rows_max}"
             )
-        self.choice: Mapping[str, Any] = {}
-        self.n_features, self.n_classes, self.shots = bundle.n_features, bundle.n_classes, shots
-        self.radix: NDArray[np.int64] = (shots + 1) ** np.arange(self.n_features, dtype=np.int64)
         head = open_head(bundle.head_onnx, bundle.n_features, bundle.n_classes, bundle.name)
         demand_golden(self.name, head.scores(bundle.golden_means), bundle.golden_scores, bundle)
-        rows = np.arange((shots + 1) ** self.n_features, dtype=np.int64)
-        counts = rows[:, None] // self.radix[None, :] % (shots + 1)
-        self.scores = head.scores(counts.astype(np.float32) / np.float32(shots))
-        self.labels, self.probabilities = softmax_winners(self.scores)
-
-    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from clicks per pattern, int64 (d_f,); the caller answers for 0 <= counts <= shots."""
-        if shots != self.shots:
-            raise UsageError(f"this table of counts answers {self.shots} shots, not {shots}")
-        row = int(counts @ self.radix)
-        return Verdict(int(self.labels[row]), float(self.probabilities[row]))
-
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """Return the head's scores, float32 (n, classes), for click counts (n, d_f)."""
-        return self.scores[self._index(counts, shots)]
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """Return the labels, int64 (n,), for click counts (n, d_f)."""
-        return self.labels[self._index(counts, shots)].astype(np.int64)
-
-    def verdicts(self, counts: ArrayLike, shots: int) -> Verdicts:
-        """Return labels and probabilities for click counts (n, d_f)."""
-        index = self._index(counts, shots)
-        return Verdicts(self.labels[index], self.probabilities[index])
-
-    def _index(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        if shots != self.shots:
-            raise UsageError(f"this table of counts answers {self.shots} shots, not {shots}")
-        return checked_counts(counts, shots, self.n_features) @ self.radix
+        radix = (shots + 1) ** np.arange(bundle.n_features, dtype=np.int64)
+        counts = np.arange((shots + 1) ** bundle.n_features, dtype=np.int64)[:, None] // radix % (shots + 1)
+        super().__init__(head.scores(counts.astype(np.float32) / np.float32(shots)), shots, {})
 
 
 def fits_count_table(n_features: int, shots: int, rows_max: int = COUNT_TABLE_ROWS_MAX) -> bool:
     """Whether (shots+1)**n_features rows are at most `rows_max`, decided without forming the number."""
     return n_features * np.log2(shots + 1) <= np.log2(rows_max) + 1e-9
+
+
+def n_features_of(rows: int, base: int) -> int:
+    """Return d_f of a table of base**d_f `rows`."""
+    n = 0
+    while base**n < rows:
+        n += 1
+    return n

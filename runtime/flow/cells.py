@@ -1,6 +1,6 @@
 """Cells in flow: onset, best window and release of each, and whether it was one cell or two.
 
-Owns what is done with the passages that flow_kernels.py finds; the verdict on a window is flow.py's.
+Owns what is done with the passages that kernels.py finds; the verdict on a window is core.py's.
 """
 
 from __future__ import annotations

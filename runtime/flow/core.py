@@ -1,8 +1,8 @@
-"""Decisions about objects that pass by, one for each: what cells (flow_cells.py) and a tape (flow_tape.py) have in common.
+"""Decisions about objects that pass by, one for each: what cells (cells.py) and a tape (tape.py) have in common.
 
 Owns the ring of the last frames, the verdict on a window, the pulse it asks for and why a passage is given up; frames run through
-flow_kernels.py. Never reads a clock and never learns the truth before it has decided: passages.py compares afterwards. A core of a flow has
-the shape of core.Core; its outputs also carry the passages and the pulses. flow_make.py makes one.
+kernels.py. Never reads a clock and never learns the truth before it has decided: matching.py compares afterwards. A core of a flow has
+the shape of core.Core; its outputs also carry the passages and the pulses. make.py makes one.
 
 A cell's row of the decision log says: `object` the number of the passage, `exposure_index` the last exposure of the best window,
 `clicks` those of that window. No window overlaps a gap: the row is then flagged GAP and abstains.

@@ -1,6 +1,6 @@
 """A tape of bars in flow: its speed says when a window of bars is aligned; one decision for each bar position.
 
-Owns the times of alignment, in whole numbers; the verdict on a window is flow.py's.
+Owns the times of alignment, in whole numbers; the verdict on a window is core.py's.
 
 With `track` above 0 the times follow the tape by its clicks, in a phase-locked loop of second order that is directed by decisions: a
 channel whose bar changes from one window to the next tells when, by how many of the exposures in between were lit. Bars that come

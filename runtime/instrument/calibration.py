@@ -1,7 +1,7 @@
 """The calibration file: what was measured on one instrument, when and how; beside the profile, never a rewrite of it.
 
 Owns the file (strict JSON with a checksum over all of it), its checks, and what a run takes from it: the brightness of the
-projector, the dark rates and their intervals. Never measures (calibrate.py) and never watches (dark_watch.py, light_watch.py).
+projector, the dark rates and their intervals. Never measures (estimate.py) and never watches (cusum.py, light_level.py).
 `load_calibration` returns a `Calibration` whose every figure is possible, or raises DamagedFileError; `find_objections` says
 why a run must not use one."""
 

@@ -1,6 +1,6 @@
 """What is wrong with the detector, in plain words: hot and silent channels, light leaks, drift, told apart from the watch's alarms.
 
-Owns the naming of causes, their levels, and which state lasts; never counts clicks (dark_watch.py) and never acts
+Owns the naming of causes, their levels, and which state lasts; never counts clicks (cusum.py) and never acts
 (dark_guard.py). `ChannelHealth.take` turns alarms into `Finding`s: one when a state begins and one when it ends, however often
 a test passes its threshold meanwhile.
 
@@ -25,8 +25,8 @@ from .cusum import ALL_CHANNELS, Alarm, ChannelWatch
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
-BURST_RATIO = 5.0
-WARNING_RATIO = 1.5
+BURST_RATIO = 5.0  # of the present to the expected rate, from which an excess is an alarm, and of all channels a burst
+WARNING_RATIO = 1.5  # the least ratio that a test looks for (WatchSettings.drift_ratio)
 MOST = 0.5  # of the excess: a channel with more of it is the cause
 RETURN_EVIDENCE = 14.0  # log likelihood ratio for the expected rate at which a state is over: e^14 to one
 LEAST_CHANGE = 1.5  # times, that a state which lasts is taken to differ from what is expected
@@ -111,7 +111,7 @@ class ChannelHealth:
         return findings
 
     def note_dead(self, channels: tuple[int, ...], words: str) -> list[Finding]:
-        """Channels have been found dead by other means (lit_watch.py): return the finding, none where the state is known."""
+        """Channels have been found dead by other means (dead_channels.py): return the finding, none where the state is known."""
         known = [state.finding for held, state in self._states.items() if set(channels) <= set(held)]
         if any(finding.kind == "dead" for finding in known):
             return []

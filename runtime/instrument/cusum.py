@@ -1,11 +1,11 @@
 """Change detection on dark clicks: one exact CUSUM per channel and side, and two over all channels, in whole numbers.
 
-Owns the running sums and says when one passes its threshold; never names the cause (channels.py) and never acts. What comes in are dark
-exposures, or exposures of an empty stretch, in the order of time; what comes out are `Alarm`s. A sum changes by the same amount
-with every silent exposure, so the kernel works per click and is still exact per exposure: integer arithmetic, the same on every
-machine and in a replay.
+Owns the running sums and says when one passes its threshold; never names the cause (channel_health.py) and never acts. What comes in are
+dark exposures, or exposures of an empty stretch, in the order of time; what comes out are `Alarm`s. A sum changes by the same amount with
+every silent exposure, so the kernel works per click and is still exact per exposure: integer arithmetic, the same on every machine and
+in a replay.
 
-Tests, each designed by watch_design.py: every channel against twice and half its rate; with several channels, their sum against
+Tests, each designed by cusum_design.py: every channel against twice and half its rate; with several channels, their sum against
 ten times (a light leak, soon) and one and a half times (a drift, surely). `WatchSettings.arl_exposures` is for all of them
 together.
 """
@@ -26,7 +26,9 @@ I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
 FLOOR_RATE = 1e-9  # a detector that is said to have no dark clicks at all is watched as one with this rate
 ALL_CHANNELS = -1
-SHARES = {"rise": 0.6, "fall": 0.2, "burst": 0.1, "drift": 0.1}  # of the false alarms, by test
+# Of the false alarms, by test: a larger share gives a lower threshold and a shorter delay, but only by the logarithm of the share. Most
+# goes to rising channels, which spoil decisions soonest.
+SHARES = {"rise": 0.6, "fall": 0.2, "burst": 0.1, "drift": 0.1}
 MAX_CHANNELS = 4096
 _ALARM_ROOM = 256  # alarms of one call; more are counted, not kept
 # columns of a test's state

@@ -1,6 +1,6 @@
 """The design of a CUSUM test on clicks: whole-number steps, exact average run lengths, the threshold for a stated false-alarm rate.
 
-Owns the numerics of one Bernoulli CUSUM; never sees a click (dark_watch.py runs the tests). Page's test of rate p0 against p1 adds the
+Owns the numerics of one Bernoulli CUSUM; never sees a click (cusum.py runs the tests). Page's test of rate p0 against p1 adds the
 log likelihood ratio of each exposure and never falls below 0: `S = max(0, S + x)`, alarm at `S >= threshold`. Scaled to whole
 numbers, the ratio of the steps is a fraction, so the test that runs is exact integer arithmetic, and so is the chain whose run
 length is computed.
@@ -22,10 +22,12 @@ RATE_MIN, RATE_MAX = 1e-12, 0.5
 FINE_RATE = 1e-3  # rarer clicks are designed at this rate and scaled: the Poisson limit, right to about the rate itself
 STEP_ERROR = 2e-3  # of the steps' ratio, by rounding to whole numbers
 STATES_MAX = 1 << 22
-GUARD_RATIO = 1.5
-ENOUGH_CLICKS = 1e4
-_TOLERANCE = 1e-10
-_SWEEPS_MAX = 200_000
+GUARD_RATIO = (
+    1.5  # between the rates that are told apart where the expected one is an estimate: nearer ones would need very long
+)
+ENOUGH_CLICKS = 1e4  # between false alarms: beyond, log(ARL) is a straight line to about 1/ARL (Wald's identity)
+_TOLERANCE = 1e-10  # relative, of the sums of a cycle: far below STEP_ERROR
+_SWEEPS_MAX = 200_000  # a guard against a sum that does not settle
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Dead channels, found in exposures with light: a channel that says nothing where it should have clicked.
 
-Owns counts of silence, in whole numbers, and says which channels are dead; never names other states (channels.py) and never
-acts (dark_guard.py). In the dark a dead channel is hard to see: at 10^-4 clicks per exposure silence is no news for a long time.
+Owns counts of silence, in whole numbers, and says which channels are dead; never names other states (channel_health.py) and never
+acts (core/dark_guard.py). In the dark a dead channel is hard to see: at 10^-4 clicks per exposure silence is no news for a long time.
 With light there are two tests, each with a stated number of exposures or objects between false alarms, all channels together:
 
 - *Proved.* Whatever the scene, a living channel clicks at least at its dark rate r in every exposure, lit or not. A silence of n
@@ -35,10 +35,15 @@ U8 = npt.NDArray[np.uint8]
 F64 = npt.NDArray[np.float64]
 QUIET = 0.5  # of the expected dark rate: less often clicks only a dead channel
 MAX_WITNESSES = 64  # other channels that are compared, evenly spread
-LEAST_CLICKED = 30  # objects in which a channel has clicked before it is judged by them
+LEAST_CLICKED = (
+    30  # objects in which a channel has clicked before it is judged by them: its share is then known to about a fifth
+)
 LEAST_OBJECTS = 8  # in a row without a click
 LOOK_AGAIN = 1.25  # times the objects, where the others have changed
-MEAN_Z2_MAX, Z2_MAX = 1.6, 12.0  # of the others' changes, in squared standard errors, beyond which the scene is another
+# Of the others' changes, in squared standard errors, beyond which the scene is another. One change alone is chi-square with one degree
+# of freedom: 12.0 is passed with probability 5e-4. Their mean over d channels has standard deviation sqrt(2 / d): 1.6 lies 1.3 of them
+# above 1 for ten channels and 3.4 for MAX_WITNESSES. The test errs to the side of saying nothing: then the proof decides, later.
+MEAN_Z2_MAX, Z2_MAX = 1.6, 12.0
 RETURN_BLOCKS = 3  # with a click: the channel lives
 _NEVER = 1 << 62
 

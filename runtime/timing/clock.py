@@ -24,7 +24,11 @@ ANCHORS = 8  # the latest quick probes, each of which bounds the error by itself
 DRIFT_PRIOR = 100e-6  # one sigma of the prior on the rate error: crystals are within +-100 ppm
 WANDER = 2e-6  # the rate may differ by this from the fitted one within the history
 READING_NS = 1_000  # both ends stamp to a microsecond or better
-STEP_MARGIN_NS = 20_000
+STEP_MARGIN_NS = 20_000  # a jump is larger than the published uncertainty by this: the jitter of a stamp on a busy host
+# A probe is quick, and goes into the fit, up to 1.5 times the least round trip and 20 us. Its bound is half its round trip, so that a
+# probe of 1.5 times the best still weighs (1 / 1.5)^2 = 0.44 of it; the 20 us let probes in on links whose best trip is shorter than
+# the scheduler's own jitter. What is slower waited in a queue and says nothing that the quick ones do not.
+QUICK_RATIO, QUICK_MARGIN_NS = 1.5, 20_000.0
 MAX_UNRECORDED = 4096
 
 CLOCK_DTYPE = np.dtype([("host_ns", "<i8"), ("tick", "<u8"), ("round_trip_ns", "<i8")])
@@ -142,8 +146,7 @@ class ClockModel:
 def _fit(samples: npt.NDArray[np.void], tick_hz: int, newest: int) -> ClockFit:
     round_trip = samples["round_trip_ns"].astype(np.float64)
     best = float(round_trip.min())
-    # Queueing only ever adds delay: slow probes carry no information that the quick ones do not.
-    quick = np.flatnonzero(round_trip <= 1.5 * best + 20_000.0)
+    quick = np.flatnonzero(round_trip <= QUICK_RATIO * best + QUICK_MARGIN_NS)
     quick = quick[np.argsort((quick - newest - 1) % len(samples))]  # oldest first
     host, tick, trip = samples["host_ns"][quick], samples["tick"][quick], round_trip[quick]
     reference_host, reference_tick = int(host[-1]), int(tick[-1])
@@ -163,7 +166,7 @@ def _fit(samples: npt.NDArray[np.void], tick_hz: int, newest: int) -> ClockFit:
         reference_host_ns=reference_host + round(mean_o - rate * mean_t),
         ns_per_tick=ns_per_tick * (1.0 + rate),
         uncertainty_ns=float(bounds[-1]),
-        rate_uncertainty=3.0 / precision**0.5 + WANDER,
+        rate_uncertainty=3.0 / precision**0.5 + WANDER,  # three sigma of the fitted rate
         drift_ppm=rate * 1e6,
         probes=len(quick),
         anchors=tuple(zip(ticks[-ANCHORS:].tolist(), bounds[-ANCHORS:].tolist())),
