@@ -161,13 +161,13 @@ class GridHost:
         """Listen to the run."""
         self._run = run
         self.checker.attach(run)
-        report = run.journal.event
+        note = run.journal.note
 
-        def tapped(event: dict[str, Any]) -> None:
-            self.checker.on_event(run.connection.session.nonce, event)
-            report(event)
+        def tapped(kind: str, **facts: Any) -> None:
+            self.checker.on_event(run.connection.session.nonce, {"kind": kind, **facts})
+            note(kind, **facts)
 
-        run.journal.event = tapped  # type: ignore[method-assign]
+        run.journal.note = tapped  # type: ignore[method-assign]
 
     def watch(self, run: LiveRun, output: Output) -> None:
         """After each block: now and then a gate, and a look at the memory."""

@@ -1,6 +1,6 @@
 """`pans replay`: recompute a recording's decisions from its raw messages and compare the logs by hash.
 
-Owns the command; the replay itself is record/replay.py's.
+Owns the command; the replay itself is record/replaying.py's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
 if TYPE_CHECKING:  # `pans replay --help` loads no kernels
     from pans.runtime.record import Recording
     from pans.runtime.record.pictures import PictureLog
-    from pans.runtime.record.replay import Replayed
+    from pans.runtime.record.replaying import Replayed
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

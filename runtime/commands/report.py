@@ -8,11 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import EXIT_FINE, Command, emit
 from pans.runtime.container import replace_file
-from pans.runtime.errors import UsageError
-from pans.runtime.record import read_recording
 from pans.runtime.report.verify import file_kind
 
 
@@ -22,18 +19,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pans.runtime.report.page_run import bundle_page, recording_page
+    from pans.runtime.report import page_of
 
+    page = page_of(args.path)
     kind = file_kind(args.path)
-    if kind == "recording":
-        page = recording_page(read_recording(args.path, salvage=True))
-    elif kind == "bundle":
-        bundle, sha256 = load_bundle(args.path)
-        page = bundle_page(bundle, sha256, args.path)
-    else:
-        raise UsageError(
-            f"{args.path} is a {kind}", remedy="reports are made of recordings and bundles; `pans info` shows this"
-        )
     replace_file(args.out, page)
     emit(args, {"report": str(args.out), "kind": kind, "bytes": len(page)}, str(args.out))
     return EXIT_FINE

@@ -121,7 +121,7 @@ class DarkRun:
         if self.calibration is not None:
             find_objections(self.calibration, self.profile, None if serial is None else str(serial))
         for warning in self.warnings:
-            run.journal.event({"kind": "calibration_warning", "words": warning})
+            run.journal.note("calibration_warning", words=warning)
 
     def look(self, run: LiveRun, output: Output) -> None:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""
@@ -129,7 +129,7 @@ class DarkRun:
             if not decision.flags & NOT_MEASURED:
                 words = self.light.take(decision.clicks)
                 if words:
-                    run.journal.event({"kind": "light_changed", **self.light.found[-1]})
+                    run.journal.note("light_changed", **self.light.found[-1])
 
     def figures(self) -> DarkFigures:
         """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults."""

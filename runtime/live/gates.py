@@ -131,7 +131,7 @@ class GateQueue:
             return
         assert self.actuator is not None
         reason = self.actuator.fire(at_ns, action.duration_ticks * 1e6 / clock.tick_hz, action.channel)
-        self._journal.event({"kind": "fired", "decision": action.number, "tick": action.tick, "refusal": reason})
+        self._journal.note("fired", decision=action.number, tick=action.tick, refusal=reason)
         if reason:
             self._refuse(action, reason)
         else:
@@ -155,7 +155,7 @@ class GateQueue:
         off_ns = uncertainty_ns + sent.uncertainty_ns
         second.worst_uncertainty_ns = max(second.worst_uncertainty_ns, off_ns)
         facts = {"host_ns": at_ns, "second_tick": sent.tick, "uncertainty_us": off_ns / 1000}
-        self._journal.event({"kind": "gate_sent", "decision": action.number, "tick": action.tick, **facts})
+        self._journal.note("gate_sent", decision=action.number, tick=action.tick, **facts)
 
     def _turn_second(self, second: SecondInstrument, now_ns: int) -> None:
         if self._lost:
@@ -168,7 +168,7 @@ class GateQueue:
     def _lose_second(self, error: LinkError | DeviceError) -> None:
         """The second instrument is gone: the run goes on, and every pulse is refused from here on."""
         self._lost = f"the second instrument was lost: {error.message}"
-        self._journal.event({"kind": "actuator_lost", "words": self._lost})
+        self._journal.note("actuator_lost", words=self._lost)
         for _, action in self._sent:
             self._refuse(action, self._lost)
         self._sent.clear()
@@ -190,16 +190,16 @@ class GateQueue:
             else:
                 self.counters.done += 1
         for refusal in refusals.values():
-            self._journal.event({"kind": "gate_refused", **refusal._asdict()})
+            self._journal.note("gate_refused", **refusal._asdict())
 
     def _refuse(self, action: Action, why: str) -> None:
         self.counters.refused += 1
-        self._journal.event({"kind": "gate_refused", "decision": action.number, "tick": action.tick, "text": why})
+        self._journal.note("gate_refused", decision=action.number, tick=action.tick, text=why)
         self.failed(action.number)
 
     def _expire(self, action: Action, why: str) -> None:
         self.counters.expired += 1
-        self._journal.event({"kind": "gate_expired", "decision": action.number, "tick": action.tick, "text": why})
+        self._journal.note("gate_expired", decision=action.number, tick=action.tick, text=why)
         self.failed(action.number)
 
     def summary(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+from pans.runtime.core.decision import CoreEvent
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import AnyRecorder
 
@@ -26,9 +27,13 @@ class Journal:
         self.recorder = recorder
         self._kept: Counter[str] = Counter()
 
-    def event(self, event: dict[str, Any]) -> None:
-        """Note one event: a map with its `kind` and what belongs to it, units in the keys."""
-        kind = event["kind"]
+    def take(self, event: CoreEvent) -> None:
+        """Note what a core or a verdict tells."""
+        self.note(**event.event())
+
+    def note(self, kind: str, **facts: Any) -> None:
+        """Note one event: its kind and what belongs to it, units in the names."""
+        event = {"kind": kind, **facts}
         if kind in TROUBLE:
             self.trouble = event
         if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
@@ -41,13 +46,13 @@ class Journal:
         """Note which session and device clock the following ticks belong to."""
         welcome = connection.session.welcome
         facts = {} if welcome is None else welcome.facts
-        self.event({"kind": "session", "nonce": connection.session.nonce, "epoch": str(facts.get("epoch", "unknown"))})
+        self.note("session", nonce=connection.session.nonce, epoch=str(facts.get("epoch", "unknown")))
         self.clock(connection)
 
     def clock(self, connection: Connection) -> None:
         """Note the probes and the jumps of the device's clock since the last time."""
         for step in connection.clock_steps:
-            self.event({"kind": "clock_step", "tick": step.tick, "off_ns": step.off_ns, "allowed_ns": step.allowed_ns})
+            self.note("clock_step", tick=step.tick, off_ns=step.off_ns, allowed_ns=step.allowed_ns)
         connection.clock_steps.clear()
         samples = connection.known_clock().take_samples()
         if self.recorder is not None and len(samples):
@@ -57,4 +62,4 @@ class Journal:
         """Note the gates that the device has refused."""
         refusals = connection.session.refusals
         while refusals:
-            self.event({"kind": "gate_refused", **refusals.popleft()._asdict()})
+            self.note("gate_refused", **refusals.popleft()._asdict())

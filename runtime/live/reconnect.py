@@ -86,7 +86,7 @@ def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: C
     """Find the device again and arm it for what is left of the run, or end the run because that failed."""
     now_ns = run.now_ns()
     run.outage_ns = now_ns if run.outage_ns is None else run.outage_ns
-    run.journal.event({"kind": "link_lost", "reason": error.message})
+    run.journal.note("link_lost", reason=error.message)
     run.journal.clock(run.connection)
     run.count_decoded()
     try:
@@ -97,7 +97,7 @@ def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: C
     run.reconnects += 1
     gc.collect()  # it is off while armed, and an old connection's objects name each other: here nobody waits
     outage_ms = (run.now_ns() - run.outage_ns) / NS_PER_MS
-    run.journal.event({"kind": "reconnected", "attempts": attempts, "outage_ms": outage_ms})
+    run.journal.note("reconnected", attempts=attempts, outage_ms=outage_ms)
     run.settle(run.core.end())
     if run.config.n_cycles and run.core.cycles_left(run.config.n_cycles) <= 0:
         run.ended = "the link was lost within the last object"

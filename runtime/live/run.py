@@ -21,7 +21,6 @@ from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record import AnyRecorder, PartedRecorder
 from pans.runtime.record.parted_recorder import repeated_setup
-from pans.runtime.timing.attribution import LateAttribution
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.frame import Messages
@@ -156,7 +155,7 @@ class LiveRun:
         self.settle(self.core.end())
         self.gates.finish(session)
         for verdict in self.lateness.closing_verdicts(self.now_ns()):
-            self.journal.event(verdict.event())
+            self.journal.take(verdict)
         self.lateness.close()
         self.journal.clock(self.connection)
 
@@ -193,7 +192,8 @@ class LiveRun:
         outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
         now_ns = self.now_ns()
         self._act(now_ns)
-        self._judge_late(self.lateness.settled(self.connection, now_ns, idle=not outputs))
+        if (verdict := self.lateness.settled(self.connection, now_ns, idle=not outputs)) is not None:
+            self.journal.take(verdict)
         self.journal.refusals(self.connection)
         if watch is not None:
             for output in outputs:
@@ -290,9 +290,9 @@ class LiveRun:
     def _account(self, output: Output, times_ns: tuple[int, int, int]) -> None:
         """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
         for event in output.events:
-            self.journal.event(event.event())
+            self.journal.take(event)
             if isinstance(event, Gap):
-                self.journal.event(self.lateness.lost(event, self.connection, self.now_ns()).event())
+                self.journal.take(self.lateness.lost(event, self.connection, self.now_ns()))
         if not output.decisions:
             return
         self.gates.take(output.actions)
@@ -312,7 +312,7 @@ class LiveRun:
             marks_ns = (end_ns, *times_ns, self.now_ns())
             if self.timing.judge(marks_ns, uncertainty_ns):
                 latency_us = (marks_ns[3] - end_ns) / 1000
-                self.journal.event({"kind": "late", "decision": decision.number, "latency_us": latency_us})
+                self.journal.note("late", decision=decision.number, latency_us=latency_us)
                 self.lateness.late(decision.number, marks_ns, uncertainty_ns)
             if self._recorder is not None:
                 self._recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
@@ -323,7 +323,7 @@ class LiveRun:
         if not isinstance(recorder, PartedRecorder):
             return
         for event in recorder.keeper.news():
-            self.journal.event(event)
+            self.journal.note(**event)
         if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())
@@ -333,10 +333,6 @@ class LiveRun:
         """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
         self._recorder = self.journal.recorder = None
         self.connection.on_sent = None
-
-    def _judge_late(self, verdict: LateAttribution | None) -> None:
-        if verdict is not None:
-            self.journal.event(verdict.event())
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .parted_recorder import PartedRecorder
     from .recorder import Recorder
     from .recording import Recording, read_recording
-    from .replay import replay
+    from .replaying import replay
 
 __all__ = ["AnyRecorder", "PartedRecorder", "Recorder", "Recording", "read_recording", "replay"]
 
@@ -31,6 +31,6 @@ __getattr__ = lazy_names(
         "Recorder": ".recorder",
         "Recording": ".recording",
         "read_recording": ".recording",
-        "replay": ".replay",
+        "replay": ".replaying",
     },
 )

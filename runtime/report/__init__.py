@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .page_run import bundle_page, recording_page
+    from .file_page import page_of
     from .summary import Summary, summarise
     from .verify import FileVerdict, verify_file
 
-__all__ = ["FileVerdict", "Summary", "bundle_page", "recording_page", "summarise", "verify_file"]
+__all__ = ["FileVerdict", "Summary", "page_of", "summarise", "verify_file"]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "FileVerdict": ".verify",
         "Summary": ".summary",
-        "bundle_page": ".page_run",
-        "recording_page": ".page_run",
+        "page_of": ".file_page",
         "summarise": ".summary",
         "verify_file": ".verify",
     },

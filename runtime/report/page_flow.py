@@ -36,7 +36,7 @@ def add_passages(page: Page, recording: Recording, bundle: Bundle | None) -> Non
     if bundle is None:
         page.text("The bundle is not in the recording: its decisions cannot be matched with what passed.", "note")
         return
-    from pans.runtime.record.replay import replayed_flow
+    from pans.runtime.record.replaying import replayed_flow
 
     figures, confusion = replayed_flow(recording, bundle)
     pulses = _pulses(recording, bundle)

@@ -1,36 +1,30 @@
-"""The report page of a recording or of a bundle: which figures stand on it, and where they come from.
+"""The report page of a recording: which figures stand on it, and where they come from.
 
-Owns the order of the sections and the sums behind the drawings; never draws (page_figures.py) and never judges: the verdict is the
+Owns the order of the sections and the sums behind the drawings; never draws (figures.py) and never judges: the verdict is the
 recorded one. Every figure is computed from the recorded messages, decisions and times, except where it says "as the run summed it up".
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
-from pans.runtime.core.plan import Plan
-from pans.runtime.intervals import wilson_interval
 from pans.runtime.record import Recording
-from pans.runtime.record.exposures import Exposures, is_dark, iter_exposures
 from pans.runtime.record.sent_plan import recorded_plan
 
 from . import figures as draw
 from .page import Page
+from .page_bundle import add_optics
 from .page_flow import add_late, add_passages, is_flow
+from .page_rates import add_rates, count_rates
 
-BINS = 120
-EXPOSURES_PER_BIN = 25  # of each pattern: a rate from fewer is noise
 EVENTS_SHOWN = 200
 EVENTS_OF_A_KIND = 30
-F64 = NDArray[np.float64]
 _TITLES = {
     "accuracy": "accuracy",
     "accuracy_std_trials": "spread over trials (standard deviation)",
@@ -59,16 +53,6 @@ _SHOWN_ELSEWHERE = {
 }
 
 
-class Rates(NamedTuple):
-    """Clicks and exposures per time bin and pattern or channel, and of the dark slots, (bins, channels) and (bins,)."""
-
-    edges_s: F64
-    clicks: F64
-    exposures: F64
-    dark_clicks: F64
-    dark_exposures: F64
-
-
 def recording_page(recording: Recording) -> bytes:
     """Return the page of `recording`; a cut one is shown as far as it goes, and says so."""
     summary = recording.summary
@@ -94,12 +78,12 @@ def recording_page(recording: Recording) -> bytes:
     add_late(page, recording)
     plan = recorded_plan(recording)
     rates = count_rates(recording, plan)
-    _rates(page, plan, rates, summary)
+    add_rates(page, plan, rates, summary)
     _clock(page, recording)
     _events(page, recording)
     if bundle is not None:
         page.heading("The bundle")
-        _optics(page, bundle)
+        add_optics(page, bundle)
     page.heading("What was run")
     header = {key: value for key, value in recording.header.items() if key != "profile"}
     profile = recording.header.get("profile") or {}
@@ -117,58 +101,6 @@ def recording_page(recording: Recording) -> bytes:
             | {"device": summary.get("device", {}), "dark": summary.get("dark", {}), "clock": summary.get("clock", {})}
         )
     return page.html()
-
-
-def bundle_page(bundle: Bundle, sha256: str, path: Path) -> bytes:
-    """Return the page of a bundle: what it is, its patterns or optics, where it comes from."""
-    from .file_facts import file_facts
-
-    page = Page(f"Bundle {bundle.name}", simulated=False)
-    page.text(
-        "A trained sensor: what is shown or stands before the detectors, and how clicks become a decision.", "note"
-    )
-    facts = file_facts(path)
-    provenance = facts.pop("provenance", {})
-    page.facts(facts)
-    page.heading("Patterns" if bundle.analyser is None else "Optics")
-    _optics(page, bundle)
-    page.heading("Provenance")
-    page.facts({"SHA-256": sha256, **provenance})
-    return page.html()
-
-
-def count_rates(recording: Recording, plan: Plan) -> Rates:
-    """Sum clicks and exposures over at most `BINS` equal stretches of device time; a clock that went back starts no new bin."""
-    n = plan.n_patterns
-    sums: list[tuple[int, F64, F64, int, int]] = []
-    for item in iter_exposures(recording, plan):
-        if isinstance(item, Exposures):
-            sums.append((int(item.start_tick[0]), *_sums(item, plan, n)))
-    if not sums:
-        empty = np.zeros((1, n))
-        return Rates(np.array([0.0, 1.0]), empty, empty, np.zeros(1), np.zeros(1))
-    ticks = np.array([row[0] for row in sums], np.int64)
-    seconds = np.maximum(ticks - ticks[0], 0) * plan.tick_us * 1e-6
-    per_pattern = sum(float(row[2].sum()) for row in sums) / n
-    bins = int(np.clip(per_pattern / EXPOSURES_PER_BIN, 1, BINS))
-    edges = np.linspace(0.0, float(seconds.max()) + plan.cycle_us * 1e-6, bins + 1)
-    which = np.clip(np.searchsorted(edges, seconds, "right") - 1, 0, len(edges) - 2)
-    totals = [np.zeros((len(edges) - 1, n)) for _ in range(2)] + [np.zeros(len(edges) - 1) for _ in range(2)]
-    for total, column in zip(totals, range(1, 5)):
-        np.add.at(total, which, np.array([row[column] for row in sums], np.float64))
-    return Rates(edges, *totals)
-
-
-def _sums(item: Exposures, plan: Plan, n: int) -> tuple[F64, F64, int, int]:
-    """Clicks and exposures of one message per pattern or channel; clicks and exposures in the dark."""
-    dark = is_dark(item.pattern)
-    lit = item.clicks[~dark]
-    if plan.mode == "parallel":
-        clicks, exposures = lit.sum(axis=0).astype(np.float64), np.full(n, float(len(lit)))
-        return clicks, exposures, int(item.clicks[dark].sum()), int(dark.sum()) * n
-    shown = np.minimum(item.pattern[~dark], n - 1)
-    clicks = np.bincount(shown, weights=lit[:, 0], minlength=n).astype(np.float64)
-    return clicks, np.bincount(shown, minlength=n).astype(np.float64), int(item.clicks[dark].sum()), int(dark.sum())
 
 
 def _verdict(page: Page, recording: Recording) -> None:
@@ -242,50 +174,6 @@ def _timing(page: Page, recording: Recording) -> None:
     )
 
 
-def _rates(page: Page, plan: Plan, rates: Rates, summary: Mapping[str, Any]) -> None:
-    page.heading("Clicks over time")
-    what = "channel" if plan.mode == "parallel" else "pattern"
-    page.figure(
-        draw.click_rates(rates.edges_s, rates.clicks, rates.exposures, what),
-        f"Clicks per exposure of each {what}, {len(rates.clicks)} bins over the run; right: the mean with its standard error.",
-    )
-    if not rates.dark_exposures.sum():
-        _empty_fields(page, summary)
-        return
-    page.heading("Dark counts")
-    clicks, exposures = int(rates.dark_clicks.sum()), int(rates.dark_exposures.sum())
-    low, high = wilson_interval(clicks, exposures)
-    expected = summary.get("dark", {}).get("expected") if isinstance(summary.get("dark"), Mapping) else None
-    expected = float(np.mean(expected)) if expected is not None else None
-    page.text(
-        f"{clicks} clicks in {exposures} dark exposures: {clicks / exposures:.3g} per exposure, 95 % interval {low:.3g} to {high:.3g}"
-        + ("." if expected is None else f"; expected {expected:.3g}.")
-    )
-    some = rates.dark_exposures > 0
-    counted = zip(rates.dark_clicks[some].astype(int).tolist(), rates.dark_exposures[some].astype(int).tolist())
-    intervals = np.array([wilson_interval(c, n) for c, n in counted])
-    centres = (rates.edges_s[:-1] + rates.edges_s[1:])[some] / 2
-    page.figure(
-        draw.dark_rates(centres, rates.dark_clicks[some], rates.dark_exposures[some], intervals, expected),
-        "Dark clicks per dark exposure in each stretch of the run.",
-    )
-
-
-def _empty_fields(page: Page, summary: Mapping[str, Any]) -> None:
-    """Without dark slots: what a flow's frames without an object told, channel by channel."""
-    channels = summary.get("dark", {}).get("channels") or []
-    if not channels or not channels[0]["exposures"]:
-        page.text("The run had no dark slots: nothing is known about dark counts.", "note")
-        return
-    page.heading("Dark counts")
-    page.text("The run had no dark slots; frames in which no object was found tell, as the run summed it up.", "note")
-    rows = [
-        (number, row["clicks"], row["exposures"], f"{row['low']:.3g} to {row['high']:.3g}", f"{row['expected']:.3g}")
-        for number, row in enumerate(channels)
-    ]
-    page.table(rows, ("channel", "clicks", "frames", "per frame, 95 %", "expected"))
-
-
 def _clock(page: Page, recording: Recording) -> None:
     samples = recording.clock_samples()
     if len(samples) < 3 or samples["tick"].min() == samples["tick"].max():
@@ -321,25 +209,3 @@ def _events(page: Page, recording: Recording) -> None:
             f"{len(shown)} are shown, the first {EVENTS_OF_A_KIND} of a kind at most; `pans export` writes them all.",
             "note",
         )
-
-
-def _optics(page: Page, bundle: Bundle) -> None:
-    if bundle.analyser is None:
-        pictures = bundle.patterns().reshape(-1, *bundle.image_shape)
-        more = (
-            ""
-            if len(pictures) <= draw.PATTERNS_MAX
-            else f" The first {draw.PATTERNS_MAX} of {len(pictures)} are drawn."
-        )
-        page.figure(
-            draw.patterns(pictures, "photoelectrons per exposure\nand unit transmission"),
-            f"The patterns as they are shown, in {bundle.levels} whole levels.{more}",
-        )
-        page.figure(
-            draw.per_pattern(pictures.sum(axis=(1, 2)), "photoelectrons at\ntransmission 1"),
-            f"Light of each pattern; together {bundle.illumination():.4g}, the illumination of one shot.",
-        )
-        return
-    matrix = bundle.analyser.matrix.reshape(-1, *bundle.image_shape)
-    values, unit = (np.abs(matrix), "modulus of W") if np.iscomplexobj(matrix) else (matrix, "W")
-    page.figure(draw.patterns(values.astype(np.float64), unit), f"The rows of W, {bundle.encoder}: one per detector.")

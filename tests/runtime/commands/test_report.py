@@ -16,7 +16,7 @@ from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.page import Page, flat
-from pans.runtime.report.page_run import count_rates
+from pans.runtime.report.page_rates import count_rates
 
 pytest.importorskip("matplotlib", reason="needs the plot extra")
 

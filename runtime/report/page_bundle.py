@@ -1,0 +1,55 @@
+"""The report page of a bundle, and the pictures of its patterns or optics.
+
+Owns what stands on it; never draws (figures.py).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle
+
+from . import figures as draw
+from .file_facts import file_facts
+from .page import Page
+
+
+def bundle_page(bundle: Bundle, sha256: str, path: Path) -> bytes:
+    """Return the page of a bundle: what it is, its patterns or optics, where it comes from."""
+    page = Page(f"Bundle {bundle.name}", simulated=False)
+    page.text(
+        "A trained sensor: what is shown or stands before the detectors, and how clicks become a decision.", "note"
+    )
+    facts = file_facts(path)
+    provenance = facts.pop("provenance", {})
+    page.facts(facts)
+    page.heading("Patterns" if bundle.analyser is None else "Optics")
+    add_optics(page, bundle)
+    page.heading("Provenance")
+    page.facts({"SHA-256": sha256, **provenance})
+    return page.html()
+
+
+def add_optics(page: Page, bundle: Bundle) -> None:
+    """Add the patterns that are shown, or the rows of the passive optics."""
+    if bundle.analyser is None:
+        pictures = bundle.patterns().reshape(-1, *bundle.image_shape)
+        more = (
+            ""
+            if len(pictures) <= draw.PATTERNS_MAX
+            else f" The first {draw.PATTERNS_MAX} of {len(pictures)} are drawn."
+        )
+        page.figure(
+            draw.patterns(pictures, "photoelectrons per exposure\nand unit transmission"),
+            f"The patterns as they are shown, in {bundle.levels} whole levels.{more}",
+        )
+        page.figure(
+            draw.per_pattern(pictures.sum(axis=(1, 2)), "photoelectrons at\ntransmission 1"),
+            f"Light of each pattern; together {bundle.illumination():.4g}, the illumination of one shot.",
+        )
+        return
+    matrix = bundle.analyser.matrix.reshape(-1, *bundle.image_shape)
+    values, unit = (np.abs(matrix), "modulus of W") if np.iscomplexobj(matrix) else (matrix, "W")
+    page.figure(draw.patterns(values.astype(np.float64), unit), f"The rows of W, {bundle.encoder}: one per detector.")
