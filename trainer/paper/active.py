@@ -29,7 +29,7 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, sam
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import plots
-from .page import MINUTES, Asked, Column, Made, Page, Row, Rows, Table, accuracy, kept, percent
+from .page import Asked, Made, Row, Rows, Table, columns, kept, pages
 from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
 
 PROFILE = "ideal"
@@ -206,76 +206,35 @@ def active_page(asked: Asked) -> Made:
 
 def active_tables(rows: Rows) -> list[Table]:
     """Return the table of the paper's images, that of all, and that of other seeds."""
-    others = [other | {"of": row} for row in rows for other in row.get("other_seeds", ())]
-    return [
-        Table(
-            _FIRST_COLUMNS,
-            rows,
-            f"## First {FIRST_OBJECTS} test images, as in the paper (accuracy %, K = 1 / 2 / 3 / 5)",
-        ),
-        Table(_ALL_COLUMNS, rows, "## All 10 000 test images"),
-        *([Table(_SEED_COLUMNS, others, "## Other seeds (accuracy %, K = 1 / 2 / 3 / 5)")] if others else ()),
+    shown = [row | _compared(row) for row in rows]
+    others = [other | {"moved": _moved(row, other)} for row in rows for other in row.get("other_seeds", ())]
+    first = f"## First {FIRST_OBJECTS} test images, as in the paper (accuracy %, K = 1 / 2 / 3 / 5)"
+    seeds = Table(columns("active_seeds"), others, "## Other seeds (accuracy %, K = 1 / 2 / 3 / 5)")
+    found = [
+        Table(columns("active_first"), shown, first),
+        Table(columns("active_all"), shown, "## All 10 000 test images"),
     ]
+    return [*found, seeds] if others else found
 
 
-def _slashed(values: list[float]) -> str:
-    return " / ".join(f"{value:.2f}" for value in values)
+def _compared(row: Row) -> Row:
+    trials = row["all"]["1"]["trials"]
+    ahead = 100 * row[FIRST]["1"]["accuracy_mean"] - row["paper"]["simulation"][0]
+    return {"ahead": ahead, "how": f"{trials} trials" if trials else "exact"}
 
 
-def _accuracies(part: str) -> Callable[[Row], str]:
-    return lambda row: _slashed([100 * row[part][str(shots)]["accuracy_mean"] for shots in SHOTS])
-
-
-def _moved(part: str, shots: int) -> Callable[[Row], float]:
+def _moved(row: Row, other: Row) -> Row:
     """By how much another seed moves the accuracy."""
-    return lambda row: float(row[part][str(shots)]["accuracy_mean"] - row["of"][part][str(shots)]["accuracy_mean"])
+    return {
+        part: {k: other[part][k]["accuracy_mean"] - row[part][k]["accuracy_mean"] for k in row[part]}
+        for part in (FIRST, "all")
+    }
 
 
-FEATURES = Column("d_f", "features")
-_FIRST_COLUMNS = (
-    FEATURES,
-    Column("paper, simulation", lambda row: _slashed(row["paper"]["simulation"])),
-    Column("paper, experiment", lambda row: _slashed(row["paper"]["experiment"])),
-    Column("ours", _accuracies(FIRST)),
-    Column("ahead (K=1)", lambda row: 100 * row[FIRST]["1"]["accuracy_mean"] - row["paper"]["simulation"][0], "+.2f"),
-    Column("clicks: paper", "paper.clicks", ".2f"),
-    Column("ours", f"{FIRST}.1.clicks_mean", ".2f"),
-    Column("photons", f"{FIRST}.1.photons_mean", ".1f"),
-    Column("illum.: paper", "paper.illumination", ".0f"),
-    Column("ours", f"{FIRST}.1.illumination", ".0f"),
-)
-_ALL_COLUMNS = (
-    FEATURES,
-    Column("ours, K = 1 / 2 / 3 / 5", _accuracies("all")),
-    percent("trials (K=1)", "all.1.accuracy_std"),
-    percent("objects (K=1)", "all.1.accuracy_se_objects"),
-    Column("clicks", "all.1.clicks_mean", ".2f"),
-    Column("photons", "all.1.photons_mean", ".1f"),
-    percent("direct at these photons", "direct.accuracy_mean", ".1f"),
-    Column("how", lambda row: f"{row['all']['1']['trials']} trials" if row["all"]["1"]["trials"] else "exact"),
-    MINUTES,
-)
-_SEED_COLUMNS = (
-    FEATURES,
-    Column("seed", "options.seed"),
-    Column(f"first {FIRST_OBJECTS}", _accuracies(FIRST)),
-    Column("all", _accuracies("all")),
-    Column("clicks", f"{FIRST}.1.clicks_mean", ".2f"),
-    *(
-        percent(f"moved, {words}, K = {shots}", _moved(part, shots), "+.2f")
-        for part, words in ((FIRST, f"first {FIRST_OBJECTS}"), ("all", "all"))
-        for shots in (1, 5)
-    ),
-)
-PAGES = {
-    name: Page(f"{name}: the paper's table", active_page, active_tables, {"": "accuracy over clicks and over photons"})
-    for name in ACTIVE
-}
+PAGES = pages(dict.fromkeys(ACTIVE, (active_page, active_tables)))
 
 
 # ---- trained rows, for the pages that measure them further ----
-
-MEASURED = (*accuracy(f"first {FIRST_OBJECTS}", FIRST), *accuracy("all", "all"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

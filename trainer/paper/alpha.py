@@ -20,7 +20,7 @@ from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.history import follow
 
 from . import images, plots
-from .page import MINUTES, Asked, Column, Draw, Made, Page, Row, Rows, Table, kept, percent
+from .page import Asked, Draw, Made, Row, Rows, Table, columns, kept, pages
 from .passive import PROFILE, measure
 
 TASK = "fashion-mnist"
@@ -90,22 +90,8 @@ def growth(row: Row) -> float:
 
 
 def alpha_tables(rows: Rows) -> list[Table]:
-    """Return one line per training, of the finished model; `grows` is what the illumination changed by over the last `LATE` epochs."""
-    columns = (
-        Column("d_f", "features"),
-        Column("alpha", "alpha", "g"),
-        Column("all 10 000 %", "final.value", ".2f"),
-        Column("trials", "final.spread_trials", ".2f"),
-        Column("objects", "final.error_objects", ".2f"),
-        Column("first 200 %", "final.first_200", ".2f"),
-        Column("clicks", "final.clicks", ".2f"),
-        Column("photons", "final.photons", ".1f"),
-        Column("illumination", "final.illumination", ".0f"),
-        Column("grows %", growth, "+.1f"),
-        Column("training %", lambda row: row["epochs"]["training"][-1], ".1f"),
-        MINUTES,
-    )
-    return [Table(columns, rows)]
+    """Return one line per training, of the finished model."""
+    return [Table(columns("alpha"), [row | {"grows": growth(row)} for row in rows])]
 
 
 # ---- the evolution of patterns ----
@@ -142,27 +128,9 @@ def stage_row(row: Row, after: int, normal: NDArray[np.floating]) -> Row:
 
 def evolution_tables(rows: Rows) -> list[Table]:
     """Return one line per stage."""
-    columns = (
-        Column("after epoch", "epoch"),
-        Column("largest over mean", "peak", ".0f"),
-        percent("half of the light in, % of the pixels", "pixels_with_half_the_light", ".1f"),
-        percent("pixels below a tenth of the mean, %", "pixels_below_a_tenth_of_the_mean", ".0f"),
-        Column("means of the patterns", lambda row: f"{min(row['means']):.2f} to {max(row['means']):.2f}"),
-        Column("all 10 000 %", "held_out", ".2f"),
-        Column("first 200 %", "held_out_first_200", ".1f"),
-        Column("clicks", "clicks", ".2f"),
-        Column("photons", "photons", ".1f"),
-        Column("illumination", "illumination", ".0f"),
-    )
-    return [Table(columns, rows)]
+    return [
+        Table(columns("evolution"), [row | {"least": min(row["means"]), "most": max(row["means"])} for row in rows])
+    ]
 
 
-PAGES = {
-    "alpha": Page(
-        "Training dynamics against the weight of the illumination (alpha)",
-        alpha_page,
-        alpha_tables,
-        {f"-{features}": f"d_f = {features}" for features in FEATURES},
-    ),
-    "evolution": Page("Patterns in the course of a training", evolution_page, evolution_tables, {"": "patterns"}),
-}
+PAGES = pages({"alpha": (alpha_page, alpha_tables), "evolution": (evolution_page, evolution_tables)})

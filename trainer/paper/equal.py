@@ -32,7 +32,7 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, sam
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
 
-from .page import MINUTES, Asked, Column, Made, Page, Row, Rows, Table
+from .page import Asked, Made, Row, Rows, Table, columns, pages
 from .passive import PROFILE, measure
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
 
@@ -156,31 +156,9 @@ def _direct(task: Task, way: str, photons: float) -> Row:
 
 def equal_tables(rows: Rows) -> list[Table]:
     """Return every row, and how far ours is ahead of the better direct way at each level."""
-    columns = (
-        Column("task", "task"),
-        Column("photons asked", "asked", "g"),
-        Column("way", "way"),
-        Column("d_f", "options.features"),
-        Column("held-out %", "value", ".2f"),
-        Column("first 200 %", "first_200", ".2f"),
-        Column("trials", "spread_trials", ".2f"),
-        Column("objects", "error_objects", ".2f"),
-        Column("clicks", "clicks", ".2f"),
-        Column("photons", "photons", ".2f"),
-        Column("illumination", "illumination", ".0f"),
-        MINUTES,
-    )
     ordered = sorted(rows, key=lambda row: (TASKS.index(row["task"]), row["asked"], WAYS.index(row["way"])))
     compared = [found for row in ordered if row["way"] not in DIRECT and (found := ahead(row, rows)) is not None]
-    leads = (
-        Column("task", "task"),
-        Column("photons asked", "asked", "g"),
-        Column("way", "way"),
-        Column("the better direct way", "beside"),
-        Column("ahead, points", "ahead", "+.2f"),
-        Column("standard error of both", "error", ".2f"),
-    )
-    return [Table(columns, ordered), Table(leads, compared, "## Ahead of the better direct way")]
+    return [Table(columns("equal"), ordered), Table(columns("ahead"), compared, "## Ahead of the better direct way")]
 
 
 def ahead(row: Row, rows: Rows) -> Row | None:
@@ -200,6 +178,4 @@ def ahead(row: Row, rows: Rows) -> Row | None:
     return row | {"beside": best["way"], "ahead": row["value"] - best["value"], "error": error}
 
 
-PAGES = {
-    "equal-photons": Page("PANS against direct imaging at equal photons, on our generators", equal_page, equal_tables)
-}
+PAGES = pages({"equal-photons": (equal_page, equal_tables)})

@@ -23,7 +23,7 @@ from pans.trainer.evaluate.information import fisher, fisher_of_frames, posterio
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import plots
-from .page import Asked, Column, Made, Page, Row, Rows, Table, percent
+from .page import Asked, Made, Row, Rows, Table, columns, pages
 from .swept import shipped_bundle
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5)
@@ -91,24 +91,7 @@ def _words(task: Task, report: Callable[[str], None]) -> Rows:
 
 def information_tables(rows: Rows) -> list[Table]:
     """Return one line per way and photon level."""
-    columns = (
-        Column("way", "way"),
-        Column("photons", "photons", "g"),
-        Column("clicks", "clicks", ".2f"),
-        Column("bits of the label, at least", "bits", ".2f"),
-        Column("error", "bits_se", ".3f"),
-        percent("accuracy %", "accuracy", ".1f"),
-        Column("tr(S_b)/tr(S_w)", "fisher.trace", ".4f"),
-        Column("tr(S_w^-1 S_b)", "fisher.discriminant", ".2f"),
-    )
-    return [Table(columns, rows)]
+    return [Table(columns("information"), rows)]
 
 
-PAGES = {
-    "fig-2c": Page(
-        "Information against photons (paper, Fig. 2C)",
-        information_page,
-        information_tables,
-        {"": "bits and Fisher ratios over photons"},
-    )
-}
+PAGES = pages({"fig-2c": (information_page, information_tables)})

@@ -8,8 +8,11 @@ two markers is written by hand and stays.
 
 from __future__ import annotations
 
+import importlib.resources
 import json
+import re
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,25 +54,41 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: its header, what it takes from a row (a dotted path, or a function), and how a number is written.
+    """One column: its header, and the template of its cells (see pages.toml).
 
-    >>> Column("all", "all.accuracy_mean", ".2f", scale=100).cell({"all": {"accuracy_mean": 0.5}})
+    >>> Column("all", "{all.accuracy_mean:.2f %}").cell({"all": {"accuracy_mean": 0.5}})
     '50.00'
-    >>> Column("trials", "spread", ".2f").cell({"spread": None})
+    >>> Column("K = 1, 2", "{all.*.clicks:.1f}").cell({"all": {"1": {"clicks": 2}, "2": {"clicks": 4}}})
+    '2.0 / 4.0'
+    >>> Column("trials", "{spread:.2f}").cell({"spread": None})
     '-'
     """
 
     header: str
-    value: str | Callable[[Row], Any]
-    form: str = ""
-    scale: float = 1
+    template: str
 
     def cell(self, row: Row) -> str:
-        """Return what stands in the column for `row`: a text as it is, a number in the column's format, "-" for nothing."""
-        found = at(row, self.value) if isinstance(self.value, str) else self.value(row)
-        if found is None:
+        """Return what stands in the column for `row`."""
+        found = [(at(row, path), form) for path, form in _FIELD.findall(self.template)]
+        if any(value is None for value, _ in found):
             return NOTHING
-        return found if isinstance(found, str) else format(self.scale * found, self.form)
+        texts = iter([_written(value, form) for value, form in found])
+        return _FIELD.sub(lambda _: next(texts), self.template)
+
+
+_FIELD = re.compile(r"\{([^{}:]+):?([^{}]*)\}")  # path, format
+_UNITS: dict[str, Callable[[Any], Any]] = {
+    "": lambda value: value,
+    "%": lambda value: 100 * value,
+    "min": lambda value: value / 60,
+}
+
+
+def _written(value: Any, form: str) -> str:
+    if isinstance(value, (list, tuple)):
+        return " / ".join(_written(one, form) for one in value)
+    spec, _, unit = form.partition(" ")
+    return format(_UNITS[unit](value), spec)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,45 +143,40 @@ class Page:
 
 
 def at(row: Row, path: str) -> Any:
-    """Return what stands in a row at a dotted path of keys; None where a key is missing.
+    """Return what stands in a row at a dotted path of keys and places (* for all values); None where one is missing.
 
-    >>> at({"all": {"clicks": 5}}, "all.clicks"), at({}, "all.clicks")
+    >>> at({"all": {"clicks": [4, 5]}}, "all.clicks.-1"), at({}, "all.clicks")
     (5, None)
     """
     found: Any = row
-    for key in path.split("."):
-        if not isinstance(found, dict) or key not in found:
+    for i, key in enumerate(keys := path.split(".")):
+        if key == "*" and isinstance(found, dict):
+            return [at(value, ".".join(keys[i + 1 :])) for value in found.values()]
+        if isinstance(found, (list, tuple)):
+            found = found[int(key)]
+        elif isinstance(found, dict) and key in found:
+            found = found[key]
+        else:
             return None
-        found = found[key]
     return found
 
 
-def percent(header: str, value: str | Callable[[Row], Any], form: str = ".2f") -> Column:
-    """Return a column of shares, written in percent."""
-    return Column(header, value, form, scale=100)
+_FILE: Row = tomllib.loads((importlib.resources.files(__package__) / "pages.toml").read_text(encoding="utf-8"))
 
 
-def accuracy(header: str, part: str = "", form: str = ".2f") -> tuple[Column, Column, Column]:
-    """Return accuracy in %, the spread of one trial and the standard error from having few objects, of a part of the rows."""
-    prefix = f"{part}." if part else ""
-    return (
-        percent(header, f"{prefix}accuracy_mean", form),
-        percent("trials", f"{prefix}accuracy_std", form),
-        percent("objects", f"{prefix}accuracy_se_objects", form),
-    )
+def columns(*names: str) -> tuple[Column, ...]:
+    """Return the columns of pages.toml of these names, one after the other."""
+    parts = [part for name in names for part in _FILE["columns"][name]]
+    groups = [columns(part) if isinstance(part, str) else (Column(*part),) for part in parts]
+    return tuple(column for group in groups for column in group)
 
 
-def light(part: str = "", clicks: str = "clicks") -> tuple[Column, Column, Column]:
-    """Return clicks, photons and illumination of a part of the rows."""
-    prefix = f"{part}." if part else ""
-    return (
-        Column(clicks, f"{prefix}clicks_mean", ".2f"),
-        Column("photons", f"{prefix}photons_mean", ".1f"),
-        Column("illumination", f"{prefix}illumination", ".0f"),
-    )
-
-
-MINUTES = Column("minutes", lambda row: row["cpu_seconds"] / 60, ".1f")  # of the processor
+def pages(
+    made_by: Mapping[str, tuple[Callable[[Asked], Made], Callable[[Rows], Iterable[Table]]]],
+) -> dict[str, Page]:
+    """Return pages with the titles and captions of pages.toml, each by its name and what measures it and makes its tables."""
+    facts = _FILE["page"]
+    return {name: Page(facts[name]["title"], *how, facts[name].get("pictures", {})) for name, how in made_by.items()}
 
 
 def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) -> Row | None:

@@ -7,7 +7,6 @@ Owns the curves of the baselines over photons, their place in the cache folder, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -22,7 +21,7 @@ from pans.trainer.tasks.registry import load_task
 
 from . import images, plots
 from .active import finished_row
-from .page import MINUTES, Asked, Column, Draw, Made, Page, Row, Rows, Table, accuracy, kept, light, percent
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, kept, pages
 from .tables import ACTIVE, FIRST, FIRST_OBJECTS, SHOTS
 
 TASK = "fashion-mnist"
@@ -167,88 +166,50 @@ def _plain(row: Row) -> Row:
     return facts | {key: row[key] for key in MEASURED} | {FIRST: {key: row[FIRST][key] for key in MEASURED}}
 
 
-def _spread(row: Row) -> str:
-    return f"{100 * row['accuracy_std']:.2f}" + ("" if row["trials"] else " (exact)")
-
-
-_CELL = (
-    percent(f"first {FIRST_OBJECTS} %", f"{FIRST}.accuracy_mean"),
-    percent("objects", f"{FIRST}.accuracy_se_objects", ".1f"),
-)
-_EVERYTHING = (
-    Column("way", "way"),
-    Column("d_f", "features"),
-    Column("photons asked", "photons_asked", "g"),
-    percent("all 10 000 %", "accuracy_mean"),
-    Column("trials", _spread),
-    percent("objects", "accuracy_se_objects"),
-    *_CELL,
-    *light(),
-)
-
-
 def curve_tables(rows: Rows) -> list[Table]:
     """Return accuracies of all test objects, one line per way and one column per photon level; and every row with its light."""
     by: dict[str, Row] = {}
     for row in rows:
         if "photons_asked" in row:
-            by.setdefault(row["way"], {})[f"{row['photons_asked']:g}"] = row
+            by.setdefault(row["way"], {"way": row["way"]})[f"{row['photons_asked']:g}"] = row
     levels = [f"{level:g}" for level in LEVELS if any(f"{level:g}" in found for found in by.values())]
-    columns = [Column("way", "way"), *(percent(level, f"{level}.accuracy_mean", ".1f") for level in levels)]
+    matrix = [Column("way", "{way}"), *(Column(level, f"{{{level}.accuracy_mean:.1f %}}") for level in levels)]
+    every = [row | {"how": "" if row["trials"] else " (exact)"} for row in rows]
     return [
-        Table(
-            columns,
-            [found | {"way": way} for way, found in by.items()],
-            "## All 10 000 test images, accuracy % over photons",
-        ),
-        Table(_EVERYTHING, rows, "## Everything"),
+        Table(matrix, by.values(), "## All 10 000 test images, accuracy % over photons"),
+        Table(columns("curve"), every, "## Everything"),
     ]
 
 
 def fig_2e_tables(rows: Rows) -> list[Table]:
     """Return the tables of the curves, PANS beside two of them at its own photons and its own illumination, and the commands."""
+    curves = {key: [row for row in rows if row["way"] == way] for key, way in _BESIDE.items()}
+    pans = []
+    for row in (row for row in rows if row["way"] == PANS):
+        there = {
+            key: {of: accuracy_at(curve, row[of], of) for of in ("photons_mean", "illumination")}
+            for key, curve in curves.items()
+        }
+        pans.append(row | there)
+    heading = "## PANS beside direct imaging by the exact posterior and the end-to-end envelope, at equal light"
+    return [*curve_tables(rows), Table(columns("at_equal_light"), pans, heading), _commands(CURVES)]
 
-    def beside(way: str, of: str) -> Callable[[Row], float | None]:
-        curve = [row for row in rows if row["way"] == way]
-        return lambda row: accuracy_at(curve, row[of], of)
 
-    columns = [Column("d_f", "features"), percent("PANS %", "accuracy_mean", ".1f")]
-    for header, of in (("photons", "photons_mean"), ("illumination", "illumination")):
-        columns.append(Column(header, of, ".0f"))
-        columns += [
-            percent(f"{words} there %", beside(way, of), ".1f")
-            for words, way in (("posterior", POSTERIOR.way), ("envelope", ENVELOPE))
-        ]
-    pans = [row for row in rows if row["way"] == PANS]
-    compared = Table(
-        columns,
-        pans,
-        "## PANS beside direct imaging by the exact posterior and the end-to-end envelope, at equal light",
-    )
-    return [*curve_tables(rows), compared, _commands(CURVES)]
+_BESIDE = {"posterior": POSTERIOR.way, "envelope": ENVELOPE}
 
 
 def end_to_end_tables(rows: Rows) -> list[Table]:
     """Return the tables of the curves, of which patterns the envelope is, and the command of each curve."""
-    matrix, everything = curve_tables(rows)
+    matrix, _ = curve_tables(rows)
+    _, everything = curve_tables([row for row in rows if row["way"] != ENVELOPE])
     best = [row for row in rows if row["way"] == ENVELOPE]
-    columns = (
-        Column("photons asked", "photons_asked", "g"),
-        Column("d_f", "features"),
-        percent("all 10 000 %", "accuracy_mean", ".1f"),
-    )
-    measured = [row for row in rows if row["way"] != ENVELOPE]
-    return [
-        matrix,
-        Table(columns, best, "## Patterns of the envelope"),
-        Table(everything.columns, measured, everything.heading),
-        _commands(tuple(map(e2e_curve, E2E_FEATURES))),
-    ]
+    commands = _commands(tuple(map(e2e_curve, E2E_FEATURES)))
+    return [matrix, Table(columns("envelope"), best, "## Patterns of the envelope"), everything, commands]
 
 
 def _commands(curves: tuple[Curve, ...]) -> Table:
-    rows = [{"way": curve.way, "command": f"`{curve.command()}`"} for curve in curves]
-    return Table((Column("way", "way"), Column("command", "command")), rows, "## Commands of the curves")
+    rows = [{"way": curve.way, "command": curve.command()} for curve in curves]
+    return Table(columns("commands"), rows, "## Commands of the curves")
 
 
 # ---- compressive sensing ----
@@ -278,12 +239,12 @@ def sensed(asked: Asked, features: int) -> Row:
     task = load_task(TASK, asked.data_dir)
     measurement = measure(task, patterns(FAMILY, features, task.image_shape, seed=0))
     clean = measurement.photoelectrons(measurement.test, 1.0)
-    columns: dict[str, list[float]] = {"loss": [], "training": [], "held_out": []}
+    course: dict[str, list[float]] = {"loss": [], "training": [], "held_out": []}
 
     def watch(epoch: EpochOfFit, decide: Decide) -> None:
-        columns["loss"].append(round(epoch.loss, 4))
-        columns["training"].append(round(100 * epoch.accuracy, 2))
-        columns["held_out"].append(round(100 * float((decide(clean) == measurement.test_labels).mean()), 2))
+        course["loss"].append(round(epoch.loss, 4))
+        course["training"].append(round(100 * epoch.accuracy, 2))
+        course["held_out"].append(round(100 * float((decide(clean) == measurement.test_labels).mean()), 2))
 
     at = clean_mlp(measurement, seed=0, epochs=EPOCHS, watch=watch)
     cells = []
@@ -291,48 +252,22 @@ def sensed(asked: Asked, features: int) -> Row:
         done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=TRIALS, seed=0)
         cells.append({"photons_asked": photons, **asdict(done.measured()), FIRST: asdict(done.measured(FIRST_OBJECTS))})
         asked.report(f"compressive, d_f = {features}, {photons:g} photons: {100 * cells[-1]['accuracy_mean']:.2f} %")
-    return {"features": features, "epochs": columns, "cells": cells}
+    return {"features": features, "epochs": course, "cells": cells}
 
 
 def compressive_tables(rows: Rows) -> list[Table]:
     """Return the trainings, and every cell."""
-
-    def epoch(column: str, place: int) -> Column:
-        words = {"loss": "loss", "training": "training objects %", "held_out": "test images %"}[column]
-        form = ".3f" if column == "loss" else ".1f"
-        return Column(f"{words}, {'last' if place else 'first'} epoch", lambda row: row["epochs"][column][place], form)
-
-    places = (("loss", 0), ("loss", -1), ("training", -1), ("held_out", 0), ("held_out", -1))
-    trainings = (Column("d_f", "features"), *(epoch(*place) for place in places), MINUTES)
-    cells = (
-        Column("d_f", "features"),
-        Column("photons", "photons_mean", "g"),
-        *accuracy("all 10 000 %"),
-        *_CELL,
-        Column("clicks", "clicks_mean", ".1f"),
-        Column("illumination", "illumination", ".0f"),
-    )
-    every = [{"features": row["features"], **cell} for row in rows for cell in row["cells"]]
-    return [Table(trainings, rows, "## Training on clean measurements"), Table(cells, every, "## Every cell")]
+    cells = [{"features": row["features"], **cell} for row in rows for cell in row["cells"]]
+    return [
+        Table(columns("sensing_training"), rows, "## Training on clean measurements"),
+        Table(columns("sensing"), cells, "## Every cell"),
+    ]
 
 
-PAGES = {
-    "fig-2e": Page(
-        "Accuracy against photons: PANS and the alternatives (paper, Fig. 2E)",
-        fig_2e_page,
-        fig_2e_tables,
-        {"": "accuracy"},
-    ),
-    "end-to-end": Page(
-        "Conventional end-to-end optimisation, without photons in training",
-        end_to_end_page,
-        end_to_end_tables,
-        {"": "accuracy"},
-    ),
-    "compressive": Page(
-        "Compressive sensing: training, and accuracy over patterns and photons",
-        compressive_page,
-        compressive_tables,
-        {"": "accuracy over patterns and photons", "-training": "loss and accuracy over the epochs"},
-    ),
-}
+PAGES = pages(
+    {
+        "fig-2e": (fig_2e_page, fig_2e_tables),
+        "end-to-end": (end_to_end_page, end_to_end_tables),
+        "compressive": (compressive_page, compressive_tables),
+    }
+)

@@ -36,7 +36,7 @@ from pans.trainer.train.data import CHUNK, encoder_input
 from pans.trainer.train.loop import Trained, train
 
 from . import images, plots
-from .page import MINUTES, Asked, Column, Draw, Made, Page, Row, Rows, Table, at
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, pages
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
 from .tables import PASSIVE, UNPRINTED, PassiveRow, table_of
 
@@ -219,67 +219,30 @@ def passive_page(asked: Asked) -> Made:
 
 def passive_tables(name: str, rows: Rows) -> list[Table]:
     """Return the table of draw 0, that of other draws, and of `barcode` that of classes equally likely."""
+    shown = columns("passive_ssim" if table_of(name).measure == "SSIM" else "passive")
+    seeded = (*shown[:2], Column("data seed", "{data_seed}"), *shown[2:])
+    rows = [row | _beside(name, row) for row in rows]
+    balanced = [row for row in rows if "balanced" in row]
+    others = [row for row in rows if row.get("data_seed")]
+    found = [Table(shown, [row for row in rows if not row.get("data_seed")])]
+    if others:
+        found.append(Table(seeded, others, "## Other draws of the generator"))
+    if balanced:
+        found.append(Table(columns("balanced"), balanced, "## Classes equally likely, without dark counts"))
+    return found
+
+
+def _beside(name: str, row: Row) -> Row:
+    """What the paper prints for a row, and how far ours is ahead of it; nothing where it prints nothing."""
     table = table_of(name)
-    digits = 3 if table.measure == "SSIM" else 2
-    of = {row.features: row for row in table.rows}
-
-    def paper(row: Row) -> float | None:
-        values = of[row["features"]].values
-        return values[table.dark.index(row["dark"])] if values else None
-
-    def ahead(of_ours: str) -> Column:
-        def points(row: Row) -> float | None:
-            printed = paper(row)
-            return None if printed is None else at(row, of_ours) - printed
-
-        return Column("ahead", points, f"+.{digits}f")
-
-    def clicks(row: Row) -> float | None:
-        printed = of[row["features"]]
-        return printed.clicks if printed.values and row["dark"] == table.dark[0] else None
-
-    beside = (Column("d_f", "features"), Column("dark", "dark", "g"), Column("paper", paper, f".{digits}f"))
-    columns = (
-        *beside,
-        Column("ours", "value", f".{digits}f"),
-        ahead("value"),
-        Column("first 200", "first_200", f".{digits}f"),
-        Column("trials", "spread_trials", ".2f"),
-        Column("objects", "error_objects", f".{digits}f"),
-        Column("clicks: paper", clicks, ".2f"),
-        Column("ours", "clicks", ".2f"),
-        Column("photons", "photons", ".1f"),
-        Column("illumination", "illumination", ".0f"),
-        MINUTES,
-    )
-    balanced = (
-        *beside,
-        Column("ours, balanced", "balanced.value", ".2f"),
-        ahead("balanced.value"),
-        Column("clicks", "balanced.clicks", ".2f"),
-    )
-    seed = Column("data seed", "data_seed")
-    found = [
-        Table(columns, [row for row in rows if not row.get("data_seed")]),
-        Table(
-            (*columns[:2], seed, *columns[2:]),
-            [row for row in rows if row.get("data_seed")],
-            "## Other draws of the generator",
-        ),
-        Table(balanced, [row for row in rows if "balanced" in row], "## Classes equally likely, without dark counts"),
-    ]
-    return found[:1] + [other for other in found[1:] if other.rows]
+    (printed,) = [printed for printed in table.rows if printed.features == row["features"]]
+    if not printed.values:
+        return {}
+    value = printed.values[table.dark.index(row["dark"])]
+    clicks = printed.clicks if row["dark"] == table.dark[0] else None
+    balanced = row.get("balanced")
+    more = {"balanced": balanced | {"ahead": balanced["value"] - value}} if balanced else {}
+    return {"paper": value, "ahead": row["value"] - value, "paper_clicks": clicks} | more
 
 
-PAGES = {
-    name: Page(
-        f"{name}: " + ("the paper's table" if name in PASSIVE else "no figures in the paper's tables"),
-        passive_page,
-        partial(passive_tables, name),
-        {
-            "": f"{table_of(name).measure} over the number of patterns",
-            "-pictures": "the first held-out digit of every class, its speckle, and three single shots each",
-        },
-    )
-    for name in (*PASSIVE, *UNPRINTED)
-}
+PAGES = pages({name: (passive_page, partial(passive_tables, name)) for name in (*PASSIVE, *UNPRINTED)})

@@ -23,8 +23,8 @@ from pans.trainer.evaluate.tsne import tsne
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import images
-from .active import FEATURES, MEASURED, PROFILE, TrainedRow, measured_on, trained_rows
-from .page import Asked, Column, Draw, Made, Page, Row, Rows, Table, kept, light, percent
+from .active import PROFILE, TrainedRow, measured_on, trained_rows
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, kept, pages
 from .paradigms import CLEAN, POSTERIOR, TASK, curve_rows
 from .tables import FIRST
 
@@ -184,35 +184,14 @@ def _map(row: TrainedRow, lit: Light, test: Objects) -> tuple[F64, dict[str, flo
 
 def single_shot_tables(rows: Rows) -> list[Table]:
     """Return how much shots vary, one line per d_f, and for each d_f one line per image shown."""
-    columns = (
-        FEATURES,
-        *MEASURED,
-        *light("all"),
-        Column("one image", "differing.object", ".2f"),
-        Column("two of a class", "differing.class", ".2f"),
-        Column("two of other classes", "differing.others", ".2f"),
-        percent("uncertain exposures %", "differing.uncertain", ".0f"),
-        percent(f"{NEIGHBOURS} neighbours on the map", "near.map", ".1f"),
-        percent("by clicks", "near.clicks", ".1f"),
-        percent("the head", "near.head", ".1f"),
-    )
-    found = [Table(columns, rows)]
+    found = [Table(columns("single_shot"), rows)]
     for row in rows:
         how = "exact" if 1 << row["features"] <= EXACT_OUTCOMES_MAX else f"{SAMPLED_TRIALS} trials"
         names = [one["class"] for one in row["objects"]]
-        entries = [one | _decided(one, names, label) for label, one in enumerate(row["objects"])]
-        of_objects = (
-            Column("class", "class"),
-            Column("test image", "object"),
-            Column("clicks", "clicks", ".2f"),
-            Column("photons", "photons", ".1f"),
-            Column("illumination", "illumination", ".0f"),
-            Column("different words", lambda one: len(set(one["words"]))),
-            Column(f"right of {TRIALS}", "right"),
-            percent(f"expected right % ({how})", "expected_right", ".1f"),
-            Column("decided most wrongly as", "wrong"),
-        )
-        found.append(Table(of_objects, entries, f"## d_f = {row['features']}, {TRIALS} trials of each image shown"))
+        shown = [one | _decided(one, names, label) for label, one in enumerate(row["objects"])]
+        expected = Column(f"expected right % ({how})", "{expected_right:.1f %}")
+        of_images = (*columns("shots_of_images"), expected, Column("decided most wrongly as", "{wrong}"))
+        found.append(Table(of_images, shown, f"## d_f = {row['features']}, {TRIALS} trials of each image shown"))
     return found
 
 
@@ -221,7 +200,8 @@ def _decided(one: Row, names: list[str], label: int) -> Row:
     expected, wrong[label] = wrong[label], 0.0
     other = int(wrong.argmax())
     right = sum(decided == label for decided in one["decided"])
-    return {"right": right, "expected_right": expected, "wrong": f"{names[other]} {100 * wrong[other]:.0f} %"}
+    most = f"{names[other]} {100 * wrong[other]:.0f} %"
+    return {"different": len(set(one["words"])), "right": right, "expected_right": expected, "wrong": most}
 
 
 # ---- camera frames ----
@@ -301,43 +281,9 @@ def _frame_row(photons: float, maps: Rows, curves: dict[str, Rows]) -> Row:
 
 def frames_tables(rows: Rows) -> list[Table]:
     """Return one line per photon level; light is that of the posterior's frames, else of the network's, else of those on the map."""
-
-    def lit(key: str) -> Any:
-        return lambda row: (row.get("posterior") or row.get("network") or row.get("on_the_map") or {}).get(key)
-
-    columns = (
-        Column("photons", "photons_asked", "g"),
-        Column("clicks", lit("clicks_mean"), ".1f"),
-        Column("illumination", lit("illumination"), ".0f"),
-        percent("neighbours on the map %", "neighbours", ".1f"),
-        percent("posterior, these frames %", "on_the_map.accuracy_mean", ".1f"),
-        percent("objects", "on_the_map.accuracy_se_objects", ".1f"),
-        percent("posterior, all 10 000 %", "posterior.accuracy_mean", ".1f"),
-        percent("trials", "posterior.accuracy_std"),
-        percent("objects", "posterior.accuracy_se_objects"),
-        percent("first 200 %", "posterior.first_200.accuracy_mean", ".1f"),
-        percent("network of clean frames, all 10 000 %", "network.accuracy_mean", ".1f"),
-        percent("first 200 %", "network.first_200.accuracy_mean", ".1f"),
-    )
-    return [Table(columns, rows)]
+    of = ("posterior", "network", "on_the_map")
+    shown = [row | {"light": next((row[key] for key in of if key in row), None)} for row in rows]
+    return [Table(columns("direct_frames"), shown)]
 
 
-PAGES = {
-    "single-shot": Page(
-        "Single shots: clicks, outputs, decisions",
-        single_shot_page,
-        single_shot_tables,
-        {
-            "-frames": "clicks of single shots",
-            "-pipeline": "image, patterns, and the first trials of one image",
-            "-outputs": "outputs of all trials, and the share of trials per decision",
-            "-tsne": "t-SNE of single shots",
-        },
-    ),
-    "direct-frames": Page(
-        "Direct imaging: frames and what is left in them",
-        frames_page,
-        frames_tables,
-        {"": "frames", "-map": "t-SNE maps of frames"},
-    ),
-}
+PAGES = pages({"single-shot": (single_shot_page, single_shot_tables), "direct-frames": (frames_page, frames_tables)})

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from . import plots
-from .active import FEATURES, MEASURED, TrainedRow, by_table, trained_rows
-from .page import Asked, Column, Made, Page, Row, Rows, Table, at, light
+from .active import TrainedRow, by_table, trained_rows
+from .page import Asked, Column, Made, Row, Rows, Table, at, columns, pages
 from .tables import ACTIVE, FIRST, FIRST_OBJECTS, SHOTS
 
 Point = tuple[float, float]  # what was spent, accuracy in %
@@ -49,30 +49,17 @@ def _point(row: TrainedRow, shots: int) -> Row:
     }
 
 
-def _printed(kind: str) -> Column:
-    return Column(f"paper, {kind}", lambda row: f"{row['paper'][kind]:.2f} ± {row['paper'][f'{kind}_std']:.2f}")
-
-
-_LIGHT = (
-    Column("clicks: paper", "paper.clicks", ".2f"),
-    Column(f"first {FIRST_OBJECTS}", f"{FIRST}.clicks_mean", ".2f"),
-)
-
-
 def fig_3_tables(rows: Rows) -> list[Table]:
     """Return one table per data set."""
-    columns = (FEATURES, _printed("experiment"), _printed("simulation"), *MEASURED, *_LIGHT, *light("all", "all"))
-    return [Table(columns, mine, f"## {table}") for table, mine in by_table(rows)]
+    return [Table(columns("fig_3"), mine, f"## {table}") for table, mine in by_table(rows)]
 
 
 def multi_shot_tables(rows: Rows) -> list[Table]:
     """Return per data set every point, and the comparison of more patterns with more shots where they spend the same."""
-    setting = (Column("d_f x K", "detections"), FEATURES, Column("K", "shots"))
-    columns = (*setting, _printed("simulation"), *MEASURED, *_LIGHT, *light("all", "all"))
     found = []
     for table, mine in by_table(rows):
         ordered = sorted(mine, key=lambda row: (row["detections"], row["features"]))
-        found += [Table(columns, ordered, f"## {table}"), _duels_table(table, mine)]
+        found += [Table(columns("multi_shot"), ordered, f"## {table}"), _duels_table(table, mine)]
     return found
 
 
@@ -110,24 +97,18 @@ def _duels_table(table: str, mine: Rows) -> Table:
         (ours, "clicks", clicks, "all.accuracy_mean", 100),
         (ours, "photons", photons, "all.accuracy_mean", 100),
     )
+    few = sorted({row["features"] for row in mine})[:-1]
     rows = []
     for whose, words, spent, value, scale in sets:
         curves: Curves = {}
         for row in mine:
             curves.setdefault(row["features"], []).append((at(row, spent), scale * at(row, value)))
-        rows.append({"whose": whose, "at equal": words, "duels": duels(curves)})
-    few = sorted({row["features"] for row in mine})[:-1]
-
-    def of(d_f: int) -> Column:
-        return Column(str(d_f), lambda row: _won([duel for duel in row["duels"] if duel.few == d_f]))
-
-    columns = (
-        Column("whose", "whose"),
-        Column("at equal", "at equal"),
-        *map(of, few),
-        Column("together", lambda row: _won(row["duels"])),
-    )
-    return Table(columns, rows, f"### {table}: d_f (columns) with more shots against all larger d_f; more patterns win")
+        found = duels(curves)
+        won = {str(d): _won([duel for duel in found if duel.few == d]) for d in few}
+        rows.append({"whose": whose, "at equal": words, **won, "together": _won(found)})
+    heads = ("whose", "at equal", *map(str, few), "together")
+    shown = [Column(head, f"{{{head}}}") for head in heads]
+    return Table(shown, rows, f"### {table}: d_f (columns) with more shots against all larger d_f; more patterns win")
 
 
 def _won(found: Sequence[Duel]) -> str | None:
@@ -138,17 +119,4 @@ def _won(found: Sequence[Duel]) -> str | None:
     return words if won == len(found) else f"**{words}**"
 
 
-PAGES = {
-    "fig-3": Page(
-        "Accuracy against the number of patterns, single shot (paper, Fig. 3 B and C)",
-        fig_3_page,
-        fig_3_tables,
-        {"": "accuracy over the number of patterns"},
-    ),
-    "multi-shot": Page(
-        "More patterns or more shots",
-        multi_shot_page,
-        multi_shot_tables,
-        {"": "accuracy over detections, one curve per number of patterns"},
-    ),
-}
+PAGES = pages({"fig-3": (fig_3_page, fig_3_tables), "multi-shot": (multi_shot_page, multi_shot_tables)})

@@ -7,7 +7,6 @@ Owns the settings, the measuring and the pages `eta`, `dark-counts`, `confusion`
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -29,8 +28,8 @@ from pans.trainer.evaluate.accuracy import (
 from pans.trainer.tasks.registry import Objects, load_task
 
 from . import images, plots
-from .active import FEATURES, MEASURED, PROFILE, TrainedRow, by_table, measured_on, trained_rows
-from .page import Asked, Column, Draw, Made, Page, Row, Rows, Table, light, percent
+from .active import PROFILE, TrainedRow, by_table, measured_on, trained_rows
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, pages
 from .tables import ACTIVE, FIRST, FIRST_OBJECTS
 
 SWEPT_SHOTS = (1, 2, 3, 5, 8, 13, 21)
@@ -41,6 +40,8 @@ TRIALS_OF_ALL = 10
 EXACT_WORK_MAX = 1 << 25  # objects times click words
 SWEEPS = {"K": "shots", "eta": "all light times", "dark": "dark counts of an exposure"}
 SWEPT_TABLE = "fashion-mnist"  # of eta and dark counts
+ETAS_SHOWN = (0.01, 0.1, 10**-0.5, 10**0.5, 10.0, 100.0)  # of which a table tells the change
+DARKS_SHOWN = (0.01, 10**-1.5, 0.1, 10**-0.5, 1.0)
 LEVEL = 2.0  # points below the best that still count as level with it
 WORST = 3  # confusions that a table names
 
@@ -110,16 +111,11 @@ def sweeps_page(asked: Asked) -> Made:
 
 def sweeps_tables(rows: Rows) -> list[Table]:
     """Return one table per sweep."""
-    measured = (*MEASURED, Column("clicks", "all.clicks_mean", ".2f"), Column("photons", "all.photons_mean", ".2f"))
-    columns = (*measured, Column("illumination", "all.illumination", ".1f"))
-    return [
-        Table(
-            (Column(sweep, "setting", ".3g"), *columns),
-            [row for row in rows if row["sweep"] == sweep],
-            f"## {words} ({sweep})",
-        )
-        for sweep, words in SWEEPS.items()
-    ]
+    found = []
+    for sweep, words in SWEEPS.items():
+        mine = [row for row in rows if row["sweep"] == sweep]
+        found.append(Table((Column(sweep, "{setting:.3g}"), *columns("swept")), mine, f"## {words} ({sweep})"))
+    return found
 
 
 # ---- light and dark counts ----
@@ -158,92 +154,50 @@ def _percent(row: Row, part: str = "all") -> float:
     return 100 * float(row[part]["accuracy_mean"])
 
 
-def _setting(row: Row, setting: float) -> Row:
-    """The swept row of a setting, up to rounding; `row` has them all under "swept"."""
-    found: Row = min(row["swept"], key=lambda other: abs(float(other["setting"]) - setting))
-    return found
+def _at(swept: Rows, setting: float) -> Row:
+    """The row of a setting, up to rounding."""
+    return min(swept, key=lambda row: abs(float(row["setting"]) - setting))
 
 
-def _change(header: str, setting: float, against: Callable[[Row], Row], form: str = "+.1f") -> Column:
-    """Points of accuracy on all images at a setting over those of another row."""
-    return Column(header, lambda row: _percent(_setting(row, setting)) - _percent(against(row)), form)
+def _over_light(trained: Row, swept: Rows) -> Row:
+    """What the light does to a row: its best settings, where it is level with the best, and the change in points at `ETAS_SHOWN`."""
+    one = _at(swept, 1.0)
+    best = {}
+    for part in ("all", FIRST):
+        top = max(swept, key=partial(_percent, part=part))
+        best[part] = {"setting": top["setting"], "gain": _percent(top, part) - _percent(one, part)}
+    level = [row["setting"] for row in swept if _percent(row) >= max(map(_percent, swept)) - LEVEL]
+    accuracy = [_percent(_at(swept, eta)) for eta in ETAS_SHOWN]
+    change = [value - _percent(one) for value in accuracy]
+    return {"best": best, "level": (min(level), max(level)), "accuracy": accuracy, "change": change}
 
 
-def _best(part: str) -> Callable[[Row], Row]:
-    def best(row: Row) -> Row:
-        found: Row = max(row["swept"], key=partial(_percent, part=part))
-        return found
-
-    return best
-
-
-def _level(row: Row) -> str:
-    top = max(map(_percent, row["swept"]))
-    level = [other["setting"] for other in row["swept"] if _percent(other) >= top - LEVEL]
-    return f"{min(level):.2g} to {max(level):.2g}"
-
-
-def _one(row: Row) -> Row:
-    return _setting(row, 1.0)
-
-
-def _gain(header: str, part: str) -> Column:
-    return Column(header, lambda row: _percent(_best(part)(row), part) - _percent(_one(row), part), "+.2f")
-
-
-_TRAINED_COLUMNS = (FEATURES, *MEASURED, *light("all"))
-_ETA_COLUMNS = (
-    FEATURES,
-    Column("best eta (all)", lambda row: _best("all")(row)["setting"], ".2f"),
-    _gain("gain over eta = 1", "all"),
-    Column(f"best eta (first {FIRST_OBJECTS})", lambda row: _best(FIRST)(row)["setting"], ".2f"),
-    _gain("gain", FIRST),
-    Column(f"within {LEVEL:g} points of the best", _level),
-    *(
-        _change(words, eta, _one)
-        for words, eta in (("change at 0.1", 0.1), ("at 0.32", 10**-0.5), ("at 3.2", 10**0.5), ("at 10", 10.0))
-    ),
-    Column("accuracy at 0.01", lambda row: _percent(_setting(row, 0.01)), ".1f"),
-    Column("at 100", lambda row: _percent(_setting(row, 100.0)), ".1f"),
-)
-_DARK_COLUMNS = (
-    FEATURES,
-    *(_change(f"change at {dark:.2g}", dark, lambda row: row) for dark in (0.01, 10**-1.5, 0.1, 10**-0.5, 1.0)),
-    _change("points per decade, 0.01 to 0.1", 0.1, partial(_setting, setting=0.01)),
-    _change("0.1 to 1", 1.0, partial(_setting, setting=0.1)),
-)
+def _over_dark(trained: Row, swept: Rows) -> Row:
+    """What dark counts do to a row: the change in points at `DARKS_SHOWN`, and per decade below and above 0.1."""
+    change = [_percent(_at(swept, dark)) - _percent(trained) for dark in DARKS_SHOWN]
+    return {"change": change, "decade": (change[2] - change[0], change[4] - change[2])}
 
 
 def swept_tables(sweep: str, rows: Rows) -> list[Table]:
     """Return the rows as trained, what the sweep does to each, and accuracy and clicks with settings down and d_f across."""
-    trained = [
-        row
-        | {"swept": [other for other in rows if other["features"] == row["features"] and other["setting"] != "trained"]}
-        for row in rows
-        if row["setting"] == "trained"
-    ]
-    if not trained:
-        return []
-    settings = [other["setting"] for other in trained[0]["swept"]]
-    by = {(row["features"], row["setting"]): row for row in rows}
+    trained = [row for row in rows if row["setting"] == "trained"]
+    of = {row["features"]: [other for other in rows if other["features"] == row["features"]][1:] for row in trained}
+    what, change = ("the light", _over_light) if sweep == "eta" else ("dark counts", _over_dark)
+    changed = [row | change(row, of[row["features"]]) for row in trained]
     across = [
-        {"setting": setting, **{str(d): by[d, setting] for d in (r["features"] for r in trained)}}
-        for setting in settings
+        {"setting": line[0]["setting"], **{str(row["features"]): row for row in line}} for line in zip(*of.values())
     ]
 
-    def accuracies(row: Row, d: str) -> str:
-        return f"{_percent(row[d], FIRST):.1f} / {_percent(row[d]):.1f}"
+    def shown(template: str) -> list[Column]:
+        heads = [Column(f"d_f = {d}", template.replace("D", str(d))) for d in of]
+        return [Column(sweep, "{setting:.3g}"), *heads]
 
-    what, columns = ("the light", _ETA_COLUMNS) if sweep == "eta" else ("dark counts", _DARK_COLUMNS)
-    heads = [(str(row["features"]), f"d_f = {row['features']}") for row in trained]
-    setting = Column(sweep, "setting", ".3g")
-    shown = (setting, *(Column(head, partial(accuracies, d=d)) for d, head in heads))
-    clicks = (setting, *(Column(head, f"{d}.all.clicks_mean", ".2f") for d, head in heads))
+    both = shown("{D.first_200.accuracy_mean:.1f %} / {D.all.accuracy_mean:.1f %}")
     return [
-        Table(_TRAINED_COLUMNS, trained, "## As trained (eta = 1, no dark counts)"),
-        Table(columns, trained, f"## What {what} change, in points (all images)"),
-        Table(shown, across, f"## Accuracy in %, first {FIRST_OBJECTS} / all"),
-        Table(clicks, across, "## Clicks of a decision, all images"),
+        Table(columns("trained"), trained, "## As trained (eta = 1, no dark counts)"),
+        Table(columns(sweep), changed, f"## What {what} change, in points (all images)"),
+        Table(both, across, f"## Accuracy in %, first {FIRST_OBJECTS} / all"),
+        Table(shown("{D.all.clicks_mean:.2f}"), across, "## Clicks of a decision, all images"),
     ]
 
 
@@ -281,64 +235,33 @@ def _matrices(row: TrainedRow, data_dir: str | None) -> Row:
     return found
 
 
-def _right(choose: Callable[[F64], np.intp]) -> Callable[[Row], str]:
-    def named(row: Row) -> str:
-        right = np.diagonal(row["all"]["matrix"])
-        return f"{row['classes'][choose(right)]} {100 * right[choose(right)]:.0f}"
-
-    return named
-
-
-def _confused(row: Row) -> str:
-    wrong = np.array(row["all"]["matrix"]) * (1 - np.eye(len(row["classes"])))
+def _named(row: Row) -> Row:
+    """The classes that are told best and worst, and the most frequent confusions, with shares in %."""
+    matrix, classes = np.array(row["all"]["matrix"]), row["classes"]
+    right = matrix.diagonal()
+    best, poorest = (f"{classes[place]} {100 * right[place]:.0f}" for place in (right.argmax(), right.argmin()))
+    wrong = matrix * (1 - np.eye(len(classes)))
     places = [np.unravel_index(place, wrong.shape) for place in np.argsort(-wrong, axis=None)[:WORST]]
-    return ", ".join(f"{row['classes'][i]} → {row['classes'][j]} {100 * wrong[i, j]:.0f}" for i, j in places)
+    confused = ", ".join(f"{classes[i]} → {classes[j]} {100 * wrong[i, j]:.0f}" for i, j in places)
+    return {"best": best, "poorest": poorest, "confused": confused}
 
 
 def confusion_tables(rows: Rows) -> list[Table]:
     """Return per data set the classes that are told best and worst, and every class's share of right decisions."""
-    columns = (
-        *_TRAINED_COLUMNS,
-        Column("best class", _right(np.argmax)),
-        Column("poorest class", _right(np.argmin)),
-        Column("most frequent confusions, true → decided", _confused),
-    )
-
-    def right(label: int, name: str) -> Column:
-        return percent(name, lambda row: row["all"]["matrix"][label][label], ".1f")
-
     found = []
     for table, mine in by_table(rows):
-        found.append(Table(columns, mine, f"## {table}"))
-        if mine:
-            shares = [right(label, name) for label, name in enumerate(mine[0]["classes"])]
-            found.append(Table((FEATURES, *shares), mine, f"### {table}: right decisions of each class, %"))
+        found.append(Table(columns("confusion"), [row | _named(row) for row in mine], f"## {table}"))
+        names = mine[0]["classes"] if mine else ()
+        right = [Column(name, f"{{all.matrix.{i}.{i}:.1f %}}") for i, name in enumerate(names)]
+        found.append(Table((*columns("d_f"), *right), mine, f"### {table}: right decisions of each class, %"))
     return found
 
 
-PAGES = {
-    "sweeps": Page(
-        "Sweeps over shots, light and dark counts",
-        sweeps_page,
-        sweeps_tables,
-        {"": "accuracy over shots, light and dark counts"},
-    ),
-    "confusion": Page(
-        "Confusion matrices, single shot",
-        confusion_page,
-        confusion_tables,
-        {f"-{table}": f"confusion matrices, {table}" for table in ACTIVE},
-    ),
-    "dark-counts": Page(
-        "Accuracy against dark counts",
-        dark_page,
-        partial(swept_tables, "dark"),
-        {"": "accuracy over dark counts, one curve per number of patterns"},
-    ),
-    "eta": Page(
-        "Accuracy against the light, times the trained light (eta)",
-        eta_page,
-        partial(swept_tables, "eta"),
-        {"": "accuracy over the light, one curve per number of patterns"},
-    ),
-}
+PAGES = pages(
+    {
+        "sweeps": (sweeps_page, sweeps_tables),
+        "confusion": (confusion_page, confusion_tables),
+        "dark-counts": (dark_page, partial(swept_tables, "dark")),
+        "eta": (eta_page, partial(swept_tables, "eta")),
+    }
+)

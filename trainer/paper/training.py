@@ -41,7 +41,7 @@ from pans.trainer.train.head_fit import joint_distribution
 from pans.trainer.train.loop import Run, Trained, train
 
 from .active import recipe
-from .page import Asked, Column, Made, Page, Row, Rows, Table
+from .page import Asked, Made, Row, Rows, Table, columns, pages
 from .tables import ACTIVE, CLICKS_TOLERANCE, FIRST_OBJECTS, ActiveRow
 
 TASK = "fashion-mnist"
@@ -173,36 +173,20 @@ def _kept(path: Path, make: Callable[[], Row], report: Callable[[str], None]) ->
 
 def estimators_tables(rows: Rows) -> list[Table]:
     """Return the gradients of every stage and estimator, and what trainings reach: mean over seeds, their spread in brackets."""
-    gradients = (
-        Column("epochs", "epochs"),
-        Column("estimator", "estimator"),
-        Column("bias (+- its sampling error)", lambda row: f"{row['bias']:.3f} +- {row['bias_error']:.3f}"),
-        Column("spread of one estimate", "spread", ".2f"),
-        Column("cosine of the mean", "cosine", ".3f"),
-    )
     of_way: dict[str, Rows] = {}
     for row in rows:
         if "way" in row:
             of_way.setdefault(row["way"], []).append(row)
-
-    def mean(key: str) -> Callable[[Row], float]:
-        return lambda row: sum(run[key] for run in row["runs"]) / len(row["runs"])
-
-    def accuracy(row: Row) -> str:
-        values = [run["accuracy"] for run in row["runs"]]
-        return f"{100 * mean('accuracy')(row):.2f} ({100 * (max(values) - min(values)):.2f})"
-
-    trainings = (
-        Column("way", "way"),
-        Column("accuracy %", accuracy),
-        Column("clicks", mean("clicks"), ".2f"),
-        Column("photons", mean("photons"), ".1f"),
-        Column("illumination", mean("illumination"), ".0f"),
-        Column("processor seconds", mean("cpu_seconds"), ".0f"),
-    )
+    trained = []
+    for way, runs in of_way.items():
+        keys = ("accuracy", "clicks", "photons", "illumination", "cpu_seconds")
+        means = {key: sum(run[key] for run in runs) / len(runs) for key in keys}
+        accuracies = [run["accuracy"] for run in runs]
+        trained.append({"way": way, "over_seeds": max(accuracies) - min(accuracies), **means})
+    gradients = [row for row in rows if "estimator" in row]
     return [
-        Table(gradients, [row for row in rows if "estimator" in row], "## Gradients"),
-        Table(trainings, [{"way": way, "runs": runs} for way, runs in of_way.items()], "## Trainings"),
+        Table(columns("gradients"), gradients, "## Gradients"),
+        Table(columns("trainings"), trained, "## Trainings"),
     ]
 
 
@@ -302,43 +286,17 @@ class _Judge:
 
 def time_tables(rows: Rows) -> list[Table]:
     """Return both ways at every number of patterns, and how much longer the paper's recipe takes."""
-    ways = [
-        {"features": row["features"], "goal": row["goal"], "way": words, **row[key]}
-        for row in rows
-        for key, words in (("ours", "ours"), ("paper", "the paper's recipe"))
-    ]
-    raced = (
-        Column("d_f", "features"),
-        Column("goal %", "goal", ".2f"),
-        Column("way", "way"),
-        Column("reached", lambda row: "yes" if row["reached"] else "no"),
-        Column("seconds", "seconds", ".0f"),
-        Column("epochs", "epochs"),
-        Column("first 200 %", lambda row: f"{row['accuracy']:.2f} (best {row['best_accuracy']:.2f})"),
-        Column("all 10 000 %", "accuracy_all", ".2f"),
-        Column("clicks", "clicks", ".2f"),
-        Column("photons", "photons", ".1f"),
-        Column("illumination", "illumination", ".0f"),
-    )
-
-    def tried(row: Row) -> float:
-        return float(sum(schedule["seconds"] for schedule in row["schedules"]))
-
-    def times(seconds: Callable[[Row], float]) -> Callable[[Row], str]:
-        return lambda row: (
-            f"{'' if row['paper']['reached'] else 'more than '}{row['paper']['seconds'] / seconds(row):.1f}"
-        )
-
-    ratios = (
-        Column("d_f", "features"),
-        Column("the paper's recipe over ours, times", times(lambda row: float(row["ours"]["seconds"]))),
-        Column("over all schedules that we tried, times", times(tried)),
-        Column("all schedules, seconds", tried, ".0f"),
-    )
-    return [Table(raced, ways), Table(ratios, rows)]
+    ways, ratios = [], []
+    for row in rows:
+        for key, words in (("ours", "ours"), ("paper", "the paper's recipe")):
+            reached = "yes" if row[key]["reached"] else "no"
+            facts = {"features": row["features"], "goal": row["goal"], "way": words}
+            ways.append(row[key] | facts | {"reached": reached})
+        theirs, tried = row["paper"]["seconds"], sum(schedule["seconds"] for schedule in row["schedules"])
+        than = "" if row["paper"]["reached"] else "more than "
+        over = {"over_ours": theirs / row["ours"]["seconds"], "over_all": theirs / tried}
+        ratios.append({"features": row["features"], "than": than, "tried": tried} | over)
+    return [Table(columns("raced"), ways), Table(columns("ratios"), ratios)]
 
 
-PAGES = {
-    "estimators": Page("Gradient estimators against the exact gradient", estimators_page, estimators_tables),
-    "time": Page("Time to the paper's accuracy", time_page, time_tables),
-}
+PAGES = pages({"estimators": (estimators_page, estimators_tables), "time": (time_page, time_tables)})

@@ -12,14 +12,10 @@ pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.evaluate.picture_samples import SAMPLES, Samples
 from pans.trainer.paper import PAGES, Made, Page, images, page_of, tables, write_page
-from pans.trainer.paper.page import BEGIN, END, Column, Table, percent, read_page
+from pans.trainer.paper.page import BEGIN, END, Column, Table, columns, read_page
 
 RESULTS = ROOT / "docs" / "results"
-COLUMNS = (
-    Column("d_f", "features"),
-    percent("all", "all.accuracy"),
-    Column("clicks", lambda row: row.get("clicks"), ".1f"),
-)
+COLUMNS = (Column("d_f", "{features}"), Column("all", "{all.accuracy:.2f %}"), Column("clicks", "{clicks:.1f}"))
 ROW = {"features": 3, "all": {"accuracy": 0.5}}
 PAGE = Page("A page", lambda _: Made([]), lambda rows: [Table(COLUMNS, rows, "## Rows")], {"-x": "a picture"})
 TABLE = "## Rows\n\n| d_f | all | clicks |\n| --- | --- | --- |\n| 3 | 50.00 | - |\n"
@@ -43,6 +39,14 @@ def test_what_is_written_by_hand_stays(tmp_path):
     assert "old" not in middle
     assert TABLE in middle
     assert read_page(tmp_path, "name", PAGE) == f"{BEGIN}{middle}{END}"
+
+
+def test_columns_are_put_together_from_groups():
+    assert [column.header for column in columns("trained")] == [
+        *("d_f", "first 200", "trials", "objects", "all", "trials", "objects", "clicks", "photons", "illumination")
+    ]
+    assert Column("s", "{seconds:.1f min}").cell({"seconds": 90}) == "1.5"
+    assert Column("s", "{a:.1f} ± {b:.1f}").cell({"a": 1, "b": None}) == "-"
 
 
 def test_every_page_is_found_under_its_name():
