@@ -42,7 +42,7 @@ from pans.firmware_sim.scene.marks import MARK_PHOTONS
 from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
 from pans.firmware_sim.scene.optics import expected_photoelectrons, photons_per_level
 from pans.firmware_sim.scene.scene_file import open_scene
-from pans.firmware_sim.scene.shifts import shift_table
+from pans.firmware_sim.scene.shifts import ShiftTable, shift_table
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.scene.tape import BarTable, TapeFlow
 from pans.runtime.errors import ConfigError
@@ -79,6 +79,16 @@ def emitted(run: FrameRun | Measurement, n: int) -> list[Any]:
 # -- light ---------------------------------------------------------------------------------------------------------------
 
 
+def exposed(table: ShiftTable, centre: float, speed: float, images: list[int], offset: int = 0, begin: int = 0) -> Any:
+    """The light of one exposure of 200 ticks from `begin` with these pictures at the same place, by the kernel."""
+    n = len(images)
+    cells = (np.full(n, centre), np.full(n, speed), np.array(images), np.full(n, offset))
+    row_of, rows = np.zeros(1, np.int64), np.empty((3, 3))
+    begins, lit = np.array([begin], np.int64), np.ones(1, np.bool_)
+    assert cells_module._fill(begins, lit, 200.0, np.inf, cells_module.Arrivals(*cells), table, row_of, rows) == 3
+    return rows[row_of[0]]
+
+
 @pytest.mark.parametrize("modulator", [None, ObjectModulator(20.0, 5), ObjectModulator(50.0, 256, 0.03)])
 @pytest.mark.parametrize("background", [0.0, 0.3])
 def test_tables_are_the_sums_of_the_drawn_field(modulator: ObjectModulator | None, background: float) -> None:
@@ -101,23 +111,11 @@ def test_a_cell_at_rest_in_the_middle_is_the_still_object(name: str) -> None:
     levels = np.minimum(LEVELS, profile.projector.levels - 1)
     table = shift_table(profile, PICTURES, levels, 2.0, 0, 0.0)
     still = expected_photoelectrons(profile, PICTURES, levels, 2.0)
-    ones, row_of, rows = np.ones(1), np.zeros(1, np.int64), np.empty((3, 3))
     for image in range(5):
-        cell = (np.array([100.0]), ones * 1e-300, np.array([image]), np.zeros(1, np.int64))
-        used = cells_module._fill(
-            np.zeros(1, np.int64),
-            np.ones(1, np.bool_),
-            200.0,
-            np.inf,
-            cells_module.Arrivals(*cell),
-            table,
-            row_of,
-            rows,
-        )
-        assert used == 3
-        np.testing.assert_allclose(rows[row_of[0]], still[image], rtol=1e-12)
+        found = exposed(table, 100.0, 1e-300, [image])
+        np.testing.assert_allclose(found, still[image], rtol=1e-12)
         if profile.min_transmission == 0:
-            np.testing.assert_allclose(rows[row_of[0]], still[image], rtol=4e-16)
+            np.testing.assert_allclose(found, still[image], rtol=4e-16)
 
 
 @settings(max_examples=40, deadline=None)
@@ -127,11 +125,7 @@ def test_light_during_an_exposure_is_the_mean_of_the_drawn_field(
 ) -> None:
     table = shift_table(FLOW, PICTURES, LEVELS, 2.0, 2, background)
     speed = moved_px / 200
-    begins = np.array([50], np.int64)
-    centre = 50 - start_px / speed
-    cell = (np.array([centre]), np.array([speed]), np.array([image]), np.array([down + 2]))
-    row_of, rows = np.zeros(1, np.int64), np.empty((3, 3))
-    cells_module._fill(begins, np.ones(1, np.bool_), 200.0, np.inf, cells_module.Arrivals(*cell), table, row_of, rows)
+    found = exposed(table, 50 - start_px / speed, speed, [image], down + 2, begin=50)
 
     def field_at(moment: float) -> np.ndarray:
         return shifted(PICTURES.images[image] / 255, min(max(moment, -8.0), 8.0), down, background)
@@ -142,19 +136,14 @@ def test_light_during_an_exposure_is_the_mean_of_the_drawn_field(
     )
     # the midpoint sum errs where the piecewise linear light bends: by its change over one step, about twice a pixel
     bound = photons_per_level(FLOW, 2.0) * LEVELS.sum(1).max() * moved_px / steps
-    np.testing.assert_allclose(rows[row_of[0]], wanted, atol=bound)
+    np.testing.assert_allclose(found, wanted, atol=bound)
 
 
 def test_cells_that_overlap_add_up_to_the_open_field_at_most() -> None:
     table = shift_table(FLOW, PICTURES, LEVELS, 2.0, 0, 0.0)
-    begins, lit = np.array([0], np.int64), np.ones(1, np.bool_)
 
     def light(images: list[int]) -> np.ndarray:
-        n = len(images)
-        cell = (np.full(n, 100.0), np.full(n, 0.01), np.array(images), np.zeros(n, np.int64))
-        row_of, rows = np.zeros(1, np.int64), np.empty((3, 3))
-        cells_module._fill(begins, lit, 200.0, np.inf, cells_module.Arrivals(*cell), table, row_of, rows)
-        return rows[row_of[0]]
+        return exposed(table, 100.0, 0.01, images)
 
     np.testing.assert_allclose(light([0, 1]), np.minimum(light([0]) + light([1]), table.full), rtol=1e-12)
     np.testing.assert_allclose(light([0, 1, 2, 3, 4]), table.full, rtol=1e-15)
