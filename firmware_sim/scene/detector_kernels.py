@@ -1,4 +1,4 @@
-"""The compiled kernels of the simulated detector and optics: many clicks, packed as a parallel instrument sends them.
+"""The compiled kernels of the simulated detector: many clicks, packed as a parallel instrument sends them.
 
 Owns the loops; law and model are detector_model.py's, and every bit is the one that `detector.sample_clicks` draws.
 What the profile does not declare is in no loop: dead time, read noise and dark counts are in the probability already, afterpulsing
@@ -115,20 +115,6 @@ def register_words(thresholds, primed, row_of, keys, first, crosstalk, previous,
         previous[0, c] = last >> _U(c) & _U(1)
 
 
-@njit(cache=True, nogil=True)
-def sparse_sums(images, starts, pixels, levels, out):  # type: ignore[no-untyped-def]
-    """Sum of level times grey over the lit pixels of each pattern: images uint8 (n, pixels of an image), exact integers.
-
-    Pattern i has the pixels `pixels[starts[i]:starts[i + 1]]` (int32) at `levels` (int32); out float64 (n, patterns).
-    """
-    for k in range(images.shape[0]):
-        for i in range(out.shape[1]):
-            total = np.int64(0)
-            for j in range(starts[i], starts[i + 1]):
-                total += np.int64(levels[j]) * np.int64(images[k, pixels[j]])
-            out[k, i] = total
-
-
 def click_thresholds(probability: NDArray[np.float64]) -> NDArray[np.uint64]:
     """Return the whole numbers below which a 53-bit number is a click: exactly `number * 2**-53 < probability`."""
     return np.ceil(probability * 2.0**53).astype(np.uint64)
@@ -172,10 +158,3 @@ def warm_up() -> None:
     for effects, n in ((plain, 1), (primed, 1), (primed, 65)):
         words = np.zeros((1, -(-n // 8)), np.uint8)
         sample_words(effects, np.zeros((1, n)), np.zeros(1, np.int64), 0, 0, np.zeros(n, np.uint8), words)
-
-
-def sparse_patterns(levels: NDArray[np.uint16]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return patterns (n, pixels) by their lit pixels: starts int64 (n + 1,), pixels int32 and levels int32."""
-    pattern, pixel = np.nonzero(levels)
-    starts = np.searchsorted(pattern, np.arange(len(levels) + 1)).astype(np.int64)
-    return starts, pixel.astype(np.int32), levels[pattern, pixel].astype(np.int32)

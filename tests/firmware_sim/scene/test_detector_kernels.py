@@ -1,4 +1,4 @@
-"""The compiled detector draws the very bits of the plain one; the sparse optics the very sums of the dense one."""
+"""The compiled detector draws the very bits of the plain one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
-from pans.firmware_sim.scene.detector_kernels import click_thresholds, sample_words, sparse_patterns, sparse_sums
+from pans.firmware_sim.scene.detector_kernels import click_thresholds, sample_words
 from pans.firmware_sim.scene.detector_model import DetectorModel
 from pans.runtime.instrument.click_law import ClickLaw
 
@@ -50,13 +50,3 @@ def test_thresholds_are_exact() -> None:
     whole = (numbers * 2.0**53).astype(np.uint64)
     for p in (0.0, 2.0**-53, 0.1, 0.5, np.nextafter(1, 0), 1.0, *numbers[:20], *np.nextafter(numbers[:20], 1)):
         assert ((whole < click_thresholds(np.array(p))) == (numbers < p)).all()
-
-
-def test_sparse_sums_are_exact() -> None:
-    rng = np.random.default_rng(1)
-    levels = np.where(rng.random((6, 784)) < 0.1, rng.integers(0, 65536, (6, 784)), 0).astype(np.uint16)
-    levels[2] = 0
-    images = rng.integers(0, 256, (20, 784), dtype=np.uint8)
-    out = np.empty((20, 6))
-    sparse_sums(images, *sparse_patterns(levels), out)
-    assert (out == images.astype(np.int64) @ levels.astype(np.int64).T).all()
