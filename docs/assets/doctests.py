@@ -5,13 +5,18 @@ from typing import Any
 
 import griffe
 
-# A blank line, an example of any length, and what ends it: a blank line or the end of the text.
+# An example begins with a prompt and ends with a blank line that no further prompt follows, or with the text.
 EXAMPLE = re.compile(r"(?:^|\n)\n*((?:[ ]*)>>> .*?)(?=\n\s*\n(?![ ]*>>>)|\Z)", re.DOTALL)
 
 
 class Doctests(griffe.Extension):
-    """Puts each run of lines from `>>>` to the next blank line into a fence."""
+    """Puts every example of a docstring into a fence."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Change the docstring of a module, class or function below the top package."""
         if obj.docstring is not None:
             obj.docstring.value = EXAMPLE.sub(r"\n\n```pycon\n\1\n```\n", obj.docstring.value)
+
+    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+        """Change the docstring of the top package, which is no object of another."""
+        self.on_object(obj=pkg)
