@@ -12,8 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
-
 from .common import F32, F64, I64, Decide, Measurement, Report, blocks, detect, silent
 
 FLOORS = (1e-3, 5e-3, 2e-2)  # of full transmission, among which a part of the training objects chooses
@@ -52,7 +50,7 @@ def log_joint(
     Bayes decision, the softmax its posterior. `left_out` (training objects,) are no part of the mixture.
     """
     if not (floor > 0 or dark > 0):
-        raise UsageError(f"floor is {floor:g} and dark is {dark:g}: one must be above 0", remedy="try --floor 0.001")
+        raise ValueError(f"floor is {floor:g} and dark is {dark:g}: one must be above 0 (try a floor of 0.001)")
     labels = measurement.train_labels if left_out is None else np.where(left_out, -1, measurement.train_labels)
     # log weights are taken relative to a typical object: smaller numbers, fewer lost digits in float32
     typical = measurement.photoelectrons(measurement.train[::50], photons, floor).mean(axis=0, keepdims=True) + dark

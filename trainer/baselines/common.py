@@ -1,7 +1,7 @@
 """Baselines, the common ground: light, detection and the score.
 
 Owns what every alternative to PANS shares: how N photons are dealt out, how they are detected, and how a result is counted.
-Never decides (baseline_bayes.py, baseline_nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a
+Never decides (bayes.py, nets.py) and reads no file. numpy only. Readouts are float32 (n, m): m pixels of a
 frame, or m = d_f patterns.
 
 Two conventions of "N photons" (`brightness`), both SIMULATED:
@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.incident import incident_intensity
-from pans.runtime.errors import UsageError
 from pans.trainer.evaluate.accuracy import Measured
 from pans.trainer.tasks.registry import Task
 
@@ -94,10 +93,10 @@ class Measurement:
 def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str = "source") -> Measurement:
     """Measure all objects of `task` by `patterns` (d_f, pixels, at least 0), or pixel by pixel without them (direct imaging)."""
     if brightness not in BRIGHTNESS:
-        raise UsageError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
+        raise ValueError(f"brightness is {brightness!r}, allowed: {', '.join(BRIGHTNESS)}")
     n_pixels = math.prod(task.image_shape)
     if not task.test.images.any():
-        raise UsageError(f"the test objects of {task.name} are black: no light can reach the detector")
+        raise ValueError(f"the test objects of {task.name} are black: no light can reach the detector")
     shared = (task.train.labels, task.test.labels, len(task.classes))
     if task.light != "transmission" or task.optics != "none":
         return _incident_frames(task, patterns, brightness)
@@ -106,7 +105,7 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
         ones = np.ones(n_pixels, np.float32)
         return Measurement(train, shared[0], test, shared[1], shared[2], ones, 1 / 255, brightness, task.image_shape)
     if patterns.ndim != 2 or patterns.shape[1] != n_pixels or not (patterns >= 0).all() or not patterns.any():
-        raise UsageError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
+        raise ValueError(f"patterns are {patterns.shape}, allowed: (d_f, {n_pixels}), at least 0 and not all 0")
     weights = patterns.astype(np.float32).T
     features = [_features(images, weights) for images in (train, test)]
     full = weights.sum(axis=0)
@@ -116,8 +115,8 @@ def measure(task: Task, patterns: NDArray[np.floating] | None, brightness: str =
 def _incident_frames(task: Task, patterns: NDArray[np.floating] | None, brightness: str) -> Measurement:
     """Frames of light that reaches us: a camera sees the intensity of a field, not its amplitude."""
     if patterns is not None:
-        raise UsageError(
-            f"{task.name} is light that reaches us: no patterns can be thrown on it", remedy="direct imaging"
+        raise ValueError(
+            f"{task.name} is light that reaches us: no patterns can be thrown on it, only a direct image taken"
         )
     n_pixels = math.prod(task.image_shape)
     train, test = (
@@ -198,7 +197,7 @@ def run_trials(
 ) -> Trials:
     """Detect every test object `trials` times at `photons` per object and let `decide` (readouts -> labels) judge."""
     if not (trials >= 1 and 0 < photons < math.inf and 0 <= dark < math.inf):
-        raise UsageError(f"{trials} trials, {photons:g} photons, dark {dark:g}; allowed: from 1, above 0, from 0")
+        raise ValueError(f"{trials} trials, {photons:g} photons, dark {dark:g}; allowed: from 1, above 0, from 0")
     light = measurement.photoelectrons(measurement.test, photons)
     rng = np.random.default_rng([seed, 1])
     right = np.empty((trials, len(light)), bool)

@@ -1,11 +1,11 @@
 """Compressive sensing: fixed patterns that know nothing of the task, and a classifier on the measured features.
 
-Owns the pattern families and the feature classifiers; light, detector and score are those of baselines.py. Without
+Owns the pattern families and the feature classifiers; light, detector and score are those of common.py. Without
 reconstruction: the classifier sees the d_f readouts (paper, appendix on fixed optical transformations). SIMULATED.
 
 - `mlp`: the paper's back end trained on noisy readouts of the very photon level.
 - `clean-mlp`: the same trained on noiseless features and shown noisy ones (the paper's baseline).
-- `bayes` (baseline_bayes.py): the exact posterior over the training objects.
+- `bayes` (bayes.py): the exact posterior over the training objects.
 """
 
 from __future__ import annotations
@@ -17,16 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
-
 from .common import Decide, Measurement, Report, named, silent
-from .nets import EpochOfFit, decider, feature_net, fit, poisson, seeded
+from .nets import Watch, feature_net, fitted, seeded, shown
 
 FAMILIES = ("binary", "hadamard")
 EPOCHS = 10
 
 F64 = NDArray[np.float64]
-Watch = Callable[[EpochOfFit, Decide], None]
 
 
 def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) -> F64:
@@ -36,16 +33,16 @@ def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) ->
     first one is light everywhere. Sides that are no power of two are cut from the next larger pattern.
     """
     if n_features < 1:
-        raise UsageError(f"--features is {n_features}, allowed: 1 or more")
+        raise ValueError(f"features is {n_features}, allowed: 1 or more")
     height, width = shape
     if family == "binary":
         return np.random.default_rng([seed, 3]).integers(0, 2, (n_features, height * width)).astype(np.float64)
     if family != "hadamard":
-        raise UsageError(f"patterns are {family!r}, allowed: {', '.join(FAMILIES)}")
+        raise ValueError(f"patterns are {family!r}, allowed: {', '.join(FAMILIES)}")
     rows, columns = walsh(height), walsh(width)
     order = sorted(((u, v) for u in range(len(rows)) for v in range(len(columns))), key=lambda uv: (sum(uv), uv))
     if n_features > len(order):
-        raise UsageError(f"--features is {n_features}, allowed for Walsh patterns of {height} x {width}: {len(order)}")
+        raise ValueError(f"features is {n_features}, allowed for Walsh patterns of {height} x {width}: {len(order)}")
     signs = [np.outer(rows[u, :height], columns[v, :width]).ravel() for u, v in order[:n_features]]
     return (np.array(signs) + 1) / 2
 
@@ -70,14 +67,9 @@ def aware_mlp(
     report: Report = silent,
 ) -> Decide:
     """Return the feature network trained on fresh readouts at this photon level."""
-
-    def readouts(which: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        shown = measurement.photoelectrons(measurement.train[which.numpy()], photons)
-        return poisson(torch.from_numpy(shown), detector, generator, dark)
-
-    return decider(
-        _fitted(measurement, readouts, seed, epochs, named(f"noise-aware MLP at {photons:g} photons", report))
-    )
+    told = named(f"noise-aware MLP at {photons:g} photons", report)
+    inputs = shown(measurement, photons, detector, dark)
+    return fitted(_net(measurement, seed), measurement, inputs, seed=seed, epochs=epochs, report=told)
 
 
 def clean_mlp(
@@ -93,11 +85,8 @@ def clean_mlp(
     Counts are divided by the exposure, clicks by their mean over that of the clean features: the network then sees features
     of the size that it knows. `watch` is called after every epoch, with what the network decides then on noiseless features.
     """
-
-    def features(which: torch.Tensor, _generator: torch.Generator) -> torch.Tensor:
-        return torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], 1.0))
-
-    decide = decider(_fitted(measurement, features, seed, epochs, named("MLP on clean features", report), watch))
+    told, inputs = named("MLP on clean features", report), shown(measurement, 1.0)
+    decide = fitted(_net(measurement, seed), measurement, inputs, seed=seed, epochs=epochs, report=told, watch=watch)
     return lambda photons, detector: lambda readouts: decide(readouts / size(measurement, photons, detector))
 
 
@@ -109,16 +98,5 @@ def size(measurement: Measurement, photons: float, detector: str) -> np.float32:
     return np.float32(-np.expm1(-light * np.float32(photons)).mean(dtype=np.float64) / light.mean(dtype=np.float64))
 
 
-def _fitted(
-    measurement: Measurement,
-    inputs: Callable[[torch.Tensor, torch.Generator], torch.Tensor],
-    seed: int,
-    epochs: int,
-    report: Report,
-    watch: Watch = lambda _epoch, _decide: None,
-) -> torch.nn.Module:
-    net = seeded(lambda: feature_net(measurement.train.shape[1], measurement.n_classes), seed)
-    labels = torch.from_numpy(measurement.train_labels)
-    decide = decider(net)
-    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
-    return net
+def _net(measurement: Measurement, seed: int) -> torch.nn.Module:
+    return seeded(lambda: feature_net(measurement.train.shape[1], measurement.n_classes), seed)

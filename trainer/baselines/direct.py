@@ -1,9 +1,9 @@
 """Direct imaging: a frame of the object under uniform light, one readout per pixel.
 
-Owns the networks that decide from a frame; the light, the detector and the score are those of baselines.py. Each way is a
+Owns the networks that decide from a frame; the light, the detector and the score are those of common.py. Each way is a
 function from a photon level to a decision `readouts -> labels`. SIMULATED, ideal shot noise unless dark counts are asked for.
 
-- `bayes` (baseline_bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise;
+- `bayes` (bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise;
   the strong one at few photons.
 - `cnn`: an AlexNet-style network trained on noisy frames of the very photon level. Knows the noise; strong at many photons.
 - `clean-cnn`: the same network trained on noiseless frames (the paper's baseline, which cannot know what noise looks like).
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from .common import Decide, Measurement, Report, named, silent
-from .nets import FrameNet, decider, fit, poisson, seeded
+from .nets import FrameNet, fitted, seeded, shown
 
 EPOCHS = 5
 
@@ -36,27 +36,14 @@ def aware_cnn(
     light = measurement.photoelectrons(measurement.train[:: max(1, len(measurement.train) // 1000)], photons) + dark
     square = light + light**2 if detector == "counting" else -np.expm1(-light)
     spread = math.sqrt(float(square.mean()))
-    net = _frame_net(measurement, seed, spread)
-
-    def frames(which: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        shown = measurement.photoelectrons(measurement.train[which.numpy()], photons)
-        return poisson(torch.from_numpy(shown), detector, generator, dark)
-
-    labels = torch.from_numpy(measurement.train_labels)
-    fit(net, frames, labels, epochs=epochs, seed=seed, report=named(f"noise-aware CNN at {photons:g} photons", report))
-    return decider(net)
+    net, told = _frame_net(measurement, seed, spread), named(f"noise-aware CNN at {photons:g} photons", report)
+    return fitted(net, measurement, shown(measurement, photons, detector, dark), seed=seed, epochs=epochs, report=told)
 
 
 def clean_cnn(measurement: Measurement, *, seed: int, epochs: int = EPOCHS, report: Report = silent) -> Decide:
     """Return the frame network trained on noiseless frames; one network serves all photon levels."""
-    net = _frame_net(measurement, seed, None)
-
-    def frames(which: torch.Tensor, _generator: torch.Generator) -> torch.Tensor:
-        return torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], 1e6))
-
-    labels = torch.from_numpy(measurement.train_labels)
-    fit(net, frames, labels, epochs=epochs, seed=seed, report=named("CNN on clean frames", report))
-    return decider(net)
+    net, told = _frame_net(measurement, seed, None), named("CNN on clean frames", report)
+    return fitted(net, measurement, shown(measurement, 1e6), seed=seed, epochs=epochs, report=told)
 
 
 def _frame_net(measurement: Measurement, seed: int, spread: float | None) -> torch.nn.Module:

@@ -1,7 +1,7 @@
 """Conventional end-to-end optimisation: trained patterns, but no photons in training.
 
 Owns the training of patterns and head on expected values, as in computational imaging before PANS (paper, appendix on
-conventional end-to-end optimisation); detection and score are those of baselines.py. The same front end (squared weights) and
+conventional end-to-end optimisation); detection and score are those of common.py. The same front end (squared weights) and
 back end (512 hidden units) as PANS. SIMULATED.
 
 - `qat`: quantisation-aware training: detected values pass a `bits`-bit quantiser, patterns one of `PATTERN_BITS`, with
@@ -21,7 +21,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pans.runtime.errors import UsageError
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Measurement, Report, measure, named, silent
@@ -84,7 +83,7 @@ def train_conventionally(
 ) -> EndToEnd:
     """Return patterns and head trained together on the expected values of the training objects of `task`."""
     if n_features < 1 or (bits is not None and not 1 <= bits <= 16):
-        raise UsageError(f"--features is {n_features}, --bits is {bits}; allowed: from 1, 1 to 16")
+        raise ValueError(f"features is {n_features}, bits is {bits}; allowed: from 1, 1 to 16")
     n_pixels = math.prod(task.image_shape)
     model = seeded(lambda: EndToEnd(n_features, n_pixels, len(task.classes), bits), seed)
     assert isinstance(model, EndToEnd)

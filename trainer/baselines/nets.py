@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .common import F32, I64, Decide, Report, silent
+from .common import F32, I64, Decide, Measurement, Report, silent
 
 CHUNK = 1000  # readouts per pass where no gradient is needed
 FRAME_SIDE = 28  # pixels; larger frames are reduced to about this by the first layer's stride
@@ -72,6 +72,9 @@ class EpochOfFit:
 
     loss: float
     accuracy: float
+
+
+Watch = Callable[[EpochOfFit, Decide], None]
 
 
 def feature_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
@@ -148,9 +151,35 @@ def _one_cycle(progress: float) -> float:
 
 
 def poisson(photoelectrons: Tensor, detector: str, generator: torch.Generator, dark: float = 0.0) -> Tensor:
-    """Return readouts as `baselines.detect` does, from torch's generator."""
+    """Return readouts as `common.detect` does, from torch's generator."""
     counts = torch.poisson(photoelectrons + dark, generator=generator)
     return (counts > 0).to(counts.dtype) if detector == "binary" else counts
+
+
+def shown(measurement: Measurement, photons: float, detector: str | None = None, dark: float = 0.0) -> Inputs:
+    """Return what a network sees of training objects: fresh readouts of `detector` every time, or without one their expectation."""
+
+    def inputs(which: Tensor, generator: torch.Generator) -> Tensor:
+        light = torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], photons))
+        return light if detector is None else poisson(light, detector, generator, dark)
+
+    return inputs
+
+
+def fitted(
+    net: nn.Module,
+    measurement: Measurement,
+    inputs: Inputs,
+    *,
+    seed: int,
+    epochs: int,
+    report: Report,
+    watch: Watch = lambda _epoch, _decide: None,
+) -> Decide:
+    """Train `net` on `inputs` of the training objects and return its decision; `watch` is told it after every epoch."""
+    decide, labels = decider(net), torch.from_numpy(measurement.train_labels)
+    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
+    return decide
 
 
 def decider(net: Callable[[Tensor], Tensor]) -> Decide:
