@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 
 from .accuracy import outcome_probabilities
@@ -50,11 +49,11 @@ class Information:
 def word_joint(probability: F64, labels: I64, n_classes: int, shots: int = 1) -> F64:
     """Return P(count vector, label), float64 ((shots + 1)**d_f, classes), over objects with click probabilities (n, d_f).
 
-    Row index: pattern 0 is the lowest digit, as in a bundle's table. UsageError beyond `OUTCOMES_MAX` outcomes.
+    Row index: pattern 0 is the lowest digit, as in a bundle's table. ValueError beyond `OUTCOMES_MAX` outcomes.
     """
     outcomes = (shots + 1) ** probability.shape[1]
     if outcomes > OUTCOMES_MAX:
-        raise UsageError(
+        raise ValueError(
             f"{probability.shape[1]} patterns at {shots} shots: {outcomes} outcomes, allowed: {OUTCOMES_MAX}"
         )
     joint = np.zeros((outcomes, n_classes))
@@ -193,7 +192,7 @@ def fisher(mean: F64, variance: F64, labels: I64) -> FisherRatio:
     variance = lambda. Clicks: p and p(1-p). Exact: nothing is sampled.
     """
     if mean.shape != variance.shape or len(mean) != len(labels):
-        raise UsageError(
+        raise ValueError(
             f"means are {mean.shape}, variances {variance.shape}, labels {labels.shape}; allowed: (n, m), (n,)"
         )
     return _Scatter(mean, labels).ratio(variance.mean(axis=0))

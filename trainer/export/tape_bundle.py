@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, write_bundle
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.barcode import CLASSES, N_BARS, all_strings
 
@@ -27,7 +26,7 @@ FLOOR = 1e-6  # of a posterior in the table
 def bar_patterns(pixels_per_bar: int, lit_px: int) -> NDArray[np.uint8]:
     """Return one pattern per bar, 1 on the `lit_px` pixels in its middle: uint8 (10, 10 * pixels_per_bar)."""
     if not 1 <= lit_px <= pixels_per_bar or (pixels_per_bar - lit_px) % 2:
-        raise UsageError(
+        raise ValueError(
             f"{lit_px} lit pixels of {pixels_per_bar}: allowed are 1 to {pixels_per_bar}, with equal guard bands"
         )
     guard = (pixels_per_bar - lit_px) // 2
@@ -60,14 +59,14 @@ def exact_table(photons: float, dark: float) -> tuple[NDArray[np.float32], float
 def tape_bundle(
     profile: Profile, *, photons: float, dark: float, pixels_per_bar: int, lit_px: int, exposure_us: float
 ) -> tuple[Bundle, dict[str, Any]]:
-    """Return the bundle, for exposures of `exposure_us`, and its exact figures; UsageError where the projector is not bright enough."""
+    """Return the bundle, for exposures of `exposure_us`, and its exact figures; ValueError where the projector is not bright enough."""
     levels = profile.projector.levels
     top = profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6
     level = round(photons / lit_px / top * (levels - 1))
     if not 1 <= level < levels:
-        raise UsageError(
-            f"{photons:g} photoelectrons on {lit_px} pixels need level {level} of {levels - 1} in {exposure_us:g} us",
-            remedy="another exposure, or more lit pixels",
+        raise ValueError(
+            f"{photons:g} photoelectrons on {lit_px} pixels need level {level} of {levels - 1} in {exposure_us:g} us: "
+            "choose another exposure, or more lit pixels"
         )
     shown = level / (levels - 1) * top * lit_px
     table, accuracy, clicks = exact_table(shown, dark)

@@ -15,8 +15,6 @@ import math
 import torch
 from torch import Tensor
 
-from pans.runtime.errors import UsageError
-
 from .encoders import CoherentField, Encoder
 
 INPUTS_MAX = 1024  # finer images are binned before the eigenvectors are found: 2 x 2 pixels of 64 x 64
@@ -56,7 +54,7 @@ def turns(image_shape: tuple[int, int]) -> list[Tensor]:
     """
     height, width = image_shape
     if height != width:
-        raise UsageError(f"images are {height} x {width}, allowed for turns: as high as wide")
+        raise ValueError(f"images are {height} x {width}, allowed for turns: as high as wide")
     pixels = torch.arange(height * width).reshape(height, width)
     quarters = [torch.rot90(pixels, quarter) for quarter in range(4)]
     return [view.flatten() for quarter in quarters for view in (quarter, quarter.flip(1))]

@@ -16,8 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pans.runtime.errors import UsageError
-
 WINDOW_PX = 11
 SIGMA_PX = 1.5
 C1 = 1e-4
@@ -84,11 +82,11 @@ def _terms(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor],
 
 def _check(shown: Tensor, wanted: Tensor) -> None:
     if shown.shape != wanted.shape or shown.dim() < 2 or 0 in shown.shape:
-        raise UsageError(
+        raise ValueError(
             f"images are {tuple(shown.shape)} and {tuple(wanted.shape)}, allowed: equal (..., height, width)"
         )
     if not shown.dtype.is_floating_point or shown.dtype != wanted.dtype:
-        raise UsageError(f"images are {shown.dtype} and {wanted.dtype}, allowed: one floating-point type, in [0, 1]")
+        raise ValueError(f"images are {shown.dtype} and {wanted.dtype}, allowed: one floating-point type, in [0, 1]")
 
 
 def _stacked(shown: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:

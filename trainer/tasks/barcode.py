@@ -22,8 +22,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
-
 from .draw import PARTS, Labels, random_stream
 
 N_BARS = 10
@@ -45,9 +43,9 @@ def occurrences(bars: NDArray[np.uint8]) -> Labels:
 
 
 def weights(prior: str = "uniform") -> NDArray[np.float64]:
-    """Return the probability of each of the 1024 strings, float64, sum 1; UsageError for an unknown prior."""
+    """Return the probability of each of the 1024 strings, float64, sum 1; ValueError for an unknown prior."""
     if prior not in PRIORS:
-        raise UsageError(f"barcode prior {prior!r}", remedy=f"allowed: {', '.join(PRIORS)}")
+        raise ValueError(f"barcode prior {prior!r}, allowed: {', '.join(PRIORS)}")
     bars, labels = all_strings()
     if prior == "uniform":
         return np.full(len(bars), 1 / len(bars))
@@ -58,7 +56,7 @@ def weights(prior: str = "uniform") -> NDArray[np.float64]:
 def draw(seed: int, part: str, n: int, prior: str = "uniform") -> tuple[NDArray[np.uint8], Labels]:
     """Return `n` strings drawn with replacement, uint8 (n, 1, 10) of 0 and 255, and int64 (n,) (OUR sampling)."""
     if part not in PARTS:
-        raise UsageError(f"part {part!r}", remedy=f"allowed: {', '.join(PARTS)}")
+        raise ValueError(f"part {part!r}, allowed: {', '.join(PARTS)}")
     bars, labels = all_strings()
     chosen = np.searchsorted(np.cumsum(weights(prior)), random_stream(seed, f"barcode-{prior}", part, 0).random(n))
     chosen = np.minimum(chosen, len(bars) - 1)

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample, interpolate
 
-from pans.runtime.errors import UsageError
-
 from .registry import IMAGES_MAX_BYTES, Objects
 
 DISTORT_STREAM = 0xD157  # beside the seed, so that no other draw is repeated
@@ -39,7 +37,7 @@ def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Ima
     """Return `copies` distorted copies of all but the last `kept` objects, then the objects as they are.
 
     `imaged` says how an image is made of what lies behind it, which is then what is distorted; without it nothing lies behind.
-    UsageError for images too small to be distorted, or more than fit.
+    ValueError for images too small to be distorted, or more than fit.
     """
     if not copies:
         return objects
@@ -56,14 +54,12 @@ def with_copies(objects: Objects, kept: int, copies: int, seed: int, imaged: Ima
 def _check(images: NDArray[np.uint8], copies: int) -> None:
     height, width = images.shape[1:]
     if min(height, width) < SIDE_MIN_PX:
-        raise UsageError(
-            f"images of {height} x {width} pixels cannot be distorted, allowed: {SIDE_MIN_PX} per side and more",
-            remedy="leave --copies out",
+        raise ValueError(
+            f"images of {height} x {width} pixels cannot be distorted into copies, allowed: {SIDE_MIN_PX} per side and more"
         )
     if images.nbytes * (copies + 1) > IMAGES_MAX_BYTES:
-        raise UsageError(
-            f"{copies} copies of {images.nbytes >> 20} MiB of images, allowed: {IMAGES_MAX_BYTES >> 20} MiB in all",
-            remedy="fewer --copies",
+        raise ValueError(
+            f"{copies} copies of {images.nbytes >> 20} MiB of images, allowed: {IMAGES_MAX_BYTES >> 20} MiB in all"
         )
 
 

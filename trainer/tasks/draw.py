@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
-
 CHUNK = 60  # objects drawn together; a multiple of 2, 3, 4, 5 and 6 classes, so that every chunk is balanced, and small
 # enough for its images to stay in the cache
 PARTS = ("train", "test")
@@ -41,7 +39,7 @@ def draw_objects(
 ) -> tuple[NDArray[np.uint8], Labels]:
     """Return `n` labelled images, uint8 (n, height, width) and int64 (n,), classes in equal shares and random order."""
     if n < 1 or part not in PARTS:
-        raise UsageError(f"{n} objects of part {part!r} of {name}", remedy=f"one or more, of {' or '.join(PARTS)}")
+        raise ValueError(f"{n} objects of part {part!r} of {name}, allowed: one or more, of {' or '.join(PARTS)}")
 
     def one(chunk: int) -> tuple[NDArray[np.uint8], Labels]:
         rng = random_stream(seed, name, part, chunk)

@@ -22,7 +22,6 @@ import math
 import torch
 from torch import Tensor
 
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
@@ -49,12 +48,12 @@ def search(task: Task, profile: Profile, options: Options, size: int) -> Trained
     """Return the best of `options.restarts` encoders of `size` fields, with a head fitted to its click words.
 
     `epochs` are passes over all turned objects in batches of `batch`, `front_rate` the peak rate of Adam, `light` the mean
-    photoelectrons per detector at the start. UsageError where the task has not two classes or the words cannot be enumerated.
+    photoelectrons per detector at the start. ValueError where the task has not two classes or the words cannot be enumerated.
     """
     if len(task.classes) != 2 or options.clicks is None or options.features > EXACT_FEATURES_MAX:
-        raise UsageError(
-            f"{task.name}: {len(task.classes)} classes, {options.features} patterns, clicks {options.clicks}",
-            remedy=f"two classes, at most {EXACT_FEATURES_MAX} patterns and a budget of clicks",
+        raise ValueError(
+            f"{task.name}: {len(task.classes)} classes, {options.features} patterns, clicks {options.clicks}; "
+            f"allowed: two classes, at most {EXACT_FEATURES_MAX} patterns and a budget of clicks"
         )
     x, labels = encoder_input(task, task.train, profile, options), torch.from_numpy(task.train.labels)
     fields = discriminant_basis(x, labels, task.image_shape, size, turned=True)[:, size:]

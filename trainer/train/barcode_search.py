@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import quantise_patterns
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
@@ -147,7 +146,7 @@ def solve_patterns(options: Options, profile: Profile, prior: str = "uniform") -
         found.append(descend(patterns, law, clicks_max, prior))
     found.sort(key=lambda one: -one.accuracy)
     if found[0].accuracy < 0:
-        raise UsageError(f"no patterns were found within {clicks_max:g} clicks", remedy="allow more, or more restarts")
+        raise ValueError(f"no patterns were found within {clicks_max:g} clicks: allow more, or more restarts")
     return found, law
 
 

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.trainer.evaluate import information
 from pans.trainer.evaluate.information import (
@@ -105,7 +104,7 @@ def test_a_word_that_no_training_object_shows_costs_finite_bits() -> None:
 
 
 def test_more_than_sixteen_patterns_are_refused() -> None:
-    with pytest.raises(UsageError, match="131072 outcomes, allowed: 65536"):
+    with pytest.raises(ValueError, match="131072 outcomes, allowed: 65536"):
         word_joint(np.full((2, 17), 0.5), np.array([0, 1]), 2)
 
 
@@ -211,5 +210,5 @@ def test_large_frames_have_a_trace_ratio_only(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_fisher_refuses_what_does_not_belong_together() -> None:
-    with pytest.raises(UsageError, match="variances"):
+    with pytest.raises(ValueError, match="variances"):
         fisher(np.zeros((2, 3)), np.zeros((3, 3)), np.array([0, 1]))

@@ -5,7 +5,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from pans.runtime.errors import UsageError
 from pans.trainer.tasks import barcode as task_barcode
 
 
@@ -62,7 +61,7 @@ def test_the_number_of_bright_bars_tells_nothing_under_the_uniform_prior():
 
 
 def test_an_unknown_prior_or_part_is_refused():
-    with pytest.raises(UsageError, match="prior 'even'"):
+    with pytest.raises(ValueError, match="prior 'even'"):
         task_barcode.weights("even")
-    with pytest.raises(UsageError, match="part 'valid'"):
+    with pytest.raises(ValueError, match="part 'valid'"):
         task_barcode.draw(0, "valid", 1)

@@ -88,13 +88,13 @@ def test_total_intensity_squares_amplitudes():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "error", "message"),
     [
-        ({"name": "cell"}, "no generator"),
-        ({"name": "fiber", "seed": -1}, "seed -1"),
-        ({"name": "fiber", "n_train": 0}, "0 objects"),
+        ({"name": "cell"}, UsageError, "no generator"),
+        ({"name": "fiber", "seed": -1}, UsageError, "seed -1"),
+        ({"name": "fiber", "n_train": 0}, ValueError, "0 objects"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(arguments, message):
-    with pytest.raises(UsageError, match=message):
+def test_what_cannot_be_drawn_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
         generate(**arguments)

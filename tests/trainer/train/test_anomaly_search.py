@@ -9,7 +9,6 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.runtime.errors import UsageError
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.field_basis import discriminant_basis, turns
@@ -58,7 +57,7 @@ def test_turns_are_the_eight_symmetries_of_a_square():
     assert tuple(image.T.flatten().tolist()) in views
     assert tuple(image.flip(0).flatten().tolist()) in views
     torch.testing.assert_close(turns((3, 3))[0], torch.arange(9))
-    with pytest.raises(UsageError, match="3 x 4"):
+    with pytest.raises(ValueError, match="3 x 4"):
         turns((3, 4))
 
 
@@ -115,7 +114,7 @@ def test_starts_above_their_clicks_are_not_chosen():
 
 def test_what_cannot_be_searched_is_said(task):
     profile = load_profile("ideal")
-    with pytest.raises(UsageError, match="clicks None"):
+    with pytest.raises(ValueError, match="clicks None"):
         search(task, profile, Options(features=2, encoder="coherent"), 20)
-    with pytest.raises(UsageError, match="13 patterns"):
+    with pytest.raises(ValueError, match="13 patterns"):
         search(task, profile, Options(features=13, clicks=2.0, encoder="coherent"), 20)
