@@ -1,6 +1,6 @@
 """What every benchmark shares: rows, timing, the facts of the machine, the mark of the best trade-offs, the plot.
 
-Owns how things are measured and told; what is measured stands in bench_decide.py, bench_ingest.py, bench_loop.py and bench_link.py.
+Owns how things are measured and told; what is measured stands in decide.py, ingest.py, loop.py and link.py.
 Throughput is in CPU time of the measuring thread, which a busy machine changes little; latencies are in wall time, and the load is
 told with them. A row is a dict with a `name`; speed and error stand in the same row.
 """

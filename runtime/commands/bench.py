@@ -61,7 +61,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def bench_link(options: Any) -> list[dict[str, Any]]:
-    """Return the rows of bench_link.py, which takes numbers of round trips rather than options."""
+    """Return the rows of bench/link.py, which takes numbers of round trips rather than options."""
     from pans.runtime.bench.link import bench_link
 
     return bench_link(samples=400 if options.quick else 4000)

@@ -98,7 +98,7 @@ class _Prepared:
     dark: DarkRun
     plan: Plan
     core: LiveCore
-    passing: FlowRun | None
+    flow_run: FlowRun | None
     config: RunConfig
     header: dict[str, Any]
     expected_decisions: int
@@ -118,12 +118,12 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     bundle, bundle_sha256 = load_bundle(job.bundle_path)
     decider = make_decider(bundle, shots=job.shots, backend=job.backend)
     dark = DarkRun.of(job.dark, job.profile)
-    n_objects, passing, seconds = -(-job.decisions // job.trials), None, job.seconds
+    n_objects, flow_run, seconds = -(-job.decisions // job.trials), None, job.seconds
     core: LiveCore
     if job.flow is not None:
         plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, job.flow, job.shots, job.seconds)
         flow_core.guard = dark.guard(plan, bundle, job.shots, flow=True)
-        core, passing, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act, job.act_profile)), 0.0
+        core, flow_run, seconds = flow_core, FlowRun(flow_core, open_actuator(job.act, job.act_profile)), 0.0
     else:
         plan = build_plan(
             dark.profile,
@@ -140,9 +140,9 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
         job.out.mkdir(parents=True, exist_ok=True)
     header = recording_header(job, bundle_sha256, decider, n_objects)
     header["config"]["dark"] = dark.header()
-    if passing is not None:
-        header["config"]["flow"] = passing.header()
-    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, passing, config, header, n_objects * job.trials)
+    if flow_run is not None:
+        header["config"]["flow"] = flow_run.header()
+    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, n_objects * job.trials)
 
 
 def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
@@ -191,8 +191,8 @@ def _watched(
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
             seen.prepared(run)
-            if ready.passing is not None:
-                ready.passing.prepared(run)
+            if ready.flow_run is not None:
+                ready.flow_run.prepared(run)
 
         def look(run: LiveRun, output: Output) -> None:
             dark.look(run, output)
@@ -211,7 +211,7 @@ def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
         result,
         illumination=ready.bundle.illumination() * frames,
         expected_decisions=ready.expected_decisions,
-        flow=None if ready.passing is None else ready.passing.figures(),
+        flow=None if ready.flow_run is None else ready.flow_run.figures(),
         dark=ready.dark.figures(),
     )
 
@@ -221,8 +221,8 @@ def _conclude(job: Job, ready: _Prepared, result: RunResult, summary: Summary) -
     from pans.runtime.report.summary_page import write_markdown
 
     confusion, page, bundle = result.tally.confusion, None, ready.bundle
-    if ready.passing is not None:
-        confusion = confusion + ready.passing.core.matcher.confusion
+    if ready.flow_run is not None:
+        confusion = confusion + ready.flow_run.core.matcher.confusion
     if job.out is not None:
         page = job.out / "summary.md"
         facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, summary)

@@ -1,7 +1,7 @@
 """Device URLs -> an open link: bytes in, bytes out, and the clock they are stamped with.
 
-Owns the schemes and what a link is; never looks into the bytes. `open_link` returns a `Link` (link_serial.py, link_usb.py, or a driver
-by entry point, see docs/how-to/own-device.md); link_reader.py reads from any of them.
+Owns the schemes and what a link is; never looks into the bytes. `open_link` returns a `Link` (serial.py, usb.py, or a driver
+by entry point, see docs/how-to/own-device.md); reader.py reads from any of them.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ LEAST_WAIT_S = 0.0002
 
 
 class Lateness:
-    """The witnesses of one run, across reconnections; `attach` before each ARM, `close` at the end."""
+    """The evidence of one run, across reconnections; `attach` before each ARM, `close` at the end."""
 
     def __init__(self, plan: Plan, deadline_ns: int, link: Link, recorder: AnyRecorder | None) -> None:
         pause_ns = longest_pause_ns(plan)
@@ -36,13 +36,13 @@ class Lateness:
             recorder.watch_write = self._wrote
 
     def attach(self, connection: Connection, start_ns: int) -> None:
-        """Hear the witnesses of `connection` from here on; its exposures begin at `start_ns`."""
+        """Take evidence from `connection` from here on; its exposures begin at `start_ns`."""
         connection.evidence = self.evidence
         self.evidence.watch([connection.reader.thread_id])
         self.block_ns, self._asked, self._damaged = start_ns, False, 0
 
     def close(self) -> None:
-        """Let the witnesses go; idempotent."""
+        """Stop taking evidence; idempotent."""
         self.evidence.close()
 
     # -- during a turn -------------------------------------------------------------------------------------------------

@@ -68,18 +68,7 @@ def run_live(
     on_sent = None if recorder is None else recorder.add_command
 
     def prepare(opened: Link) -> Connection:
-        """Open a session, check that it is the right device, and bring it to where ARM can follow."""
-        connection = Connection(opened, on_sent)
-        try:
-            facts = connection.handshake().facts
-            check_device(facts, plan, bundle, profile.clock.tick_hz)
-            connection.upload(plan, bundle)
-            connection.synchronise()
-            connection.decoder.use_kernels()
-        except BaseException:
-            connection.detach()
-            raise
-        return connection
+        return open_session(opened, on_sent, plan, bundle, profile.clock.tick_hz)
 
     try:
         connection = prepare(link)
@@ -111,6 +100,23 @@ def run_live(
         return _result(run, profile)
     finally:
         run.connection.close()
+
+
+def open_session(
+    link: Link, on_sent: Callable[[int, bytes], None] | None, plan: Plan, bundle: Bundle, tick_hz: int
+) -> Connection:
+    """Open a session, check that it is the right device, and bring it to where ARM can follow."""
+    connection = Connection(link, on_sent)
+    try:
+        facts = connection.handshake().facts
+        check_device(facts, plan, bundle, tick_hz)
+        connection.upload(plan, bundle)
+        connection.synchronise()
+        connection.decoder.use_kernels()
+    except BaseException:
+        connection.detach()
+        raise
+    return connection
 
 
 def _until_ended(

@@ -1,6 +1,6 @@
 """A second instrument that pulses: its own link, session and clock, beside the one that measures.
 
-Owns its connection and what keeps it armed; never measures with it and never decides when a pulse is due (actuate.py). Its plan is one dark
+Owns its connection and what keeps it armed; never measures with it and never decides when a pulse is due (gates.py). Its plan is one dark
 exposure per second, for which no receive window is granted: GATE needs a run, and the lease of a run is what lets go of the
 outputs when the host dies. A pulse asked for at a time of the host's clock becomes a tick of this instrument's clock; what the
 conversion may be off is returned with it.

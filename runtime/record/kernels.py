@@ -1,6 +1,6 @@
 """The compiled kernels of a recording: rows to runs, verdicts and codes of the compact decision log; messages to a block.
 
-Owns the loops over rows and bytes; what its output means is told in record_log.py, which also owns the arrays. Never allocates.
+Owns the loops over rows and bytes; what its output means is told in log.py, which also owns the arrays. Never allocates.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The pictures of a recorded run, recomputed from its clicks, and how they compare with the true ones.
 
 Owns the pairing of decisions with the clicks behind them during a replay, and the file of pictures (.npz, never pickled); never reads a
-recording (cmd_replay.py). A decision that abstained has no picture.
+recording (replaying.py). A decision that abstained has no picture.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One self-contained HTML page: text, tables and pictures in a single file that needs nothing else.
 
-Owns escaping, layout and the inlining of pictures; never measures and never draws (page_figures.py). Nothing in the page is loaded from
+Owns escaping, layout and the inlining of pictures; never measures and never draws (figures.py). Nothing in the page is loaded from
 elsewhere and nothing in it runs: no script, no font, no style sheet of another.
 """
 

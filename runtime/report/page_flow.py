@@ -1,6 +1,6 @@
 """The report page's part on objects that passed by: what they were worth, what became of pulses, what was late and why.
 
-Owns the sums behind these sections; the order of the page is page_run.py's, the drawings page_figures.py's. Figures come from a replay of
+Owns the sums behind these sections; the order of the page is page_run.py's, the drawings figures.py's. Figures come from a replay of
 the recorded messages, so that a recording that was cut, or one part of a longer one, has them too.
 """
 

@@ -77,20 +77,6 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
         f"{'SIMULATED. ' if simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "
         f"{plan.exposure_us:g} us; timestamps are the begin of the exposure. Profile {profile.get('name')}."
     )
-    identity = {
-        "author": "unknown",
-        "author_affiliation": "unknown",
-        "creator": "unknown",
-        "creator_affiliation": "unknown",
-        "filename": path.name,
-        "filename_full": str(path.resolve()),
-        "creation_time": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()),
-        "software": "pans-runtime",
-        "software_version": __version__,
-        "format_name": FORMAT_NAME,
-        "format_version": FORMAT_VERSION,
-        "format_url": FORMAT_URL,
-    }
     return {
         "acquisition_duration": (clicks.last_tick - clicks.first_tick) * unit_s,
         "description": described,
@@ -111,7 +97,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
             "excitation_alternated": np.zeros(1, np.uint8),
             "excitation_cw": np.ones(1, np.uint8),
         },
-        "identity": identity,
+        "identity": _identity(path),
         "provenance": {
             "filename": recording.path.name,
             "filename_full": str(recording.path.resolve()),
@@ -145,3 +131,20 @@ _TITLES = {
     "pattern": "Pattern that was shown during the exposure of each click; 65535: dark slot.",
     "object": "Object that stood before the detector at each click; 4294967295: not known.",
 }
+
+
+def _identity(path: Path) -> dict[str, Any]:
+    return {
+        "author": "unknown",
+        "author_affiliation": "unknown",
+        "creator": "unknown",
+        "creator_affiliation": "unknown",
+        "filename": path.name,
+        "filename_full": str(path.resolve()),
+        "creation_time": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()),
+        "software": "pans-runtime",
+        "software_version": __version__,
+        "format_name": FORMAT_NAME,
+        "format_version": FORMAT_VERSION,
+        "format_url": FORMAT_URL,
+    }

@@ -137,7 +137,7 @@ def test_decisions_that_cannot_be_true(
     assert reason in found["violations"][0]["message"]
 
 
-def test_an_honest_abstention_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_abstention_without_a_label_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = record(tmp_path / "a.pansrec", [decision(0, flags=9, label=0xFFFF, probability=0.0)])
     assert run(capsys, "verify", path)[0] == 0
 

@@ -29,13 +29,13 @@ def clock() -> ClockModel:
 
 
 class Bench:
-    """A desk, a session that has shaken hands, and the answers of a device."""
+    """A queue, a session that has shaken hands, and the answers of a device."""
 
     def __init__(self) -> None:
         self.journal, self.clock = Journal(None), clock()
-        self.desk = GateQueue(None, self.journal)
+        self.queue = GateQueue(None, self.journal)
         self.failed: list[int] = []
-        self.desk.failed = self.failed.append
+        self.queue.failed = self.failed.append
         self.session = HostSession(9)
         self.session.start(0)
         welcome = wire.encode_welcome({"epoch": 1}, 9)
@@ -44,7 +44,7 @@ class Bench:
 
     def turn(self, now_us: int) -> list[int]:
         """One turn at `now_us`; return the ids of the commands that left."""
-        self.desk.turn(self.session, self.clock, now_us * 1000)
+        self.queue.turn(self.session, self.clock, now_us * 1000)
         self.session.poll(now_us * 1000)
         frames = FrameDecoder().feed(self.session.take_output())
         return [wire.decode_command(frame.payload).command_id for frame in frames]
@@ -63,17 +63,17 @@ def pulse(number: int, tick: int) -> Action:
 
 def test_a_pulse_is_sent_at_once_and_counts_when_it_was_accepted() -> None:
     bench = Bench()
-    bench.desk.take([pulse(4, 20_000)])
+    bench.queue.take([pulse(4, 20_000)])
     assert bench.turn(10_000) == [1]
-    assert bench.desk.counters.done == 0
+    assert bench.queue.counters.done == 0
     bench.answer(1)
     bench.turn(10_100)
-    assert bench.desk.summary() == {"asked": 1, "done": 1, "refused": 0, "expired": 0}
+    assert bench.queue.summary() == {"asked": 1, "done": 1, "refused": 0, "expired": 0}
 
 
 def test_what_is_known_to_be_late_is_never_sent() -> None:
     bench = Bench()
-    bench.desk.take([pulse(4, 9_000), pulse(5, 20_000)])
+    bench.queue.take([pulse(4, 9_000), pulse(5, 20_000)])
     assert bench.turn(10_000) == [1]
     assert bench.failed == [4]
     assert bench.journal.events == [
@@ -88,48 +88,48 @@ def test_what_is_known_to_be_late_is_never_sent() -> None:
 
 def test_a_refusal_is_told_with_its_decision() -> None:
     bench = Bench()
-    bench.desk.take([pulse(4, 20_000), pulse(5, 20_010)])
+    bench.queue.take([pulse(4, 20_000), pulse(5, 20_010)])
     bench.turn(10_000)
     bench.answer(2, refused=1, text="gate tick has passed")
     bench.turn(10_100)
-    assert bench.desk.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
+    assert bench.queue.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
     assert bench.failed == [4]
     assert bench.journal.events[0]["text"] == "gate tick has passed"
 
 
 def test_pulses_behind_a_stalled_window_expire_and_are_not_sent_afterwards() -> None:
     bench = Bench()
-    bench.desk.take([pulse(n, 20_000 + n) for n in range(20)])
+    bench.queue.take([pulse(n, 20_000 + n) for n in range(20)])
     assert bench.turn(10_000) == [1, 2, 3, 4, 5, 6]
     assert bench.turn(15_000) == []
     bench.answer(6)
     assert bench.turn(30_000) == []
-    assert bench.desk.summary() == {"asked": 20, "done": 6, "refused": 0, "expired": 14}
+    assert bench.queue.summary() == {"asked": 20, "done": 6, "refused": 0, "expired": 14}
     assert bench.failed == list(range(6, 20))
 
 
 def test_the_queue_is_bounded() -> None:
     bench = Bench()
-    bench.desk.take([pulse(n, 1 << 40) for n in range(MAX_WAITING + 5)])
+    bench.queue.take([pulse(n, 1 << 40) for n in range(MAX_WAITING + 5)])
     assert bench.failed == list(range(5))
 
 
 def test_another_session_answers_no_pulse_of_the_last_one() -> None:
     bench = Bench()
-    bench.desk.take([pulse(4, 20_000)])
+    bench.queue.take([pulse(4, 20_000)])
     bench.turn(10_000)
     bench.session = HostSession(10)
     bench.turn(10_100)
-    assert bench.desk.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
+    assert bench.queue.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
 
 
 def test_the_end_of_a_run_leaves_nothing_unknown() -> None:
     bench = Bench()
-    bench.desk.take([pulse(n, 20_000) for n in range(8)])
+    bench.queue.take([pulse(n, 20_000) for n in range(8)])
     bench.turn(10_000)
     bench.answer(3)
-    bench.desk.finish(bench.session)
-    assert bench.desk.summary() == {"asked": 8, "done": 3, "refused": 3, "expired": 2}
+    bench.queue.finish(bench.session)
+    assert bench.queue.summary() == {"asked": 8, "done": 3, "refused": 3, "expired": 2}
     assert bench.failed == [3, 4, 5, 6, 7]
 
 
@@ -145,14 +145,14 @@ def test_an_actuator_of_ones_own_gets_host_times() -> None:
             pass
 
     bench = Bench()
-    bench.desk.actuator = Sorter()
-    bench.desk.take([pulse(4, 20_000), Action(5, 21_000, 50, 1)])
+    bench.queue.actuator = Sorter()
+    bench.queue.take([pulse(4, 20_000), Action(5, 21_000, 50, 1)])
     assert bench.turn(10_000) == []
     assert [(round(at / 1000), duration, channel) for at, duration, channel in fired] == [
         (20_000, 50.0, 0),
         (21_000, 50.0, 1),
     ]
-    assert bench.desk.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
+    assert bench.queue.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
     assert bench.failed == [5]
     assert bench.kinds() == ["fired", "fired", "gate_refused"]
 

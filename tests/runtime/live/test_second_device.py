@@ -71,32 +71,32 @@ def serve_one() -> Iterator[Callable[..., Served]]:
 
 
 class Lab:
-    """A first instrument whose clock is known, and a desk that pulses on the second."""
+    """A first instrument whose clock is known, and a queue that pulses on the second."""
 
     def __init__(self, first: Served, second: SecondInstrument) -> None:
         self.connection = Connection(open_link(first.port.url))
         self.connection.handshake()
         self.clock: ClockModel = self.connection.synchronise()
         self.journal = Journal(None)
-        self.desk = GateQueue(None, self.journal)
+        self.queue = GateQueue(None, self.journal)
         self.failed: list[int] = []
-        self.desk.failed = self.failed.append
-        self.desk.second = second
+        self.queue.failed = self.failed.append
+        self.queue.second = second
 
     def turns(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         stop_ns = time.perf_counter_ns() + round(seconds * 1e9)
         while time.perf_counter_ns() < stop_ns and not until():
             self.connection.pump(0.001)
-            self.desk.turn(self.connection.session, self.clock, time.perf_counter_ns())
+            self.queue.turn(self.connection.session, self.clock, time.perf_counter_ns())
 
     def events(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.journal.events if event["kind"] == kind]
 
     def close(self) -> None:
-        self.desk.finish(self.connection.session)
+        self.queue.finish(self.connection.session)
         self.connection.close()
-        assert self.desk.second is not None
-        self.desk.second.close()
+        assert self.queue.second is not None
+        self.queue.second.close()
 
 
 LISTEN = ["tcp:127.0.0.1:0", *(["pty"] if hasattr(os, "openpty") else [])]
@@ -116,13 +116,13 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
     for number in range(10):
         tick = lab.clock.to_tick(time.perf_counter_ns() + 400 * MS)
         asked.append(tick)
-        lab.desk.take([Action(number, tick, 2000, 3)])
+        lab.queue.take([Action(number, tick, 2000, 3)])
         lab.turns(0.02)
-    lab.turns(PATIENCE_S, lambda: lab.desk.counters.done == 10)
+    lab.turns(PATIENCE_S, lambda: lab.queue.counters.done == 10)
     late = lab.clock.to_tick(time.perf_counter_ns() - 5 * MS)
-    lab.desk.take([Action(10, late, 2000, 3)])  # it is known to be late: never sent
+    lab.queue.take([Action(10, late, 2000, 3)])  # it is known to be late: never sent
     lab.turns(0.01)
-    assert lab.desk.summary() == {"asked": 11, "done": 10, "refused": 0, "expired": 1}
+    assert lab.queue.summary() == {"asked": 11, "done": 10, "refused": 0, "expired": 1}
     lab.close()
     pulses = list(other.device.gates.pulses)
     assert [pulse.channel for pulse in pulses] == [3] * 10
@@ -150,9 +150,9 @@ def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Calla
     second.connect()
     lab = Lab(first, second)
     tick = lab.clock.to_tick(time.perf_counter_ns() + 200 * MS)
-    lab.desk.take([Action(1, tick, 100, 99), Action(2, tick, 100, 0)])  # there is no output 99
-    lab.turns(PATIENCE_S, lambda: lab.desk.counters.done == 1)
-    assert lab.desk.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
+    lab.queue.take([Action(1, tick, 100, 99), Action(2, tick, 100, 0)])  # there is no output 99
+    lab.turns(PATIENCE_S, lambda: lab.queue.counters.done == 1)
+    assert lab.queue.summary() == {"asked": 2, "done": 1, "refused": 1, "expired": 0}
     assert lab.failed == [1]
     assert "channels are 0..7" in lab.events("gate_refused")[0]["text"]
     lab.close()
@@ -166,9 +166,9 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
     lab = Lab(first, second)
     other.vanish()
     lab.turns(PATIENCE_S, lambda: bool(lab.events("actuator_lost")))
-    lab.desk.take([Action(5, lab.clock.to_tick(time.perf_counter_ns() + 500 * MS), 100, 0)])
+    lab.queue.take([Action(5, lab.clock.to_tick(time.perf_counter_ns() + 500 * MS), 100, 0)])
     lab.turns(0.01)
-    assert lab.desk.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
+    assert lab.queue.summary() == {"asked": 1, "done": 0, "refused": 1, "expired": 0}
     assert lab.failed == [5]
     assert "the second instrument was lost" in lab.events("gate_refused")[0]["text"]
     lab.close()
