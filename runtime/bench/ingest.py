@@ -8,7 +8,6 @@ allocates nothing.
 from __future__ import annotations
 
 import gc
-import os
 import tempfile
 import time
 import zlib
@@ -25,6 +24,7 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.instrument.dark_rate import DarkMonitor
+from pans.runtime.live.state_file import resources_used
 from pans.runtime.record import Recorder
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import FrameDecoder
@@ -240,7 +240,7 @@ def _steady_row(bundle: Bundle, wanted: int) -> Row:
         spent_s += time.thread_time() - start_s
         collections += _collections() - before
         done += piece_visits * slots
-        memory.append(_resident_bytes())
+        memory.append(resources_used()["rss_bytes"])
     counters = core.core.tracker.counters
     settled = memory[min(len(memory) - 1, 8) :]
     return {
@@ -296,10 +296,3 @@ class _Renumbered:
 
 def _collections() -> int:
     return sum(generation["collections"] for generation in gc.get_stats())
-
-
-def _resident_bytes() -> int:
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError, AttributeError):
-        return 0

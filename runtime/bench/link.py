@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -35,6 +34,8 @@ from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameBlock, Opcode
 
+from .rows import BenchOptions, Row
+
 PROFILE = "ideal"
 N_PATTERNS = 4
 TURN = 100  # round trips of one kind in a row
@@ -43,7 +44,12 @@ PATIENCE_S = 20.0
 WARM_UP = 200
 
 
-def bench_link(transports: Sequence[str] = ("pty", "tcp", "usb"), samples: int = 4000) -> list[dict[str, Any]]:
+def bench_link(options: BenchOptions) -> list[Row]:
+    """Return the rows of every transport that this system has."""
+    return link_rows(samples=400 if options.quick else 4000)
+
+
+def link_rows(transports: Sequence[str] = ("pty", "tcp", "usb"), samples: int = 4000) -> list[Row]:
     """Return rows of {name, p50_us, p99_us, p999_us, max_us, samples, ratio_p50}; `ratio_p50` is to the raw echo of that transport.
 
     Over pyusb both the instrument and the echo stand behind its backend's socket; the same echo without pyusb is told beside it.
@@ -56,7 +62,7 @@ def bench_link(transports: Sequence[str] = ("pty", "tcp", "usb"), samples: int =
     return rows
 
 
-def _bench_transport(transport: str, samples: int) -> list[dict[str, Any]]:
+def _bench_transport(transport: str, samples: int) -> list[Row]:
     listen = "pty" if transport == "pty" else "tcp:127.0.0.1:0"
     request, answer_bytes = _sizes()
     echoes = ("raw echo", "raw echo of its socket") if transport == "usb" else ("raw echo",)
@@ -85,7 +91,7 @@ def _bench_transport(transport: str, samples: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(name: str, times_ns: list[int], raw_us: float) -> dict[str, Any]:
+def _row(name: str, times_ns: list[int], raw_us: float) -> Row:
     p50, p99, p999 = (float(value) / 1000 for value in np.quantile(times_ns, [0.5, 0.99, 0.999]))
     return {
         "name": name,

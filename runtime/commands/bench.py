@@ -60,13 +60,6 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
-def bench_link(options: Any) -> list[dict[str, Any]]:
-    """Return the rows of bench/link.py, which takes numbers of round trips rather than options."""
-    from pans.runtime.bench.link import bench_link
-
-    return bench_link(samples=400 if options.quick else 4000)
-
-
 def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:
     for point in entry_points(group="pans.benches", name=name):
         found: Callable[[Any], list[dict[str, Any]]] = point.load()

@@ -70,6 +70,13 @@ def serve_one() -> Iterator[Callable[..., Served]]:
         one.vanish()
 
 
+def connected(served: Served) -> SecondInstrument:
+    second = open_actuator(served.url, PULSER)
+    assert isinstance(second, SecondInstrument)
+    second.connect()
+    return second
+
+
 class Lab:
     """A first instrument whose clock is known, and a queue that pulses on the second."""
 
@@ -108,9 +115,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
 ) -> None:
     """Both clocks start elsewhere and run 100 ppm apart; where the pulses really are is taken from the simulators' own clocks."""
     first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 10**12, 50.0), serve_one("ideal", listen, 77, -50.0)
-    second = open_actuator(other.url, PULSER)
-    assert isinstance(second, SecondInstrument)
-    second.connect()
+    second = connected(other)
     lab = Lab(first, second)
     asked = []
     for number in range(10):
@@ -145,10 +150,7 @@ def test_pulses_come_when_they_were_asked_for_within_both_uncertainties(
 
 def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Callable[..., Served]) -> None:
     first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 0, 0.0), serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
-    second = open_actuator(other.url, PULSER)
-    assert isinstance(second, SecondInstrument)
-    second.connect()
-    lab = Lab(first, second)
+    lab = Lab(first, connected(other))
     tick = lab.clock.to_tick(time.perf_counter_ns() + 200 * MS)
     lab.queue.take([Action(1, tick, 100, 99), Action(2, tick, 100, 0)])  # there is no output 99
     lab.turns(PATIENCE_S, lambda: lab.queue.counters.done == 1)
@@ -160,10 +162,7 @@ def test_what_the_second_instrument_refuses_is_counted_and_told(serve_one: Calla
 
 def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callable[..., Served]) -> None:
     first, other = serve_one("flow-snspd", "tcp:127.0.0.1:0", 0, 0.0), serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
-    second = open_actuator(other.url, PULSER)
-    assert isinstance(second, SecondInstrument)
-    second.connect()
-    lab = Lab(first, second)
+    lab = Lab(first, connected(other))
     other.vanish()
     lab.turns(PATIENCE_S, lambda: bool(lab.events("actuator_lost")))
     lab.queue.take([Action(5, lab.clock.to_tick(time.perf_counter_ns() + 500 * MS), 100, 0)])
@@ -177,9 +176,7 @@ def test_a_second_instrument_that_is_gone_does_not_end_the_run(serve_one: Callab
 def test_a_lease_that_ran_out_is_taken_again(serve_one: Callable[..., Served], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pans.runtime.live.second_device.LEASE_MS", 100)
     other = serve_one("ideal", "tcp:127.0.0.1:0", 0, 0.0)
-    second = open_actuator(other.url, PULSER)
-    assert isinstance(second, SecondInstrument)
-    second.connect()
+    second = connected(other)
     until = time.perf_counter_ns() + round(PATIENCE_S * 1e9)
     while other.device.state is not DeviceState.SAFE and time.perf_counter_ns() < until:
         time.sleep(0.01)  # the host is away

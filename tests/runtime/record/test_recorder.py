@@ -44,6 +44,13 @@ def write_recording(path: Path, decisions: int = 5, bundle: bytes = b"") -> str:
         return recorder.close({"accuracy": 0.75})
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A recording of five decisions."""
+    write_recording(tmp_path / "a.pansrec")
+    return tmp_path / "a.pansrec"
+
+
 def facts(recording: Recording) -> tuple[int, bool]:
     return recording.n_decisions, recording.complete
 
@@ -126,9 +133,7 @@ def test_any_flipped_byte_is_detected(tmp_path: Path) -> None:
                 read_recording(path)
 
 
-def test_a_cut_file_reads_up_to_the_last_whole_block(tmp_path: Path) -> None:
-    path = tmp_path / "a.pansrec"
-    write_recording(path)
+def test_a_cut_file_reads_up_to_the_last_whole_block(path: Path) -> None:
     data = path.read_bytes()
     whole = read_recording(path)
     ends = [block.end for block in whole.iter_blocks()]
@@ -148,9 +153,7 @@ def test_a_cut_file_reads_up_to_the_last_whole_block(tmp_path: Path) -> None:
         assert len(found.decisions()) == found.n_decisions
 
 
-def test_zeros_left_by_a_power_cut_are_a_cut(tmp_path: Path) -> None:
-    path = tmp_path / "a.pansrec"
-    write_recording(path)
+def test_zeros_left_by_a_power_cut_are_a_cut(path: Path) -> None:
     ends = [block.end for block in read_recording(path).iter_blocks()]
     path.write_bytes(path.read_bytes()[: ends[2]] + bytes(5000))
     found = read_recording(path)
@@ -158,9 +161,7 @@ def test_zeros_left_by_a_power_cut_are_a_cut(tmp_path: Path) -> None:
     assert (found.end_offset, found.size) == (ends[2], ends[2] + 5000)
 
 
-def test_moved_removed_and_doubled_blocks_are_detected(tmp_path: Path) -> None:
-    path = tmp_path / "a.pansrec"
-    write_recording(path)
+def test_moved_removed_and_doubled_blocks_are_detected(path: Path) -> None:
     data = path.read_bytes()
     ends = [16, *(block.end for block in read_recording(path).iter_blocks())]
     pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
@@ -175,9 +176,7 @@ def test_moved_removed_and_doubled_blocks_are_detected(tmp_path: Path) -> None:
         read_recording(path)
 
 
-def test_salvage_reads_what_stands_before_the_damage(tmp_path: Path) -> None:
-    path = tmp_path / "a.pansrec"
-    write_recording(path)
+def test_salvage_reads_what_stands_before_the_damage(path: Path) -> None:
     ends = [block.end for block in read_recording(path).iter_blocks()]
     data = bytearray(path.read_bytes())
     data[ends[-2] - 1] ^= 4
