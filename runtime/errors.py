@@ -14,6 +14,11 @@ A message says what, found, allowed and where; `remedy` is the next step. Damage
 measurements, not exceptions: they are counted, flagged and reported.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class PansError(Exception):
     """Base of all errors raised on purpose; `remedy` is one sentence that says what to do next ("" if nothing helps)."""
@@ -63,3 +68,19 @@ class TimingError(PansError):
     """The timing contract was broken and going on would be a lie."""
 
     exit_code = 4
+
+
+@contextmanager
+def as_usage_error() -> Iterator[None]:
+    """Turn a ValueError of numeric code into a UsageError of the same words, where what a user gave is at fault.
+
+    >>> with as_usage_error():
+    ...     raise ValueError("levels is 1, allowed: 2 to 65536")
+    Traceback (most recent call last):
+        ...
+    pans.runtime.errors.UsageError: levels is 1, allowed: 2 to 65536
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error

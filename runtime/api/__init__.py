@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from pans.runtime import SHIPPED
 from pans.runtime import __version__ as __version__
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
@@ -103,7 +103,8 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
         if found.size and (int(found.min()) < 0 or int(found.max()) >> bundle.n_features):
             raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
         found = word_means(found, bundle.n_features).astype(np.int64)
-    counts = checked_counts(found, shots, bundle.n_features)
+    with as_usage_error():
+        counts = checked_counts(found, shots, bundle.n_features)
     return verdicts_of(make_decider(bundle, shots=shots, backend=backend), counts, shots)
 
 

@@ -25,8 +25,8 @@ from pans.runtime.decide.kernels import float_run
 from pans.runtime.decide.mlp import ReferenceDecider, SparseDecider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.table import TableDecider
-from pans.runtime.decide.verdict import Decider
-from pans.runtime.errors import UsageError
+from pans.runtime.decide.verdict import Decider, checked_counts
+from pans.runtime.errors import UsageError, as_usage_error
 
 from .c import FLAGS, FREE_FLAGS, CLoops, c_loops
 from .rows import (
@@ -110,6 +110,8 @@ def _inputs(bundle: Bundle, path: Path | None, n: int) -> tuple[NDArray[np.int64
         labels = data["labels"].astype(np.int64) if "labels" in data else None
     if counts.ndim != 2 or counts.shape[1] != bundle.n_features:
         raise UsageError(f"{path}: counts are {counts.shape}, allowed: (n, {bundle.n_features})")
+    with as_usage_error():
+        counts = checked_counts(counts, shots, bundle.n_features)
     return counts, shots, labels
 
 

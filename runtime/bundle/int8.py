@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
-
 from .layers import Layer
 
 WEIGHT_MAX = 127
@@ -50,10 +48,10 @@ class Int8Head:
 def quantise_head(layers: tuple[Layer, ...], calibration: NDArray[np.floating[Any]] | None = None) -> Int8Head:
     """Quantise a head whose hidden layers are rectified; `calibration` is click means (n, d_f) of typical objects.
 
-    Without it, hidden ranges are taken from independent clicks that are as likely as not. UsageError for another kind of chain.
+    Without it, hidden ranges are taken from independent clicks that are as likely as not. ValueError for another kind of chain.
     """
     if any(not layer.relu for layer in layers[:-1]) or layers[-1].relu:
-        raise UsageError("only heads with rectified hidden layers and a plain last one can be quantised")
+        raise ValueError("only heads with rectified hidden layers and a plain last one can be quantised")
     ranges = _hidden_ranges(layers, calibration)
     weights, affine = [], []
     before = np.ones(layers[0].weights.shape[0])
@@ -68,7 +66,7 @@ def quantise_head(layers: tuple[Layer, ...], calibration: NDArray[np.floating[An
     sizes = np.array([layers[0].weights.shape[0], *(layer.weights.shape[1] for layer in layers)], np.int64)
     head = Int8Head(sizes, np.concatenate(weights), np.concatenate(affine, axis=1).astype(np.float32))
     if not np.isfinite(head.affine).all():
-        raise UsageError("the head's weights are not finite, or too large for eight bits")
+        raise ValueError("the head's weights are not finite, or too large for eight bits")
     return head
 
 

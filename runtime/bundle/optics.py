@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
 from pans.runtime.ranges import Range
 
 from .incident import LIGHTS, OPTICS, incident_field, incident_intensity
@@ -41,10 +40,10 @@ class Analyser:
     exposure_us: float
 
     def photoelectrons(self, images: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return photoelectrons per exposure, float64 (n, d_f), of images uint8 (n, height, width); UsageError if they do not fit."""
+        """Return photoelectrons per exposure, float64 (n, d_f), of images uint8 (n, height, width); ValueError if they do not fit."""
         n_pixels = self.matrix.shape[1]
         if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1] * images.shape[2] != n_pixels:
-            raise UsageError(f"images are {images.dtype} {images.shape}, the sensor sees uint8 of {n_pixels} pixels")
+            raise ValueError(f"images are {images.dtype} {images.shape}, the sensor sees uint8 of {n_pixels} pixels")
         wide = self.matrix.T.astype(np.complex128 if np.iscomplexobj(self.matrix) else np.float64)
         out = np.empty((len(images), len(self.matrix)))
         for start in range(0, len(images), _AT_ONCE):

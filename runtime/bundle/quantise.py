@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.errors import UsageError
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuantisedPatterns:
@@ -39,18 +37,18 @@ def quantise_patterns(patterns: ArrayLike, levels: int, top: float | None = None
     """
     wanted = np.asarray(patterns)
     if wanted.ndim != 2 or wanted.size == 0 or not np.issubdtype(wanted.dtype, np.floating):
-        raise UsageError(f"patterns are {wanted.dtype} {wanted.shape}, allowed: floats (d_f, pixels)")
+        raise ValueError(f"patterns are {wanted.dtype} {wanted.shape}, allowed: floats (d_f, pixels)")
     if not 2 <= levels <= 65536:
-        raise UsageError(f"levels is {levels}, allowed: 2 to 65536")
+        raise ValueError(f"levels is {levels}, allowed: 2 to 65536")
     wanted = wanted.astype(np.float64)
     bad = ~np.isfinite(wanted) | (wanted < 0)
     if bad.any():
         row, column = (int(n) for n in np.argwhere(bad)[0])
         value = wanted[row, column]
-        raise UsageError(f"pattern {row} has {value} at pixel {column}, allowed: finite photons, 0 or more")
+        raise ValueError(f"pattern {row} has {value} at pixel {column}, allowed: finite photons, 0 or more")
     scale = (float(wanted.max()) if top is None else float(top)) / (levels - 1)
     if not 0 < scale < np.inf:
-        raise UsageError("no pattern has any light, allowed: at least one pixel above 0")
+        raise ValueError("no pattern has any light, allowed: at least one pixel above 0")
     rounded = np.clip(np.rint(wanted / scale), 0, levels - 1)
     change = rounded * scale - wanted
     return QuantisedPatterns(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
-from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 
 from .run import profile_of
@@ -58,7 +58,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     model, guess = count_model(profile, exposure_us), profile_level(profile, exposure_us)
     first = design_run(profile, LADDER, guess, FIRST_STAGE_SHARE * args.seconds, args.seed)
     core, _ = _measure(args.device, profile, first)
-    found = fit_light(joined_counts(counts_of(core, first, profile)), model).level
+    with as_usage_error():
+        found = fit_light(joined_counts(counts_of(core, first, profile)), model).level
     if found.value <= 0 or not math.isfinite(found.value):
         raise UsageError(
             "no exposure with light clicked" if found.value <= 0 else "every exposure with light clicked",
@@ -66,7 +67,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         )
     second = design_run(profile, TELLING, found.value, (1 - FIRST_STAGE_SHARE) * args.seconds, args.seed + 1)
     core, facts = _measure(args.device, profile, second)
-    values = calibration_values(counts_of(core, second, profile), model, second, profile)
+    with as_usage_error():
+        values = calibration_values(counts_of(core, second, profile), model, second, profile)
     values |= {"command": shlex.join(["pans", *sys.argv[1:]]), "seed": args.seed, "device": facts}
     sha256 = save_calibration(args.out, values)
     payload = {

@@ -23,7 +23,7 @@ from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, emit
 from pans.runtime.container import read_file
 from pans.runtime.core.plan import exposure_us
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.report.file_facts import file_facts
 from pans.runtime.report.verify import FileVerdict, verify_file, verify_folder
@@ -152,7 +152,8 @@ def _bundle(args: argparse.Namespace) -> int:
     profile = load_profile(args.profile) if args.profile else None
     levels = profile.projector.levels if profile else DEFAULT_LEVELS if args.levels is None else args.levels
     patterns, provenance = _inputs(args, profile)
-    quantised = quantise_patterns(patterns, levels)
+    with as_usage_error():
+        quantised = quantise_patterns(patterns, levels)
     bundle = make_bundle(
         name=args.name or args.out.stem,
         task=args.task,

@@ -91,16 +91,16 @@ class TableDecider(CountTable):
     def decide_words(self, words: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return the labels (n,), dtype of `labels`, of uint16, uint32 or uint64 click words (n,), written to `out` if given."""
         if words.dtype not in (np.uint16, np.uint32, np.uint64) or words.ndim != 1:
-            raise UsageError(f"click words are {words.dtype} {words.shape}, allowed: uint16, uint32 or uint64 (n,)")
+            raise ValueError(f"click words are {words.dtype} {words.shape}, allowed: uint16, uint32 or uint64 (n,)")
         result = np.empty(len(words), dtype=self.labels.dtype) if out is None else out
         if result.shape != words.shape or result.dtype != self.labels.dtype:
             allowed = f"{self.labels.dtype} {words.shape}"
-            raise UsageError(f"out is {result.dtype} {result.shape}, allowed: {allowed}")
+            raise ValueError(f"out is {result.dtype} {result.shape}, allowed: {allowed}")
         from .kernels import label_words  # numba is loaded only for those who have words in bulk
 
         bad = label_words(self.labels, words, result)
         if bad >= 0:
-            raise UsageError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
+            raise ValueError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
         return result
 
     def _check(self, shots: int) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle, golden_violation
-from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.errors import DamagedFileError
 
 _CHUNK_ROWS = 65536
 
@@ -107,14 +107,14 @@ def choice_of(decider: Decider) -> Mapping[str, Any]:
 
 
 def checked_counts(counts: ArrayLike, shots: int, n_features: int) -> NDArray[np.int64]:
-    """Return click counts as int64 (n, d_f); UsageError for another shape or type, or a count beyond 0..shots."""
+    """Return click counts as int64 (n, d_f); ValueError for another shape or type, or a count beyond 0..shots."""
     values = np.asarray(counts)
     if values.ndim != 2 or values.shape[1] != n_features or not np.issubdtype(values.dtype, np.integer):
-        raise UsageError(f"counts are {values.dtype} {values.shape}, allowed: integers (n, {n_features})")
+        raise ValueError(f"counts are {values.dtype} {values.shape}, allowed: integers (n, {n_features})")
     if shots < 1:
-        raise UsageError(f"shots is {shots}, allowed: 1 or more")
+        raise ValueError(f"shots is {shots}, allowed: 1 or more")
     if values.size and (int(values.min()) < 0 or int(values.max()) > shots):
-        raise UsageError(f"counts run from {values.min()} to {values.max()}, allowed: 0 to {shots}")
+        raise ValueError(f"counts run from {values.min()} to {values.max()}, allowed: 0 to {shots}")
     return values.astype(np.int64)
 
 

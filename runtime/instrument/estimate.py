@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import UsageError
 from pans.runtime.intervals import CHI2_95, chi2_quantile, chi2_tail
 
 from .click_law import ClickLaw, survival_coefficients
@@ -121,13 +120,13 @@ def log_likelihood(counts: Counts, model: CountModel, level: float, dark: float)
 def fit_light(counts: Counts, model: CountModel) -> LightFit:
     """Return the photon level and the dark rate that make `counts` most likely, with their 95 % intervals.
 
-    UsageError without lit exposures. All silent: the level is 0 and `high` bounds it; all clicked: the level is inf and `low`
+    ValueError without lit exposures. All silent: the level is 0 and `high` bounds it; all clicked: the level is inf and `low`
     bounds it.
     """
     counts = _merged(counts)
     lit = counts.drive > 0
     if not counts.exposures[lit].sum():
-        raise UsageError("no exposure with light: nothing to estimate a photon level from")
+        raise ValueError("no exposure with light: nothing to estimate a photon level from")
     top = SATURATED / float(counts.drive[lit].min())
     fit = _Profile(counts, model, top)
     level, dark, best = fit.maximum()

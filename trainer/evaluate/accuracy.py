@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
+from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
 from pans.runtime.instrument.profile import Profile
@@ -72,7 +73,8 @@ def light_of(
     if dark is not None:
         law = ClickLaw(dark, law.read_noise_e, law.threshold_e)
     if bundle.analyser is not None:
-        light = bundle.analyser.photoelectrons(images) * eta
+        with as_usage_error():
+            light = bundle.analyser.photoelectrons(images) * eta
         return Light(light, click_probability(law, light), law, 0.0)
     patterns = bundle.patterns() * eta
     light = np.empty((len(images), bundle.n_features))

@@ -24,7 +24,7 @@ from pans.runtime.bundle.layers import read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_bundle, word_means, write_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.errors import PansError
+from pans.runtime.errors import PansError, as_usage_error
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
@@ -79,7 +79,8 @@ def export(
     graph, dead = head_onnx(head, click_mean)
     picture_shape = head.image_shape if isinstance(head, Decoders) else None
     layers = None if picture_shape else read_layers(graph, len(click_mean), len(about.classes))
-    int8 = None if layers is None else quantise_head(layers)
+    with as_usage_error():
+        int8 = None if layers is None else quantise_head(layers)
     bundle = make_bundle(
         name=about.name,
         task=about.task,

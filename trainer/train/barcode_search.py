@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import quantise_patterns
+from pans.runtime.errors import as_usage_error
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import Law, click_probability, word_probabilities
@@ -161,9 +162,9 @@ def solve(options: Options, profile: Profile) -> Trained:
     encoder = ActiveIllumination(options.features, N_BARS, (low, high), random)
     with torch.no_grad():
         encoder.weight.copy_(best.patterns.sqrt())
-    shown = quantise_patterns(
-        best.patterns.numpy(), profile.projector.levels, min(high, max(low, float(best.patterns.max())))
-    )
+    top = min(high, max(low, float(best.patterns.max())))
+    with as_usage_error():
+        shown = quantise_patterns(best.patterns.numpy(), profile.projector.levels, top)
     strings, labels = (torch.from_numpy(part) for part in all_strings())
     p = click_probability(strings.double() @ torch.from_numpy(shown.patterns()).T, law)
     head = new_head(options, 2, (1, N_BARS), random)

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
+from pans.runtime.errors import as_usage_error
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
@@ -267,7 +268,8 @@ class Run:
             self.encoder.lower_top()
             with torch.no_grad():
                 floats = (self.encoder.weight**2).cpu().numpy().copy()
-            quantised = quantise_patterns(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
+            with as_usage_error():
+                quantised = quantise_patterns(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
         p, shape = self.probabilities(0, len(self.data.labels)), self.data.picture_shape
         fit_head(
             self.head,

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from pans.runtime.bundle.quantise import quantise_patterns
-from pans.runtime.errors import UsageError
 
 RNG = np.random.default_rng(0)
 
@@ -42,12 +41,12 @@ def test_brighter_pixels_are_clipped_to_the_top():
 
 def test_quantising_refuses_what_is_not_light() -> None:
     for bad in (np.array([[1.0, -1e-9]]), np.array([[np.nan, 1.0]]), np.array([[np.inf, 1.0]])):
-        with pytest.raises(UsageError, match="allowed: finite photons"):
+        with pytest.raises(ValueError, match="allowed: finite photons"):
             quantise_patterns(bad, 4)
-    with pytest.raises(UsageError, match="no pattern has any light"):
+    with pytest.raises(ValueError, match="no pattern has any light"):
         quantise_patterns(np.zeros((2, 2)), 4)
     for bad in (np.ones((2, 2), dtype=int), np.ones(3)):
-        with pytest.raises(UsageError, match="floats"):
+        with pytest.raises(ValueError, match="floats"):
             quantise_patterns(bad, 4)
 
 

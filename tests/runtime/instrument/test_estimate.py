@@ -95,7 +95,7 @@ def test_no_clicks_and_all_clicks_are_bounded_on_one_side() -> None:
     mpmath.mp.dps = 30
     low = -mpmath.log(1 - mpmath.exp(-mpmath.mpf(CHI2_95) / 1000)) / 100
     assert full.level.low == pytest.approx(float(low), rel=1e-3)
-    with pytest.raises(UsageError, match="no exposure with light"):
+    with pytest.raises(ValueError, match="no exposure with light"):
         fit_light(counts_of([0.0], [3], [100]), PLAIN)
 
 
