@@ -67,6 +67,18 @@ def test_the_tables_of_the_results_are_those_of_their_json(name):
     assert "\n| " not in by_hand  # no table that no JSON stands behind
 
 
+def test_the_papers_rows_are_all_there_and_plausible():
+    assert [len(rows) for rows in tables.ACTIVE.values()] == [7, 6]
+    for row in (row for rows in tables.ACTIVE.values() for row in rows):
+        assert 0 < row.clicks < row.features
+        assert list(row.experiment) == sorted(row.experiment, key=lambda value: round(value / 2))  # K helps, to a point
+        assert row.simulation[0] < row.simulation[3]
+    for table in tables.PASSIVE.values():
+        assert all(len(row.values) == len(table.dark) for row in table.rows)
+        assert all(list(row.values) == sorted(row.values, reverse=True) for row in table.rows)  # dark counts hurt
+        assert all(0 < row.clicks < row.features for row in table.rows)
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [([3, 1.2, 18.1, [1.0, 2.0, 3.0, 4.0]], "4 columns of 4"), ([3, 1.2, 18.1, *[[1.0, 2.0]] * 4], "4 columns of 4")],

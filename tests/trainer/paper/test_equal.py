@@ -9,8 +9,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.trainer.options import Options
-from pans.trainer.paper import equal, information, passive, swept
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.options import Options, check_options
+from pans.trainer.paper import equal, information, swept
 from pans.trainer.paper.page import Asked
 from pans.trainer.paper.passive_recipes import basis_of, recipe
 from pans.trainer.paper.tables import UNPRINTED
@@ -136,21 +137,6 @@ def test_information_of_frames_and_words_stands_at_the_same_photons(tmp_path, mo
     assert (tmp_path / "i.png").stat().st_size > 5000
 
 
-def test_tasks_without_printed_figures_have_none_beside_ours():
-    figures = {
-        "features": 2,
-        "dark": 0.01,
-        "value": 81.0,
-        "first_200": 80.0,
-        "spread_trials": 0.3,
-        "error_objects": 0.5,
-        "clicks": 0.9,
-    }
-    figures |= {"photons": 3.0, "illumination": 0.0, "cpu_seconds": 30.0}
-    (table,) = passive.passive_tables("nebula", [figures])
-    assert table.lines()[-1] == "| 2 | 0.01 | - | 81.00 | - | 80.00 | 0.30 | 0.50 | - | 0.90 | 3.0 | 0 | 0.5 |"
-
-
 def test_only_scenes_with_a_bright_background_start_in_a_basis():
     task = columns(200, 12, 2, light="field")
     row = UNPRINTED["nebula"].rows[0]
@@ -158,3 +144,14 @@ def test_only_scenes_with_a_bright_background_start_in_a_basis():
     assert basis_of("nebula", task, options).shape[0] == 144
     assert basis_of("mmf-mnist", task, options) is None
     assert basis_of("nebula", task, dataclasses.replace(options, conserving=True)) is None
+
+
+def test_more_photons_get_more_patterns_where_ten_would_saturate():
+    options = {photons: equal.recipe("cells-3", photons) for photons in equal.PHOTONS}
+    assert options[3.0].features == equal.FEATURES
+    assert options[3.0].estimator == "exact"
+    for photons in (10.0, 25.0):
+        assert options[photons].features > equal.FEATURES
+        assert options[photons].estimator in ("local", "ste")  # too many words to enumerate
+        check_options(options[photons], load_profile("ideal"))
+    assert all(option.photons < photons and option.clicks is None for photons, option in options.items())
