@@ -50,8 +50,11 @@ def label_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[Any]) ->
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-def]
-    """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of the matrix at the start of weights."""
-    columns = _U(width)
+    """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of the matrix at the start of weights.
+
+    float32, or exact in int32 from int8 weights: `kind` keeps the sums as narrow as `out` is.
+    """
+    columns, kind = _U(width), out.dtype.type
     for r in range(0, n_rows, STEP):
         f0, f1, f2, f3, f4, f5, f6, f7 = f[r], f[r + 1], f[r + 2], f[r + 3], f[r + 4], f[r + 5], f[r + 6], f[r + 7]
         a0, a1 = _U(rows[r]) * columns, _U(rows[r + 1]) * columns
@@ -59,9 +62,10 @@ def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-
         a4, a5 = _U(rows[r + 4]) * columns, _U(rows[r + 5]) * columns
         a6, a7 = _U(rows[r + 6]) * columns, _U(rows[r + 7]) * columns
         for j in range(columns):
-            out[0, j] += (
-                (f0 * weights[a0 + j] + f1 * weights[a1 + j]) + (f2 * weights[a2 + j] + f3 * weights[a3 + j])
-            ) + ((f4 * weights[a4 + j] + f5 * weights[a5 + j]) + (f6 * weights[a6 + j] + f7 * weights[a7 + j]))
+            out[0, j] += kind(
+                ((f0 * weights[a0 + j] + f1 * weights[a1 + j]) + (f2 * weights[a2 + j] + f3 * weights[a3 + j]))
+                + ((f4 * weights[a4 + j] + f5 * weights[a5 + j]) + (f6 * weights[a6 + j] + f7 * weights[a7 + j]))
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -197,25 +201,6 @@ def float_run(counts, shots, meta, numbers, room, scores, labels, probabilities)
 
 
 @njit(cache=True, nogil=True)
-def _add_steps(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-def]
-    """out[0, j] += sum over r < n_rows (padded to STEP) of f[r] * row rows[r] of an int8 matrix; exact in int32."""
-    columns = _U(width)
-    for r in range(0, n_rows, STEP):
-        f0, f1, f2, f3, f4, f5, f6, f7 = f[r], f[r + 1], f[r + 2], f[r + 3], f[r + 4], f[r + 5], f[r + 6], f[r + 7]
-        a0, a1 = _U(rows[r]) * columns, _U(rows[r + 1]) * columns
-        a2, a3 = _U(rows[r + 2]) * columns, _U(rows[r + 3]) * columns
-        a4, a5 = _U(rows[r + 4]) * columns, _U(rows[r + 5]) * columns
-        a6, a7 = _U(rows[r + 6]) * columns, _U(rows[r + 7]) * columns
-        for j in range(columns):
-            out[0, j] += np.int32(
-                (f0 * weights[a0 + j] + f1 * weights[a1 + j])
-                + (f2 * weights[a2 + j] + f3 * weights[a3 + j])
-                + (f4 * weights[a4 + j] + f5 * weights[a5 + j])
-                + (f6 * weights[a6 + j] + f7 * weights[a7 + j])
-            )
-
-
-@njit(cache=True, nogil=True)
 def _dots_of_steps(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
     """out[k] = x . weights[start + k * n_in:][:n_in], x int16, weights int8; exact in int32."""
     for k in range(n_out):
@@ -248,7 +233,7 @@ def int8_scores(counts, i, shots, meta, numbers, room, scores):  # type: ignore[
         steps[r] = 0
     for j in range(width):
         work[0, j] = 0
-    _add_steps(weights, width, n_fired, rows, steps, work)
+    _add_rows(weights, width, n_fired, rows, steps, work)
     start, column, sums = n_features * width, 0, work[0]
     unit = np.float32(1) / np.float32(shots)
     for layer in range(1, n_layers):

@@ -26,7 +26,9 @@ def random_layers(sizes: list[int], seed: int = 0) -> tuple[Layer, ...]:
     )
 
 
-def onnx_chain(layers: tuple[Layer, ...], style: str = "gemm", float_data: bool = False) -> bytes:
+def onnx_chain(
+    layers: tuple[Layer, ...], style: str = "gemm", float_data: bool = False, batch: str | int = "n"
+) -> bytes:
     """`layers` as a model in one of the ways that exporters write them: gemm, transposed or matmul."""
     pytest.importorskip("onnx")
     from onnx import TensorProto, helper, numpy_helper
@@ -56,11 +58,16 @@ def onnx_chain(layers: tuple[Layer, ...], style: str = "gemm", float_data: bool 
             nodes.append(helper.make_node("Relu", [current], [f"hidden{number}"]))
             current = f"hidden{number}"
     n_in, n_out = layers[0].weights.shape[0], layers[-1].weights.shape[1]
-    source = helper.make_tensor_value_info("means", TensorProto.FLOAT, ["n", n_in])
-    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, ["n", n_out])
+    source = helper.make_tensor_value_info("means", TensorProto.FLOAT, [batch, n_in])
+    result = helper.make_tensor_value_info("scores", TensorProto.FLOAT, [batch, n_out])
     graph = helper.make_graph(nodes, "head", [source], [result], weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     return bytes(model.SerializeToString())
+
+
+def affine_head(weights: np.ndarray, bias: np.ndarray, batch: str | int = "n") -> bytes:
+    """A model of scores = means @ weights + bias, weights (d_f, classes)."""
+    return onnx_chain((Layer(weights.astype(np.float32), bias.astype(np.float32), False),), batch=batch)
 
 
 def head_bundle(layers: tuple[Layer, ...], **parts: Any) -> Bundle:

@@ -12,31 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from bundles import made_bundle
+from heads import affine_head
 
 from pans.runtime.bundle import format as bundle_format
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle, word_means, write_bundle
 from pans.runtime.errors import DamagedFileError, UsageError
-
-
-def affine_head(weights: np.ndarray, bias: np.ndarray, batch: Any = "n") -> bytes:
-    """An ONNX model of scores = means @ weights + bias; weights (d_f, classes)."""
-    onnx = pytest.importorskip("onnx")
-    from onnx import TensorProto, helper, numpy_helper
-
-    d_f, classes = weights.shape
-    graph = helper.make_graph(
-        [helper.make_node("Gemm", ["means", "w", "b"], ["scores"])],
-        "head",
-        [helper.make_tensor_value_info("means", TensorProto.FLOAT, [batch, d_f])],
-        [helper.make_tensor_value_info("scores", TensorProto.FLOAT, [batch, classes])],
-        [
-            numpy_helper.from_array(weights.astype(np.float32), "w"),
-            numpy_helper.from_array(bias.astype(np.float32), "b"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    onnx.checker.check_model(model)
-    return model.SerializeToString()
 
 
 def random_head(d_f: int, classes: int, seed: int = 1) -> tuple[bytes, np.ndarray, np.ndarray]:

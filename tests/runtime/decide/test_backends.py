@@ -14,6 +14,7 @@ import naive_decide as naive
 import numpy as np
 import pytest
 from bundles import made_bundle
+from heads import affine_head
 
 from pans.runtime.bundle.model import Bundle, word_means
 from pans.runtime.decide import names as backend_names_module
@@ -36,21 +37,6 @@ def tensor(name: str, shape: list[Any], kind: str = "FLOAT") -> Any:
     from onnx import TensorProto, helper
 
     return helper.make_tensor_value_info(name, getattr(TensorProto, kind), shape)
-
-
-def affine_head(weights: np.ndarray, bias: np.ndarray, batch: Any = "n") -> bytes:
-    pytest.importorskip("onnx")
-    from onnx import helper, numpy_helper
-
-    return onnx_model(
-        [helper.make_node("Gemm", ["means", "w", "b"], ["scores"])],
-        [tensor("means", [batch, weights.shape[0]])],
-        [tensor("scores", [batch, weights.shape[1]])],
-        [
-            numpy_helper.from_array(weights.astype(np.float32), "w"),
-            numpy_helper.from_array(bias.astype(np.float32), "b"),
-        ],
-    )
 
 
 def affine_bundle(d_f: int, classes: int, batch: Any = "n") -> tuple[Bundle, np.ndarray, np.ndarray]:
