@@ -1,1 +1,1 @@
-"""Hardware profiles as validated TOML, each figure with its source (`pans.runtime.profile` reads them)."""
+"""Hardware profiles as validated TOML, each figure with its source (`pans.runtime.instrument.profile` reads them)."""

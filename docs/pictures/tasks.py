@@ -14,8 +14,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.incident import incident_intensity
-from pans.trainer.tasks.generators import GENERATORS, generate
-from pans.trainer.tasks.registry import load_task
+from pans.trainer.tasks.generators import GENERATORS
+from pans.trainer.tasks.registry import draw_task, load_task
 
 PER_CLASS = 8
 DPI = 70
@@ -24,12 +24,12 @@ GREY_LEVELS = 32  # keeps the files small
 
 def picture_of(name: str, path: Path) -> None:
     """Write the picture of a drawn task: rows are classes, grey levels as they are (0 to 255, each image to its own peak)."""
-    drawn = generate(name, n_train=1, n_test=60)
+    drawn = draw_task(name, n_train=1, n_test=60)
     rows: list[tuple[str, NDArray[Any], NDArray[Any] | None]] = []
-    for label, title in enumerate(drawn.recipe.classes):
-        images = drawn.test_images[drawn.test_labels == label][:PER_CLASS]
-        rows.append((title, images, incident_intensity(images, drawn.recipe.light, "none").mean(axis=(1, 2))))
-    _write(rows, path, flat=drawn.recipe.image_shape[0] == 1)
+    for label, title in enumerate(drawn.classes):
+        images = drawn.test.images[drawn.test.labels == label][:PER_CLASS]
+        rows.append((title, images, incident_intensity(images, drawn.light, "none").mean(axis=(1, 2))))
+    _write(rows, path, flat=drawn.image_shape[0] == 1)
 
 
 def picture_of_fibre(path: Path, data_dir: Path) -> None:

@@ -1,6 +1,6 @@
 """Float patterns -> device levels: one linear scale for all patterns of a bundle, the error stated.
 
-Owns the rounding and nothing else: which patterns are good is the trainer's matter, whether a device can show them plan.py's.
+Owns the rounding and nothing else: which patterns are good is the trainer's matter, whether a device can show them core/plan.py's.
 """
 
 from __future__ import annotations

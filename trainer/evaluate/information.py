@@ -136,7 +136,7 @@ class PosteriorInformation:
 
 
 def posterior_information(log_joint: F64, labels: I64) -> PosteriorInformation:
-    """Return bounds from log P(readout, class) (n, classes), as `baseline_bayes.log_joint` gives, and the true labels (n,).
+    """Return bounds from log P(readout, class) (n, classes), as `baselines.bayes.log_joint` gives, and the true labels (n,).
 
     One half of the readouts chooses the temperature for the other half, so that the bound stays a bound.
     """

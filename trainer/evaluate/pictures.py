@@ -1,6 +1,6 @@
 """Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns.
 
-Owns which pictures there are and what is on them; the measuring is evaluate.py's. All are SIMULATED, and say so.
+Owns which pictures there are and what is on them; the measuring is accuracy.py's. All are SIMULATED, and say so.
 """
 
 from __future__ import annotations

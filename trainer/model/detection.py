@@ -45,7 +45,7 @@ Law = ClickLaw | Callable[[Tensor], Tensor]  # a user's own: photoelectrons (flo
 def click_probability(photoelectrons: Tensor, law: Law, slope: float = 1.0) -> Tensor:
     """Return p (same shape, dtype of the input) for `photoelectrons` per exposure; `slope` scales the light only.
 
-    For a `ClickLaw` the same as `pans.runtime.clicks.click_probability`, in float64 inside and differentiable; any other law
+    For a `ClickLaw` the same as `pans.runtime.instrument.click_law.click_probability`, in float64 inside and differentiable; any other law
     is called with the photoelectrons in float64.
     """
     if not isinstance(law, ClickLaw):

@@ -1,13 +1,12 @@
 """The tasks that are drawn, not read: their generators by name, what their grey levels mean, and what encoder suits them.
 
-Owns the list; never draws itself (each task has a module) and never reads a file. `generate` returns a
-`Drawn`: images uint8 (n, height, width), labels int64 (n,), for training and held out. Every generator here is OURS: the paper's
-images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows and measures them.
+Owns the list; never draws itself (each task has a module, and `draw_task` in registry.py calls it) and never reads a file. Every
+generator here is OURS: the paper's images for these tasks are not public in a form that can be reached. docs/reference/tasks.md shows
+and measures them.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.incident import Light
-from pans.runtime.errors import UsageError
 
 from . import barcode, cells, fiber, nebula, tissue, transient
 from .draw import Labels
@@ -42,26 +40,6 @@ class Recipe:
         return f"drawn by OUR generator {self.draw.__module__}, not the paper's images"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """The objects of one recipe and seed."""
-
-    recipe: Recipe
-    train_images: NDArray[np.uint8]
-    train_labels: Labels
-    test_images: NDArray[np.uint8]
-    test_labels: Labels
-
-    @property
-    def sha256(self) -> str:
-        """The SHA-256 of all images and labels (little-endian), hex."""
-        digest = hashlib.sha256()
-        for images, labels in ((self.train_images, self.train_labels), (self.test_images, self.test_labels)):
-            digest.update(np.ascontiguousarray(images).data)
-            digest.update(labels.astype("<i8").data)
-        return digest.hexdigest()
-
-
 _Kind = tuple[tuple[int, int], Light, str]  # height and width, what grey means, the encoder
 CELL: _Kind = ((cells.SIDE_PX, cells.SIDE_PX), "transmission", "active")
 BARS: _Kind = ((1, barcode.N_BARS), "transmission", "active")
@@ -83,18 +61,3 @@ GENERATORS: Mapping[str, Recipe] = {
     "nebula": Recipe("planetary or emission nebula", nebula.CLASSES, *INCOHERENT, 12_000, 2000, nebula.draw),
     "fiber": Recipe("is the end face of a fibre contaminated", fiber.CLASSES, *COHERENT, 12_000, 2000, fiber.draw),
 }
-
-
-def generate(name: str, seed: int = 0, n_train: int | None = None, n_test: int | None = None) -> Drawn:
-    """Return the objects of the drawn task `name`; UsageError for an unknown name, a negative seed or no objects.
-
-    The same seed gives the same objects, object by object, whatever the numbers asked for (default: the recipe's).
-    """
-    if name not in GENERATORS:
-        raise UsageError(f"no generator for the task {name!r}", remedy=f"there are {', '.join(GENERATORS)}")
-    if seed < 0:
-        raise UsageError(f"seed {seed} of the task {name}", remedy="0 or more")
-    recipe = GENERATORS[name]
-    train = recipe.draw(seed, "train", recipe.n_train if n_train is None else n_train)
-    test = recipe.draw(seed, "test", recipe.n_test if n_test is None else n_test)
-    return Drawn(recipe, *train, *test)

@@ -24,7 +24,7 @@ from pans.runtime.bundle.incident import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.images import read_class_folder, to_8_bits
 
-from .generators import GENERATORS, generate
+from .generators import GENERATORS
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
 
 FILE_MAX_BYTES = 1 << 30
@@ -165,12 +165,24 @@ def _checked_task(task: Task, name: str) -> Task:
 
 
 def draw_task(name: str, seed: int = 0, n_train: int | None = None, n_test: int | None = None) -> Task:
-    """Return a drawn task (see generators.py) with its recipe's or other numbers of objects; UsageError as `generate`."""
-    drawn = generate(name, seed, n_train, n_test)
-    recipe = drawn.recipe
-    train, test = Objects(drawn.train_images, drawn.train_labels), Objects(drawn.test_images, drawn.test_labels)
+    """Return a drawn task (see generators.py) with its recipe's or other numbers of objects.
+
+    The same seed gives the same objects, object by object, whatever the numbers asked for. UsageError for an unknown name or a
+    negative seed, ValueError for no objects.
+    """
+    if name not in GENERATORS:
+        raise UsageError(f"no generator for the task {name!r}", remedy=f"there are {', '.join(GENERATORS)}")
+    if seed < 0:
+        raise UsageError(f"seed {seed} of the task {name}", remedy="0 or more")
+    recipe = GENERATORS[name]
+    train = Objects(*recipe.draw(seed, "train", recipe.n_train if n_train is None else n_train))
+    test = Objects(*recipe.draw(seed, "test", recipe.n_test if n_test is None else n_test))
+    digest = hashlib.sha256()  # of all images and labels, little-endian
+    for part in (train, test):
+        digest.update(np.ascontiguousarray(part.images).data)
+        digest.update(part.labels.astype("<i8").data)
     source = f"{recipe.source}, seed {seed}"
-    return Task(name, recipe.classes, train, test, drawn.sha256, _SPLIT_OF_SEED, light=recipe.light, source=source)
+    return Task(name, recipe.classes, train, test, digest.hexdigest(), _SPLIT_OF_SEED, recipe.light, source=source)
 
 
 def _load_public(name: str, folder: Path) -> Task:
@@ -228,7 +240,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _load_folder(folder: Path) -> Task:
-    """One folder per class, images of one size inside (see runtime/grey.py)."""
+    """One folder per class, images of one size inside (see `pans.runtime.images`)."""
     pictures = read_class_folder(folder, IMAGES_MAX_BYTES)
     train, test = _split(folder, _objects(folder, pictures.images, pictures.labels))
     name = folder.resolve().name

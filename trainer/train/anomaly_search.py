@@ -1,7 +1,7 @@
 """An anomaly in a known scene, seen by few detectors: many coherent encoders at once, by the wrong decisions themselves.
 
 Owns the search for W where class 0 is the scene as it should be and class 1 shows what should not be there; never sees held-out
-objects. `search` returns what `train` would. It differs from train.py, which descends from one start at a time by a network's
+objects. `search` returns what `train` would. It differs from loop.py, which descends from one start at a time by a network's
 cross-entropy:
 
 - W is sought among the fields that class 1 has and class 0 lacks (field_basis.py), in `Options.restarts` encoders side by side;

@@ -1,6 +1,6 @@
 """Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
 
-Owns the schedule, the photon budget and the checkpoint; never writes a bundle (export.py) and never sees the held-out
+Owns the schedule, the photon budget and the checkpoint; never writes a bundle (the package export) and never sees the held-out
 objects. `train` returns a `Trained` whose patterns are already what the projector will show.
 
 Stages (one epoch is one pass over the training objects):

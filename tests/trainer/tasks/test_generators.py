@@ -6,7 +6,8 @@ from brightness import brightness_rows, decide_on_total, total_intensity
 
 from pans.runtime.errors import UsageError
 from pans.trainer.tasks.draw import CHUNK
-from pans.trainer.tasks.generators import GENERATORS, generate
+from pans.trainer.tasks.generators import GENERATORS
+from pans.trainer.tasks.registry import draw_task
 
 SCENES = [name for name in GENERATORS if name != "barcode"]
 
@@ -14,11 +15,11 @@ SCENES = [name for name in GENERATORS if name != "barcode"]
 @pytest.mark.parametrize("name", GENERATORS)
 def test_a_task_is_what_its_recipe_says(name):
     recipe = GENERATORS[name]
-    drawn = generate(name, n_train=2 * CHUNK, n_test=CHUNK)
-    assert drawn.train_images.shape == (2 * CHUNK, *recipe.image_shape)
-    assert drawn.train_images.dtype == drawn.test_images.dtype == np.uint8
-    assert drawn.train_labels.dtype == np.int64
-    assert set(drawn.test_labels) == set(range(len(recipe.classes)))
+    drawn = draw_task(name, n_train=2 * CHUNK, n_test=CHUNK)
+    assert drawn.train.images.shape == (2 * CHUNK, *recipe.image_shape)
+    assert drawn.train.images.dtype == drawn.test.images.dtype == np.uint8
+    assert drawn.train.labels.dtype == np.int64
+    assert set(drawn.test.labels) == set(range(len(recipe.classes)))
     assert recipe.light in ("transmission", "field")
     assert "OUR generator" in recipe.source
     assert recipe.draw.__doc__ is not None
@@ -27,20 +28,20 @@ def test_a_task_is_what_its_recipe_says(name):
 
 @pytest.mark.parametrize("name", GENERATORS)
 def test_an_object_depends_on_its_seed_part_and_place_alone(name, monkeypatch):
-    few = generate(name, seed=5, n_train=7, n_test=7)
+    few = draw_task(name, seed=5, n_train=7, n_test=7)
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    more = generate(name, seed=5, n_train=CHUNK + 7, n_test=7)
-    assert np.array_equal(few.train_images, more.train_images[:7])
-    assert np.array_equal(few.train_labels, more.train_labels[:7])
-    assert np.array_equal(few.test_images, more.test_images)
-    assert not np.array_equal(few.train_images, few.test_images)
-    assert not np.array_equal(few.train_images, generate(name, seed=6, n_train=7, n_test=1).train_images)
+    more = draw_task(name, seed=5, n_train=CHUNK + 7, n_test=7)
+    assert np.array_equal(few.train.images, more.train.images[:7])
+    assert np.array_equal(few.train.labels, more.train.labels[:7])
+    assert np.array_equal(few.test.images, more.test.images)
+    assert not np.array_equal(few.train.images, few.test.images)
+    assert not np.array_equal(few.train.images, draw_task(name, seed=6, n_train=7, n_test=1).train.images)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_classes_have_equal_shares(name):
     recipe = GENERATORS[name]
-    labels = generate(name, n_train=3 * CHUNK, n_test=1).train_labels
+    labels = draw_task(name, n_train=3 * CHUNK, n_test=1).train.labels
     assert np.array_equal(np.bincount(labels), np.full(len(recipe.classes), 3 * CHUNK // len(recipe.classes)))
     assert (np.diff(labels) == 0).any(), "the classes come in a fixed turn"
 
@@ -48,10 +49,10 @@ def test_classes_have_equal_shares(name):
 @pytest.mark.parametrize("name", SCENES)
 def test_total_intensity_is_near_chance_for_every_pair_of_classes(name):
     n_classes = len(GENERATORS[name].classes)
-    drawn = generate(name, seed=1, n_train=480 * n_classes, n_test=480 * n_classes)
-    light = drawn.recipe.light
-    fit, held_out = total_intensity(drawn.train_images, light), total_intensity(drawn.test_images, light)
-    rows = brightness_rows(fit, drawn.train_labels, held_out, drawn.test_labels)
+    drawn = draw_task(name, seed=1, n_train=480 * n_classes, n_test=480 * n_classes)
+    light = drawn.light
+    fit, held_out = total_intensity(drawn.train.images, light), total_intensity(drawn.test.images, light)
+    rows = brightness_rows(fit, drawn.train.labels, held_out, drawn.test.labels)
     assert len(rows) == 1 + (n_classes * (n_classes - 1) // 2 if n_classes > 2 else 0)
     for row in rows:
         assert row.chance == pytest.approx(1 / len(row.classes))
@@ -60,7 +61,7 @@ def test_total_intensity_is_near_chance_for_every_pair_of_classes(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_images_use_the_grey_scale_and_hardly_saturate(name):
-    images = generate(name, n_train=2 * CHUNK, n_test=1).train_images
+    images = draw_task(name, n_train=2 * CHUNK, n_test=1).train.images
     assert (images == 255).mean() < 2e-3
     assert np.median(images.max(axis=(1, 2))) > 50
 
@@ -97,4 +98,4 @@ def test_total_intensity_squares_amplitudes():
 )
 def test_what_cannot_be_drawn_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        generate(**arguments)
+        draw_task(**arguments)

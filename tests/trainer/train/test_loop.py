@@ -68,7 +68,7 @@ def test_head_fits_a_joint_distribution_to_its_entropy():
 
 @pytest.mark.parametrize("estimator", ["ste", "exact", "local", "disarm", "loo"])
 def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
-    options = Options(**(vars_of(SMALL) | {"estimator": estimator}))
+    options = replace(SMALL, estimator=estimator)
     reports = []
     trained = train(task, PROFILE, options, report=reports.append)
     light = trained.quantised.patterns() @ object_transmission(PROFILE, task.test.images.reshape(-1, 36)).T
@@ -93,17 +93,17 @@ def test_another_seed_gives_other_patterns(task):
 @pytest.mark.parametrize(("name", "low", "high"), [("clicks", 0.8, 1.4), ("photons", 1.4, 3.0)])
 def test_budgets_pull_towards_their_target(task, name, low, high):
     free, held = [], []
-    options = vars_of(SMALL) | {"epochs": 40, "alpha": 0.0, "batch": 32}
-    train(task, PROFILE, Options(**options), report=free.append)
-    train(task, PROFILE, Options(**(options | {name: 1.1 if name == "clicks" else 2.2})), report=held.append)
+    options = replace(SMALL, epochs=40, alpha=0.0, batch=32)
+    train(task, PROFILE, options, report=free.append)
+    train(task, PROFILE, replace(options, **{name: 1.1 if name == "clicks" else 2.2}), report=held.append)
     assert getattr(free[-1], name) > 1.3 * getattr(held[-1], name)
     assert low < getattr(held[-1], name) < high
 
 
 def test_restarts_keep_the_best(task):
-    options = vars_of(SMALL) | {"epochs": 3}
-    single = [train(task, PROFILE, Options(**(options | {"seed": seed}))) for seed in (0, 1, 2)]
-    best = train(task, PROFILE, Options(**(options | {"restarts": 3})))
+    options = replace(SMALL, epochs=3)
+    single = [train(task, PROFILE, replace(options, seed=seed)) for seed in (0, 1, 2)]
+    best = train(task, PROFILE, replace(options, restarts=3))
     losses = [one.validation_loss for one in single]
     assert best.validation_losses == pytest.approx(losses)
     assert np.array_equal(best.quantised.pattern_levels, single[int(np.argmin(losses))].quantised.pattern_levels)
@@ -133,7 +133,7 @@ def test_with_several_shots_in_the_loss_restarts_are_judged_by_them_too(task):
 
 
 def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
-    options = Options(**(vars_of(SMALL) | {"epochs": 5, "restarts": 2}))
+    options = replace(SMALL, epochs=5, restarts=2)
     whole = train(task, PROFILE, options)
 
     def interrupt(report):
@@ -151,7 +151,7 @@ def test_an_interrupted_training_goes_on_to_the_same_result(task, tmp_path):
 
 
 def test_the_best_start_goes_on_and_an_interruption_changes_nothing(task, tmp_path):
-    options = Options(**(vars_of(SMALL) | {"epochs": 6, "starts": 3, "warm": 0.34, "polish": 0.5, "shots": 3}))
+    options = replace(SMALL, epochs=6, starts=3, warm=0.34, polish=0.5, shots=3)
     reports = []
     whole = train(task, PROFILE, options, report=reports.append)
     assert [(r.restart, r.epoch) for r in reports[:6]] == [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2)]
@@ -182,7 +182,7 @@ class Hostile:
 
 
 def test_a_checkpoint_holds_plain_values_and_never_runs_code(task, tmp_path):
-    options = Options(**(vars_of(SMALL) | {"epochs": 1}))
+    options = replace(SMALL, epochs=1)
     train(task, PROFILE, options, checkpoint=tmp_path / "state")
     assert torch.load(tmp_path / "state", weights_only=True)["identity"]["features"] == "4"
     torch.save({"identity": Hostile(tmp_path / "made")}, tmp_path / "state")
@@ -195,7 +195,7 @@ def test_a_checkpoint_holds_plain_values_and_never_runs_code(task, tmp_path):
 def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given):
     changed = {"encoder": encoder, "conserving": True, "input_photons": given, "alpha": 0.0, "dark": 0.01, "epochs": 15}
     reports = []
-    trained = train(task, PROFILE, Options(**(vars_of(SMALL) | changed)), report=reports.append)
+    trained = train(task, PROFILE, replace(SMALL, **changed), report=reports.append)
     assert trained.quantised is None
     assert trained.law.dark_per_exposure == 0.01
     shown = encoder_input(task, task.train, PROFILE, trained.options)
@@ -213,7 +213,7 @@ def test_passive_encoders_learn_bars_without_creating_light(task, encoder, given
 
 def test_pictures_can_be_given_back(task):
     pictures = replace(task, target="image")
-    options = Options(**(vars_of(SMALL) | {"estimator": "local", "encoder": "coherent", "epochs": 8, "alpha": 0.0}))
+    options = replace(SMALL, estimator="local", encoder="coherent", epochs=8, alpha=0.0)
     reports = []
     trained = train(pictures, PROFILE, options, report=reports.append)
     assert reports[-1].loss < reports[0].loss
@@ -267,7 +267,7 @@ def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_
 )
 def test_impossible_options_are_refused(changed, said):
     with pytest.raises(UsageError, match=said):
-        check_options(Options(**(vars_of(SMALL) | changed)), PROFILE)
+        check_options(replace(SMALL, **changed), PROFILE)
 
 
 def test_more_patterns_than_the_hardware_holds_are_refused():
@@ -283,20 +283,8 @@ def test_train_and_evaluate_commands_agree(tmp_path, capsys):
     images, labels = bars(400)
     np.savez(tmp_path / "bars.npz", images=images, labels=labels)
     out = str(tmp_path / "bars.pans")
-    words = [
-        "train",
-        str(tmp_path / "bars.npz"),
-        "--features",
-        "4",
-        "--epochs",
-        "6",
-        "--hidden",
-        "16",
-        "-o",
-        out,
-        "--json",
-    ]
-    assert main(words) == 0
+    shape = ["--features", "4", "--epochs", "6", "--hidden", "16"]
+    assert main(["train", str(tmp_path / "bars.npz"), *shape, "-o", out, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert {"bundle", "accuracy_mean", "clicks_mean", "photons_mean", "seconds"} <= set(said)
     assert said["score_difference"] <= 1e-5
@@ -355,10 +343,6 @@ def test_the_same_seed_gives_the_same_patterns_on_one_device(task, name):
     assert torch.equal(first.head.hidden.weight, second.head.hidden.weight)
     assert first.head.hidden.weight.device.type == "cpu"
     assert torch.get_default_device().type == "cpu"
-
-
-def vars_of(options):
-    return {name: getattr(options, name) for name in Options.__dataclass_fields__}
 
 
 @pytest.mark.data
