@@ -61,6 +61,17 @@ class Stream:
     open_end: bool = False  # the host has said that it does not know how this stream ended
 
 
+class DeviceBooks(NamedTuple):
+    """What the device has made in one session: exposures, how many of those it dropped, and whether the host knew the end."""
+
+    exposures: int
+    dropped: int
+    end_known: bool
+
+
+NO_BOOKS = DeviceBooks(0, 0, True)
+
+
 @dataclass(slots=True)
 class CheckCounts:
     """How much was checked: a check that saw nothing proves nothing."""
@@ -98,6 +109,7 @@ class Checker:
         self._gates: dict[tuple[int, int], Gate] = {}  # submitted: (session, command id)
         self._asked: dict[Gate, None] = {}
         self._executed: dict[Gate, None] = {}
+        self.books: dict[int, DeviceBooks] = {}  # by session
 
     def fail(self, text: str) -> None:
         """Keep one violation."""
@@ -115,6 +127,10 @@ class Checker:
         raw = message.bits if isinstance(message, ClickBlock) else message.words
         entry = Entry(message.exposure_index, len(raw), raw.tobytes(), message.object_index, dropped)
         stream.emitted_to = entry.first + entry.exposures
+        books = self.books.get(session, NO_BOOKS)
+        self.books[session] = books._replace(
+            exposures=stream.emitted_to, dropped=books.dropped + entry.exposures * dropped
+        )
         if stream.open_end:
             self.counts.blocks_lost_open_end += 1
             return
@@ -261,6 +277,7 @@ class Checker:
             if isinstance(event, StreamEndUnknown):
                 self.counts.blocks_lost_open_end += len(stream.entries)
                 stream.open_end = True
+                self.books[self._host_session] = self.books.get(self._host_session, NO_BOOKS)._replace(end_known=False)
                 stream.entries.clear()
         for decision in output.decisions:
             self._on_decision(stream, decision)

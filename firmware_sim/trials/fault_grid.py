@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -30,14 +31,16 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.wire.commands import Gate
 
 from . import Report, Trial, figures_text
 from .checkers import Checker, WatchedInstrument
+from .reconciliation import ObservedLink, reconcile
 
 SHOTS = 1
 GATE_EVERY = 32  # decisions
-CASES = ("none", *NAMES, "all")
+CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
 GRID_TIMES = {
     "stall": "600ms/1500ms",
@@ -46,6 +49,7 @@ GRID_TIMES = {
     "clock_step": "2ms/300ms",
     "reset": "0ms/2s",
 }
+HOST_STOP = "pause:1300ms/1301ms"  # longer than the lease of a second: the device goes dark, and the host comes back to it
 GRID_ALL = (
     "loss:0.003,flip:0.003,duplicate:0.003,truncate:0.003,reorder:0.003,drip:0.003,stall:600ms/2s,"
     "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"
@@ -87,6 +91,8 @@ def case_faults(case: str) -> str:
     """Return the fault text of a case of the grid."""
     if case == "none":
         return ""
+    if case == "host_stop":
+        return HOST_STOP
     return GRID_ALL if case == "all" else f"{case}:{GRID_TIMES[case]}" if case in GRID_TIMES else case
 
 
@@ -104,7 +110,7 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
 
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
-    link = VirtualLink(device, clock, f"grid:{case}")
+    link = ObservedLink(VirtualLink(device, clock, f"grid:{case}"))
     host = GridHost(checker, plan, frames)
     per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
     config = RunConfig(shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9)
@@ -112,9 +118,16 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
     core = Core(plan, make_decider(bundle, shots=SHOTS, backend="table"), SHOTS, config.n_cycles)
     recovery = Recovery.of(link, "", 30.0)
     observers = Observers(host.watch, host.start)
-    result = run_live(link, profile, bundle, plan, core, config, recovery=recovery, observers=observers)
-    checker.close()
-    host.finish(result.ended)
+    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
+    with TemporaryDirectory() as folder:
+        with Recorder(Path(folder) / "grid.pansrec", header) as recorder:
+            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
+            recorder.close({})
+        checker.close()
+        host.finish(result.ended)
+        recording = read_recording(Path(folder) / "grid.pansrec")
+        for disagreement in reconcile(link, checker.books, result, recording, bundle):
+            checker.fail(disagreement)
     return GridResult(
         case=case,
         seed=seed,
