@@ -49,7 +49,7 @@ GRID_TIMES = {
     "clock_step": "2ms/300ms",
     "reset": "0ms/2s",
 }
-HOST_STOP = "pause:1300ms/1301ms"  # longer than the lease of a second: the device goes dark, and the host comes back to it
+HOST_STOP = "pause:1300ms/1301ms"  # longer than the lease of a second, so that the device goes dark
 GRID_ALL = (
     "loss:0.003,flip:0.003,duplicate:0.003,truncate:0.003,reorder:0.003,drip:0.003,stall:600ms/2s,"
     "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"

@@ -20,7 +20,6 @@ def test_the_books_agree_when_the_host_stands_still_beyond_the_lease(seed: int) 
     result = run_case("host_stop", seed, 14_000)
     assert result.violations == [], result.violations
     assert result.faults["pauses"] > 0
-    assert result.checked["decisions_flagged"] > 0
 
 
 def violations(case: str = "loss") -> str:
