@@ -25,11 +25,11 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
-from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, same_options
+from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import plots
-from .page import Asked, Made, Row, Rows, Table, columns, kept, pages
+from .page import Asked, Made, Row, Rows, Table, columns, finished, kept, pages
 from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
 
 PROFILE = "ideal"
@@ -74,11 +74,7 @@ def row_files(cache: Path, name: str, features: int, seed: int = 0) -> tuple[Pat
 
 def finished_row(cache: Path, name: str, row: ActiveRow, seed: int = 0) -> dict[str, Any] | None:
     """Return the figures of a row that was trained by the present recipe from `seed`, or None."""
-    _, figures = row_files(cache, name, row.features, seed)
-    if not figures.is_file():
-        return None
-    found: dict[str, Any] = json.loads(figures.read_text())
-    return found if same_options(found["options"], replace(recipe(name, row), seed=seed)) else None
+    return finished(row_files(cache, name, row.features, seed)[1], replace(recipe(name, row), seed=seed))
 
 
 def row_with_seeds(asked: Asked, row: ActiveRow) -> Row | None:
@@ -135,10 +131,15 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
 def measure_row(bundle_path: Path, task: Task, profile: Profile) -> dict[str, Any]:
     """Return accuracy, clicks, photons and illumination at every number of shots, of the first 200 and of all test images."""
     bundle, _ = load_bundle(bundle_path)
-    measured: dict[str, Any] = {}
-    for part, objects in ((FIRST, _first(task.test, FIRST_OBJECTS)), ("all", task.test)):
-        measured[part] = {str(shots): asdict(_measured(bundle, profile, objects, shots)) for shots in SHOTS}
-    return measured
+    return {
+        part: {str(shots): asdict(_measured(bundle, profile, objects, shots)) for shots in SHOTS}
+        for part, objects in parts_of(task.test).items()
+    }
+
+
+def parts_of(test: Objects) -> dict[str, Objects]:
+    """Return the first test objects, which the paper takes, and all of them."""
+    return {FIRST: Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS]), "all": test}
 
 
 def direct_at(name: str, photons: float) -> dict[str, Any]:
@@ -176,10 +177,6 @@ def _measured(bundle: Bundle, profile: Profile, objects: Objects, shots: int) ->
     if outcomes <= EXACT_OUTCOMES_MAX and outcomes * len(objects) <= EXACT_OUTCOMES_MAX << 5:
         return evaluate_exactly(bundle, light, objects.labels, shots=shots)
     return evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=TRIALS[len(objects)], seed=1)
-
-
-def _first(objects: Objects, count: int) -> Objects:
-    return Objects(objects.images[:count], objects.labels[:count])
 
 
 # ---- the pages ----

@@ -28,11 +28,11 @@ from pans.trainer.baselines.common import measure as measure_frames
 from pans.trainer.baselines.common import run_trials
 from pans.trainer.baselines.direct import aware_cnn
 from pans.trainer.model.field_basis import principal_fields
-from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, same_options
+from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
 
-from .page import Asked, Made, Row, Rows, Table, columns, pages
+from .page import Asked, Made, Row, Rows, Table, columns, finished, pages
 from .passive import PROFILE, measure
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
 
@@ -97,12 +97,9 @@ def equal_page(asked: Asked) -> Made:
 
 
 def _finished(path: Path, name: str, way: str, photons: float) -> Row | None:
-    if not path.is_file():
-        return None
-    found: Row = json.loads(path.read_text())
     if way not in DIRECT:
-        wanted = (recipe if way == "PANS" else light_recipe)(name, photons)
-        return found if same_options(found["options"], wanted) else None
+        return finished(path, (recipe if way == "PANS" else light_recipe)(name, photons))
+    found: Row = json.loads(path.read_text()) if path.is_file() else {}
     return found if direct_recipe(name, way).items() <= found.items() else None
 
 

@@ -21,6 +21,7 @@ from typing import Any
 from pans.runtime.cli import say
 from pans.runtime.container import replace_file
 from pans.runtime.errors import UsageError
+from pans.trainer.options import Options, same_options
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
@@ -198,6 +199,14 @@ def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) 
     replace_file(path, text.encode())
     whole: Row = json.loads(text)
     return whole
+
+
+def finished(path: Path, options: Options) -> Row | None:
+    """Return the figures in `path` if they are of a training with `options`, or None."""
+    if not path.is_file():
+        return None
+    found: Row = json.loads(path.read_text(encoding="utf-8"))
+    return found if same_options(found["options"], options) else None
 
 
 def write_page(folder: Path, name: str, page: Page, made: Made) -> None:

@@ -27,7 +27,7 @@ from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, 
 from pans.trainer.export.writer import export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.ssim import ssim
-from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options, same_options
+from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks import barcode as task_barcode
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.anomaly_search import search
@@ -36,7 +36,7 @@ from pans.trainer.train.data import CHUNK, encoder_input
 from pans.trainer.train.loop import Trained, train
 
 from . import images, plots
-from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, pages
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, finished, pages
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
 from .tables import PASSIVE, UNPRINTED, PassiveRow, table_of
 
@@ -48,21 +48,14 @@ SPECKLE = ("mmf-mnist", "mmf-mnist-image")  # in the release's way: images that 
 
 def finished_cell(cache: Path, name: str, row: PassiveRow, dark: float, data_seed: int = 0) -> Row | None:
     """Return the figures of a model that was trained by the present recipe, or None."""
-    return _finished(_path(cache, name, row.features, dark, data_seed), recipe(name, row, dark))
+    return finished(_path(cache, name, row.features, dark, data_seed), recipe(name, row, dark))
 
 
 def other_draws(cache: Path, name: str, row: PassiveRow, dark: float) -> Rows:
     """Return the figures of the same recipe on other draws of the generator (`data_seed` above 0), in the order of their seeds."""
     paths = cache.glob(f"{_path(cache, name, row.features, dark).stem}-data*.json")
-    found = [figures for path in paths if (figures := _finished(path, recipe(name, row, dark))) is not None]
+    found = [figures for path in paths if (figures := finished(path, recipe(name, row, dark))) is not None]
     return sorted(found, key=lambda figures: figures["data_seed"])
-
-
-def _finished(path: Path, options: Options) -> Row | None:
-    if not path.is_file():
-        return None
-    found: Row = json.loads(path.read_text())
-    return found if same_options(found["options"], options) else None
 
 
 def _path(cache: Path, name: str, features: int, dark: float, data_seed: int = 0) -> Path:

@@ -28,7 +28,7 @@ from pans.trainer.evaluate.accuracy import (
 from pans.trainer.tasks.registry import Objects, load_task
 
 from . import images, plots
-from .active import PROFILE, TrainedRow, by_table, measured_on, trained_rows
+from .active import PROFILE, TrainedRow, by_table, measured_on, parts_of, trained_rows
 from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, pages
 from .tables import ACTIVE, FIRST, FIRST_OBJECTS
 
@@ -64,11 +64,6 @@ def measure_setting(bundle: Bundle, profile: Profile, test: Objects, sweep: str,
         lit = light_of(bundle, profile, objects.images, eta=eta, dark=dark)
         row[part] = asdict(_measured(bundle, lit, objects, int(setting) if sweep == "K" else 1))
     return row
-
-
-def parts_of(test: Objects) -> dict[str, Objects]:
-    """Return the first test objects, which the paper takes, and all of them."""
-    return {FIRST: Objects(test.images[:FIRST_OBJECTS], test.labels[:FIRST_OBJECTS]), "all": test}
 
 
 def enumerable(bundle: Bundle, objects: int) -> bool:

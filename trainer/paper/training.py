@@ -199,10 +199,7 @@ def time_page(asked: Asked) -> Made:
     for row in ACTIVE[TASK]:
         if row.features in (asked.rows or TIME_ROWS):
             path = asked.cache / f"time-{row.features}.json"
-            if not path.is_file():
-                made = _race(row, asked.data_dir, asked.report)
-                replace_file(path, json.dumps(made, indent=1).encode())
-            found.append(json.loads(path.read_text()))
+            found.append(_kept(path, partial(_race, row, asked.data_dir, asked.report), asked.report))
     return Made(found)
 
 
