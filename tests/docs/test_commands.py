@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import doctest
+import json
 import os
 import subprocess
 import sys
@@ -75,6 +76,12 @@ def test_every_command_and_every_option_is_on_the_page_of_commands() -> None:
                     f"{name}: {longest}"
                 )
     assert set(COMMANDS) <= set(sections)
+
+
+def test_every_key_of_a_summary_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
+    assert cli.main(["demo", "--pace", "fast", "--seconds", "1", "--out", str(tmp_path / "demo"), "--json"]) == 0
+    assert [key for key in json.loads(capsys.readouterr().out) if f"`{key}`" not in text] == []
 
 
 def runnable(page: Path) -> list[Block]:
