@@ -34,7 +34,7 @@ I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 F64 = npt.NDArray[np.float64]
 QUIET = 0.5  # of the expected dark rate: less often clicks only a dead channel
-MAX_WITNESSES = 64  # other channels that are compared, evenly spread
+MAX_COMPARED = 64  # other channels that are compared, evenly spread
 LEAST_CLICKED = (
     30  # objects in which a channel has clicked before it is judged by them: its share is then known to about a fifth
 )
@@ -42,7 +42,7 @@ LEAST_OBJECTS = 8  # in a row without a click
 LOOK_AGAIN = 1.25  # times the objects, where the others have changed
 # Of the others' changes, in squared standard errors, beyond which the scene is another. One change alone is chi-square with one degree
 # of freedom: 12.0 is passed with probability 5e-4. Their mean over d channels has standard deviation sqrt(2 / d): 1.6 lies 1.3 of them
-# above 1 for ten channels and 3.4 for MAX_WITNESSES. The test errs to the side of saying nothing: then the proof decides, later.
+# above 1 for ten channels and 3.4 for MAX_COMPARED. The test errs to the side of saying nothing: then the proof decides, later.
 MEAN_Z2_MAX, Z2_MAX = 1.6, 12.0
 RETURN_BLOCKS = 3  # with a click: the channel lives
 _NEVER = 1 << 62
@@ -76,11 +76,11 @@ class DeadChannelTest:
         )
         self._dark, self._limits = dark_low, self._proofs.copy()
         self._arl_objects = arl_objects
-        self._witnesses: I64 = np.unique(np.linspace(0, n - 1, min(n, MAX_WITNESSES)).round().astype(np.int64))
+        self._compared: I64 = np.unique(np.linspace(0, n - 1, min(n, MAX_COMPARED)).round().astype(np.int64))
         self._row: I64 = np.zeros(n, np.int64)  # of the object under way: 1 where a channel has clicked
         self._object, self._open = -1, False
         self._quiet: I64 = np.zeros(n, np.int64)  # objects since the one of the last click
-        self._then: I64 = np.zeros((n, len(self._witnesses)), np.int64)  # `clicked` of the witnesses at that one
+        self._then: I64 = np.zeros((n, len(self._compared)), np.int64)  # `clicked` of the compared channels at that one
         self._first: I64 = np.full(n, LEAST_OBJECTS, np.int64)  # objects of silence at which a channel is looked at
         self._due: I64 = self._first.copy()
         self._told: I64 = np.full(n, -1, np.int64)  # of the dead: `clicking` when they were told of
@@ -91,7 +91,7 @@ class DeadChannelTest:
         for words in (np.zeros((0, 1), np.uint8), np.frombuffer(b"", np.uint8).reshape(0, 1)):  # two types to numba
             note_silence(words, self.silent.copy(), self.clicking.copy(), self._proofs)
         spare = [np.zeros_like(self._row) for _ in range(5)]
-        note_object(spare[0], spare[1], spare[2], self._then.copy(), self._witnesses, spare[3], spare[4])
+        note_object(spare[0], spare[1], spare[2], self._then.copy(), self._compared, spare[3], spare[4])
 
     def take_exposures(self, words: U8) -> None:
         """Take the exposures of a block, lit or dark: words uint8 (n, bytes), bit c is channel c."""
@@ -120,7 +120,7 @@ class DeadChannelTest:
     def end_object(self) -> None:
         """The object under way has gone: what comes next is another."""
         if self._open:
-            due = note_object(self._row, self.clicked, self._quiet, self._then, self._witnesses, self._first, self._due)
+            due = note_object(self._row, self.clicked, self._quiet, self._then, self._compared, self._first, self._due)
             self.objects += 1
             self._any_due |= bool(due)
             self._row[:] = 0
@@ -169,15 +169,15 @@ class DeadChannelTest:
         return [Silence(channel, False, quiet, clicked / before)]
 
     def _others_as_before(self, channel: int, before: int, quiet: int) -> bool:
-        others = self._witnesses != channel
+        others = self._compared != channel
         if not others.any():
             return True  # one detector
         then = self._then[channel, others].astype(np.float64)
-        since = self.clicked[self._witnesses[others]] - then
+        since = self.clicked[self._compared[others]] - then
         share = (then + since) / (before + quiet)
         varies = (share > 0) & (share < 1)
         if not varies.any():
-            return False  # nothing else clicks, or all do: they bear no witness
+            return False  # nothing else clicks, or all do: they say nothing
         error2 = (share * (1 - share) * (1 / before + 1 / quiet))[varies]
         z2 = (since[varies] / quiet - then[varies] / before) ** 2 / error2
         return bool(z2.mean() <= MEAN_Z2_MAX and z2.max() <= Z2_MAX)
@@ -217,11 +217,11 @@ def note_silence(words, silent, clicking, limits):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True)
-def note_object(row, clicked, quiet, then, witnesses, first, due):  # type: ignore[no-untyped-def]
+def note_object(row, clicked, quiet, then, compared, first, due):  # type: ignore[no-untyped-def]
     """Add one object, row int64 (channels,) of 0 or 1, to the shares; return whether a channel is due to be looked at.
 
-    clicked and quiet int64 (channels,), then int64 (channels, witnesses), updated: at a click of channel c, then[c] are the
-    witnesses' totals with this object.
+    clicked and quiet int64 (channels,), then int64 (channels, compared), updated: at a click of channel c, then[c] are the
+    totals of the channels `compared` with this object.
     """
     found = False
     for channel in range(row.size):
@@ -230,8 +230,8 @@ def note_object(row, clicked, quiet, then, witnesses, first, due):  # type: igno
         if row[channel]:
             quiet[channel] = 0
             due[channel] = first[channel]
-            for w in range(witnesses.size):
-                then[channel, w] = clicked[witnesses[w]]
+            for w in range(compared.size):
+                then[channel, w] = clicked[compared[w]]
         else:
             quiet[channel] += 1
             found |= quiet[channel] >= due[channel]

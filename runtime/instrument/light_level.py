@@ -1,6 +1,6 @@
 """Is the light still what was calibrated? Change detection on the mean number of clicks per decision.
 
-Owns sums of clicks and their comparison with the run's own beginning, which the calibration vouches for; never knows the
+Owns sums of clicks and their comparison with the run's own beginning, whose level the calibration states; never knows the
 objects, so that a change of their mixture looks like a change of light, and the words say so. Nothing is decided by it.
 
 How much of a change of efficiency is seen in the clicks depends on the patterns: nearly all of it where an exposure clicks

@@ -77,7 +77,7 @@ def _shares(facts: Facts) -> dict[str, int]:
     overslept = _clipped(facts.spans, OVERSLEPT, begin, end)
     asleep = _length(overslept) - _shared(overslept, collecting)
     own = max(total - _covered(facts.spans, begin, end), 0)
-    # What the hypervisor took explains work that took long; a loop that woke up on time was not robbed.
+    # What the hypervisor took explains work that took long; a loop that woke up on time lost nothing by it.
     stolen = min(facts.steal_ns, own + shares["inference"] + shares["disk"])
     starved = min(max(facts.run_delay_ns, asleep, stolen), total)
     # A thread that waits for a processor does so in the middle of something: that time is the machine's, not the activity's.

@@ -1,4 +1,4 @@
-"""The compiled spin of cpu.py: a loop that does nothing, politely, until a number in memory changes.
+"""The compiled spin of cpu.py: a loop that waits, with the processor's hint for such loops, until a number in memory changes.
 
 Owns one instruction; keeps no state and allocates nothing.
 """

@@ -2,7 +2,7 @@
 
 Owns the collecting, in bounded memory: nothing here looks at a photon, and a thread of its own reads the system (counters.py). Never
 judges (attribution.py). `Evidence.facts` returns what is known about one stretch of time. Spans shorter than `floor_ns` are not kept:
-none of them alone can make anything late. In virtual time the machine is no witness and is not asked.
+none of them alone can make anything late. In virtual time the counters of the machine mean nothing and are not read.
 """
 
 from __future__ import annotations

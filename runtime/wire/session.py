@@ -16,6 +16,7 @@ from . import messages as wire
 from .messages import AckStatus, Frame, MessageType, Opcode
 
 NS_PER_MS = 1_000_000
+# The times and limits of the conversation are those of docs/reference/protocol.md, sections 2, 4 and 9.
 UNKNOWN_STATUS = 0xFFFF
 HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
