@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pans.trainer.model.heads import CHANNELS, EPSILON, ConvHead, DecoderHead, Heads, MlpHead, PictureHead
 
-OPSET = 17
+OPSET = 17  # the newest of IR version 8
 IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
 DEAD_VARIANCE = 1e-7  # a pattern that clicks, or stays dark, less than once in ten million times says nothing
 

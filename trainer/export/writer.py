@@ -35,8 +35,8 @@ from pans.trainer.train.loop import Trained
 from .int8_onnx import int8_onnx
 from .onnx_heads import DEAD_VARIANCE, head_onnx
 
-ALL_WORDS_MAX = 12
-RANDOM_WORDS = 10_000
+ALL_WORDS_MAX = 12  # 4096 words; a bundle holds a table up to here too
+RANDOM_WORDS = 10_000  # beyond it
 COMPARED_OBJECTS = 200
 
 F64 = NDArray[np.float64]

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 
 from pans.trainer.options import PICTURE_HEADS, Options
 
-KERNEL = 15
+KERNEL = 15  # the paper, comparison of back ends
 CHANNELS = (32, 64)
-MOMENTUM = 0.05
-EPSILON = 1e-5
+MOMENTUM = 0.05  # torch's own is 0.1
+EPSILON = 1e-5  # that of torch.nn.BatchNorm1d
 
 Shape = tuple[int, int]  # height and width of a picture
 
