@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
-from pans.trainer.paper import PAGES, Asked, Made, Page, page_of, write_page
+from pans.trainer.paper import PAGES, Asked, Made, Page, page_of, rewrite_page, write_page
+from pans.trainer.paper.page import Rows, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
@@ -30,7 +31,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="another draw of a drawn task (default 0); the page of draw 0 names the finished cells of others beside its own",
     )
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
-    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help="write NAME.md, NAME.json and the pictures there")
+    words = "write NAME.json, the pictures and the tables of NAME.md there; what NAME.md says around the tables stays"
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help=words)
+    words = "measure nothing: write the tables of NAME.md in the folder of -o again from NAME.json"
+    parser.add_argument("--from-json", action="store_true", help=words)
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
     parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
@@ -44,12 +48,15 @@ def _run(args: argparse.Namespace) -> int:
         import torch
     except ModuleNotFoundError as error:
         raise UsageError("training needs the package torch, which is not installed", remedy=NEEDS_TORCH) from error
+    names = tuple(PAGES) if args.name == "all" else (args.name,)
+    if args.from_json:
+        return _rewrite(names, args)
     torch.set_num_threads(args.threads)
     args.cache = args.cache.expanduser()
     args.cache.mkdir(parents=True, exist_ok=True)
     results: dict[str, tuple[Page, Made]] = {}
     try:
-        for name in PAGES if args.name == "all" else (args.name,):
+        for name in names:
             results[name] = _measured(name, args)
             if args.out:
                 write_page(args.out, name, *results[name])
@@ -57,8 +64,22 @@ def _run(args: argparse.Namespace) -> int:
         say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
         return EXIT_INTERRUPTED
     rows = [row for _, made in results.values() for row in made.rows]
-    text = "\n\n".join(page.whole(name, made) for name, (page, made) in results.items())
-    emit(args, {"rows": rows, "simulated": True}, text)
+    blocks = [page.around(page.block(name, made.rows, made.pictures)) for name, (page, made) in results.items()]
+    emit(args, {"rows": rows, "simulated": True}, "\n\n".join(blocks))
+    return EXIT_FINE
+
+
+def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
+    if args.out is None:
+        raise UsageError("--from-json reads and writes a folder", remedy="name it by -o DIR")
+    rows: Rows = []
+    for name in names:
+        path = args.out / f"{name}.json"
+        if not path.is_file():
+            raise UsageError(f"{path} is not there", remedy=f"measure it: pans reproduce {name} -o {args.out}")
+        rewrite_page(args.out, name, page_of(name))
+        rows += read_rows(args.out, name)
+    emit(args, {"rows": rows, "simulated": True}, "\n".join(f"{args.out / name}.md" for name in names))
     return EXIT_FINE
 
 

@@ -2,16 +2,18 @@
 
 Owns the pages of `pans reproduce`: for each a recipe, what measures its rows, the tables made of them, and its pictures. A page's rows
 are plain JSON, its tables are made of them alone, and the prose about them is written by hand in docs/results. Finished parts of long
-work lie in a cache folder. The package never touches a device, and what it needs of a public data set is read by the package `tasks`.
+work lie in a cache folder. Never touches a device; data sets are read by the package `tasks`.
+
+A new page is a function that measures, one that makes tables, a title and columns in pages.toml, and a line in `PAGES`.
 """
 
 from __future__ import annotations
 
 import importlib
 
-from .page import Asked, Made, Page, write_page
+from .page import Asked, Made, Page, rewrite_page, write_page
 
-__all__ = ["PAGES", "Asked", "Made", "Page", "page_of", "write_page"]
+__all__ = ["PAGES", "Asked", "Made", "Page", "page_of", "rewrite_page", "write_page"]
 
 PAGES = {  # name of a page: the module whose PAGES holds it, imported when it is asked for
     **dict.fromkeys(("fashion-mnist", "mnist"), "active"),

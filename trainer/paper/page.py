@@ -138,9 +138,9 @@ class Page:
             lines += [f"![{self.captions.get(ending, ending.lstrip('-') or name)}]({name}{ending}.png)", ""]
         return "\n".join([BEGIN, "", *lines, END])
 
-    def whole(self, name: str, made: Made) -> str:
+    def around(self, block: str) -> str:
         """Return the page as it is where nothing was written by hand."""
-        return f"# {self.title}\n\n{self.block(name, made.rows, made.pictures)}\n"
+        return f"# {self.title}\n\n{block}\n"
 
 
 def at(row: Row, path: str) -> Any:
@@ -214,7 +214,7 @@ def write_page(folder: Path, name: str, page: Page, made: Made) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"rows": made.rows, "simulated": True}, indent=1) + "\n"
     replace_file(folder / f"{name}.json", text.encode())
-    _write_tables(folder, name, page, made)
+    _put(folder / f"{name}.md", page, page.block(name, made.rows, made.pictures))
     for ending, draw in made.pictures.items():
         try:
             draw(folder / f"{name}{ending}.png")
@@ -222,20 +222,27 @@ def write_page(folder: Path, name: str, page: Page, made: Made) -> None:
             raise UsageError("the picture needs matplotlib, which is not installed", remedy=NEEDS_PLOT) from error
 
 
-def read_page(folder: Path, name: str, page: Page) -> str:
+def read_rows(folder: Path, name: str) -> Rows:
+    """Return the rows of NAME.json."""
+    rows: Rows = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["rows"]
+    return rows
+
+
+def generated(folder: Path, name: str, page: Page) -> str:
     """Return the generated part of NAME.md as NAME.json and the pictures beside it give it."""
-    rows = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["rows"]
     there = [ending for ending in page.captions if (folder / f"{name}{ending}.png").is_file()]
-    return page.block(name, rows, there)
+    return page.block(name, read_rows(folder, name), there)
 
 
-def _write_tables(folder: Path, name: str, page: Page, made: Made) -> None:
-    path = folder / f"{name}.md"
+def rewrite_page(folder: Path, name: str, page: Page) -> None:
+    """Write the generated part of NAME.md again, from NAME.json."""
+    _put(folder / f"{name}.md", page, generated(folder, name, page))
+
+
+def _put(path: Path, page: Page, block: str) -> None:
+    """Write `block` between the markers of a page, or a new page where there is none."""
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
-    if begin and end:
-        whole = before + page.block(name, made.rows, made.pictures) + after
-    else:
-        whole = page.whole(name, made)
+    whole = before + block + after if begin and end else page.around(block)
     replace_file(path, whole.encode())

@@ -1,8 +1,10 @@
 """`pans reproduce`: what it lists, collects and refuses."""
 
 import json
+import shutil
 
 import pytest
+from tree import ROOT
 
 pytest.importorskip("torch", reason="needs the train extra")
 
@@ -26,3 +28,18 @@ def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
 def test_what_is_not_drawn_has_no_other_draws(name, capsys):
     assert main(["reproduce", name, "--data-seed", "7"]) == 2
     assert f"{name} is not drawn" in capsys.readouterr().err
+
+
+def test_tables_are_written_again_from_their_json(tmp_path, capsys):
+    words = ["reproduce", "time", "--from-json", "--json"]
+    assert main(words) == 2
+    assert "name it by -o DIR" in capsys.readouterr().err
+    assert main([*words, "-o", str(tmp_path)]) == 2
+    assert "measure it: pans reproduce time" in capsys.readouterr().err
+    for ending in ("json", "md"):
+        shutil.copy(ROOT / "docs" / "results" / f"time.{ending}", tmp_path)
+    whole = (tmp_path / "time.md").read_text()
+    (tmp_path / "time.md").write_text(whole.replace("| 10 | 74.31 |", "| 10 | 99.99 |"))
+    assert main([*words, "-o", str(tmp_path)]) == 0
+    assert [row["features"] for row in json.loads(capsys.readouterr().out)["rows"]] == [10, 32]
+    assert (tmp_path / "time.md").read_text() == whole

@@ -12,7 +12,7 @@ pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.evaluate.picture_samples import SAMPLES, Samples
 from pans.trainer.paper import PAGES, Made, Page, images, page_of, tables, write_page
-from pans.trainer.paper.page import BEGIN, END, Column, Table, columns, read_page
+from pans.trainer.paper.page import BEGIN, END, Column, Table, columns, generated
 
 RESULTS = ROOT / "docs" / "results"
 COLUMNS = (Column("d_f", "{features}"), Column("all", "{all.accuracy:.2f %}"), Column("clicks", "{clicks:.1f}"))
@@ -38,7 +38,7 @@ def test_what_is_written_by_hand_stays(tmp_path):
     assert (before, after) == ("# By hand\n\nBefore.\n\n", "\n\nAfter.\n")
     assert "old" not in middle
     assert TABLE in middle
-    assert read_page(tmp_path, "name", PAGE) == f"{BEGIN}{middle}{END}"
+    assert generated(tmp_path, "name", PAGE) == f"{BEGIN}{middle}{END}"
 
 
 def test_columns_are_put_together_from_groups():
@@ -59,7 +59,7 @@ def test_every_page_is_found_under_its_name():
 @pytest.mark.parametrize("name", PAGES)
 def test_the_tables_of_the_results_are_those_of_their_json(name):
     text = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
-    assert read_page(RESULTS, name, page_of(name)) in text
+    assert generated(RESULTS, name, page_of(name)) in text
     title, *rest = text.split("\n")
     assert title == f"# {page_of(name).title}"
     by_hand = "\n".join(rest).partition(BEGIN)[0] + text.partition(END)[2]
