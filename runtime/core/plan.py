@@ -97,12 +97,6 @@ class Plan:
             return self.block_exposures * -(-self.n_patterns // 8)
         return self.block_exposures * 17 // 8
 
-    @property
-    def last_light_ticks(self) -> int:
-        """End of the last exposure with light within the cycle: from here the decision deadline counts."""
-        lit = np.flatnonzero(self.slot_pattern != DARK_PATTERN)
-        return int(self.slot_offset_ticks[lit[-1]]) + self.exposure_ticks
-
 
 @dataclass(frozen=True, slots=True)
 class Ticks:

@@ -116,11 +116,6 @@ def parse_calibration(data: bytes, where: str) -> Calibration:
     return Calibration(where, hashlib.sha256(data).hexdigest(), values)
 
 
-def is_calibration(start: bytes) -> bool:
-    """Whether a file that begins like this is meant as a calibration."""
-    return start.lstrip()[:1] == b"{"
-
-
 def find_objections(calibration: Calibration, profile: Profile, serial: str | None) -> None:
     """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another
     device.

@@ -118,10 +118,6 @@ class ChannelWatch:
         self.exposures += len(words)
         return self._alarms(int(n))
 
-    def update_bits(self, bits: npt.NDArray[np.uint8]) -> list[Alarm]:
-        """Take dark exposures of one detector, uint8 (n,) of 0 or 1: `update_words` for one channel."""
-        return self.update_words(bits.reshape(-1, 1))
-
     def update(self, dark_exposures: int, clicks_per_channel: I64, first_exposure: int | None = None) -> list[Alarm]:
         """Take a block of which only the counts are known: clicks int64 (n,) in `dark_exposures` exposures.
 

@@ -63,7 +63,6 @@ def check_sound(plan: Plan, profile: Profile, n_patterns: int, shots: int, dark_
     exposures_per_display = plan.shots_per_cycle if plan.mode == "sequential" else 1
     assert plan.dark_slots_per_cycle == dark_displays * exposures_per_display
     assert not dark[-1]
-    assert plan.last_light_ticks == offsets[-1] + plan.exposure_ticks
     assert all(len(block) <= MAX_BLOCK_EXPOSURES for block in blocks_of(plan))
     for array in (offsets, plan.slot_pattern, plan.slot_shot):
         assert not array.flags.writeable

@@ -150,12 +150,14 @@ def test_counters_beyond_32_bits() -> None:
 
 def test_no_clicks_and_all_clicks() -> None:
     silent = ChannelWatch(1, np.array([0.05]), WatchSettings(arl_exposures=1e4))
-    assert {alarm.test for alarm in silent.update_bits(np.zeros(2000, np.uint8))} == {"fall"}
+    assert {alarm.test for alarm in silent.update_words(np.zeros((2000, 1), np.uint8))} == {"fall"}
     loud = ChannelWatch(1, np.array([0.05]), WatchSettings(arl_exposures=1e4))
-    assert {alarm.test for alarm in loud.update_bits(np.ones(200, np.uint8))} == {"rise", "burst"}
+    assert {alarm.test for alarm in loud.update_words(np.ones((200, 1), np.uint8))} == {"rise", "burst"}
     ideal = ChannelWatch(1, np.array([0.0]))
-    assert ideal.update_bits(np.zeros(100_000, np.uint8)) == []
-    assert ideal.update_bits(np.ones(1, np.uint8))[0].exposure == 100_001  # a detector that never clicks has clicked
+    assert ideal.update_words(np.zeros((100_000, 1), np.uint8)) == []
+    assert (
+        ideal.update_words(np.ones((1, 1), np.uint8))[0].exposure == 100_001
+    )  # a detector that never clicks has clicked
 
 
 def test_blocks_that_cannot_be_are_refused() -> None:
