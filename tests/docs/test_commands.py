@@ -10,8 +10,10 @@ import argparse
 import doctest
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,6 +84,20 @@ def test_every_key_of_a_summary_is_explained(tmp_path: Path, capsys: pytest.Capt
     text = (ROOT / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
     assert cli.main(["demo", "--pace", "fast", "--seconds", "1", "--out", str(tmp_path / "demo"), "--json"]) == 0
     assert [key for key in json.loads(capsys.readouterr().out) if f"`{key}`" not in text] == []
+
+
+def test_every_package_has_a_page_of_its_interface() -> None:
+    layers = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pans"]["layers"]
+    names = {f"{top}.{package}".rstrip(".") for top, packages in layers.items() for package in packages}
+    shown = {page.read_text(encoding="utf-8").strip() for page in (ROOT / "docs/reference/api").glob("*.md")}
+    hidden = {name for name in names if name.endswith(".commands") or name.startswith("hw_profiles")}
+    assert {f"::: pans.{name}" for name in names - hidden} <= shown
+
+
+@pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "CONTRIBUTING.md"])
+def test_links_into_the_documents_lead_somewhere(name: str) -> None:
+    found = re.findall(r"\]\((?!http)([^)#]+)[^)]*\)", (ROOT / name).read_text(encoding="utf-8"))
+    assert [link for link in found if not (ROOT / link).exists()] == []
 
 
 def runnable(page: Path) -> list[Block]:
