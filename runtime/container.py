@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import stat
 import struct
 import zlib
 from collections.abc import Collection, Mapping
@@ -109,14 +110,38 @@ def _refuse_constant(name: str) -> Any:
     raise ValueError(f"{name} is not a JSON number")
 
 
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a regular file for reading; UsageError for anything else: a folder, a FIFO or a device would hang or never end."""
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except (OSError, ValueError) as error:
+        reason = error.strerror or error if isinstance(error, OSError) else error
+        raise UsageError(f"{path}: cannot be read: {reason}") from error
+    mode = os.fstat(handle).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(handle)
+        kind = next((words for test, words in _NO_FILES.items() if test(mode)), "no file")
+        raise UsageError(f"{path}: cannot be read: it is {kind}, allowed: a regular file")
+    return os.fdopen(handle, "rb")
+
+
+_NO_FILES = {
+    stat.S_ISDIR: "a folder",
+    stat.S_ISFIFO: "a pipe",
+    stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device",
+    stat.S_ISSOCK: "a socket",
+}
+
+
 def read_file(path: str | Path, max_bytes: int = FILE_MAX_BYTES) -> bytes:
     """Return the bytes of `path`; UsageError when it is not there, DamagedFileError above `max_bytes`."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > max_bytes:
                 raise DamagedFileError(f"{path}: {size} bytes, allowed at most {max_bytes}")
-            data = file.read(max_bytes + 1)  # a file that grows meanwhile, or a pipe, has no honest size
+            data = file.read(max_bytes + 1)  # the file may grow meanwhile
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > max_bytes:

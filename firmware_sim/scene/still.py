@@ -25,6 +25,7 @@ MAX_OBJECTS = 1 << 17
 MAX_PIXELS = 1 << 22
 MAX_SCENE_BYTES = 1 << 29
 MAX_CLASSES = 4096
+NAME_MAX = 250  # of a file: longer ones no system has
 UNKNOWN_LABEL = -1
 SCENE_FOLDER = Path(__file__).parent.parent / "scenes"
 TARGETS = ("uniform", "dark")
@@ -79,10 +80,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
     if name in TARGETS:
         return _target(name)
     shipped = SCENE_FOLDER / f"{name}.npz"
-    if "/" not in name and "\\" not in name and shipped.is_file():
+    if "/" not in name and "\\" not in name and _is_file(shipped):
         return _read_scene(shipped, name)
     path = Path(name)
-    if not path.is_file():
+    if not _is_file(path):
         raise ConfigError(
             f"scene {name!r}: neither a shipped scene nor a file",
             remedy=f"shipped are {', '.join(shipped_scenes() + shipped_scene_files())}; or name a .npz or .toml file",
@@ -93,13 +94,13 @@ def load_scene(name_or_path: str | Path) -> Scene:
 def load_images(name: str, base: Path) -> Scene:
     """Load pictures for a scene: a target, a shipped scene, or a `.npz` file or a folder of class folders relative to `base`."""
     path = base / name
-    if path.is_dir():
+    if len(path.name) < NAME_MAX and path.is_dir():
         try:
             pictures = read_class_folder(path, MAX_SCENE_BYTES)
         except PansError as error:
             raise ConfigError(error.message, remedy=error.remedy) from error
         return scene_from_arrays(str(path), pictures.images, pictures.labels, pictures.classes)
-    return load_scene(path if path.is_file() else name)
+    return load_scene(path if _is_file(path) else name)
 
 
 def scene_from_arrays(name: str, images: NDArray[Any], labels: NDArray[Any] | None, classes: tuple[str, ...]) -> Scene:
@@ -115,6 +116,10 @@ def scene_from_arrays(name: str, images: NDArray[Any], labels: NDArray[Any] | No
     if lowest < UNKNOWN_LABEL or highest >= top:
         raise ConfigError(f"{name}: labels must lie in -1..{top - 1}, found {lowest}..{highest}")
     return Scene(name, _frozen(images), _frozen(labels.astype(np.int16)), classes)
+
+
+def _is_file(path: Path) -> bool:
+    return len(path.name) < NAME_MAX and path.is_file()
 
 
 def _target(name: str) -> Scene:

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import random
 import struct
+import tempfile
 import time
 import traceback
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
 from pans.firmware_sim.options import option
+from pans.firmware_sim.resealed import fuzz_files
 from pans.firmware_sim.scene.still import Scene, load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.cli import say
@@ -340,12 +343,15 @@ class Settings:
 
     bytes: int = option(100_000_000, "random bytes (default 100 million)")
     frames: int = option(1_000_000, "structured frames (default one million)")
+    files: int = option(0, "instead of those: changed files with right checksums, verified and used")
     seed: int = option(1, "the first seed (default 1)")
     parts: int = option(20, "seeds that the work is divided over (default 20)")
 
 
 def run(settings: Settings) -> Report:
     """Send it, seed by seed, until something is found."""
+    if settings.files:
+        return _run_files(settings)
     started = time.perf_counter()
     total: dict[str, float] = {}
     parts = settings.parts
@@ -359,6 +365,21 @@ def run(settings: Settings) -> Report:
             return Report({**total, "failed_seed": seed}, False, "")
     figures = {**total, "failed_seed": None, "seconds": time.perf_counter() - started}
     return Report(figures, True, figures_text(figures))
+
+
+def _run_files(settings: Settings) -> Report:
+    started, figures = time.perf_counter(), {"files": 0, "files_accepted": 0, "slowest_answer_s": 0.0}
+    for seed in range(settings.seed, settings.seed + settings.parts):
+        with tempfile.TemporaryDirectory() as folder:
+            counts, failure = fuzz_files(seed, -(-settings.files // settings.parts), Path(folder))
+        figures["files"] += counts.files
+        figures["files_accepted"] += counts.accepted.total()
+        figures["slowest_answer_s"] = max(figures["slowest_answer_s"], counts.slowest_answer_s)
+        if failure:
+            say(failure)
+            return Report({**figures, "failed_seed": seed}, False, "")
+    told = {**figures, "failed_seed": None, "seconds": time.perf_counter() - started}
+    return Report(told, True, figures_text(told))
 
 
 TRIAL = Trial(Settings, run)

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pans.runtime import SHIPPED
+from pans.runtime.container import read_file
 from pans.runtime.core.plan import Plan
-from pans.runtime.errors import ConfigError, UsageError
+from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.instrument.checked_toml import position_of, read_toml
 from pans.runtime.intervals import binomial_tail
 
 KINDS = ("cells", "tape")
+MAX_FILE_BYTES = 1 << 16
 MAX_RING = 1 << 18  # frames that are remembered
 BACKGROUND_BITS = 16  # after the point, of the clicks that the background gives per frame
 QUIET_QUANTILE = 0.05  # the empty field may exceed the release level that often
@@ -93,10 +95,11 @@ def read_flow(name: str) -> FlowSettings:
     """Read settings from a TOML file, or from the shipped `cells` or `tape`; ConfigError with file:line:col for what is wrong."""
     path = SHIPPED / f"flow-{name}.toml" if name in KINDS else Path(name)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_file(path, MAX_FILE_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
+    except (PansError, UnicodeDecodeError) as error:
+        reason = error.message if isinstance(error, PansError) else error
         raise ConfigError(
-            f"{path}: the flow settings cannot be read: {error}", remedy="--flow cells, tape or a file"
+            f"{path}: the flow settings cannot be read: {reason}", remedy="--flow cells, tape or a file"
         ) from error
     tables, positions = read_toml(text, str(path))
     known = {one.name: one for one in fields(FlowSettings)}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
 from pans.runtime.errors import ConfigError, DamagedFileError
+from pans.runtime.ranges import Range, number_text
 
 from .click_law import ClickLaw, log_no_click
 from .profile import Profile
@@ -30,8 +30,21 @@ VERSION = 1
 MAX_BYTES = 4 << 20
 MAX_AGE_H = 24.0
 F64 = NDArray[np.float64]
-_NUMBERS = ("photons_per_level", "dark_per_exposure", "exposure_us", "peak_photoelectrons_hz")
-_INTERVALS = ("photons_per_level_ci", "dark_ci", "peak_photoelectrons_hz_ci")
+CHANNELS_MAX = 4096
+CHANCE = Range(0, 1)
+COUNTS = Range(0, 1 << 53, whole=True)  # float64 holds them exactly
+# What a calibration file may say; docs/reference/formats.md states the same. Light and dark counts in photoelectrons per exposure.
+_NUMBERS = {
+    "photons_per_level": Range(0, 1e9),
+    "dark_per_exposure": Range(0, 1e6),
+    "exposure_us": Range(1e-3, 1e9),
+    "peak_photoelectrons_hz": Range(0, 1e18),
+}
+_INTERVALS = {  # whose ends have the range of that number, and whether both ends must be there
+    "photons_per_level_ci": ("photons_per_level", False),
+    "dark_ci": ("dark_per_exposure", False),
+    "peak_photoelectrons_hz_ci": ("peak_photoelectrons_hz", False),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +124,10 @@ def parse_calibration(data: bytes, where: str) -> Calibration:
         raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
     try:
         _check(values)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DamagedFileError(f"{where}: {error}") from error
+    except KeyError as error:
+        raise DamagedFileError(f"{where}: {error.args[0]} is missing", remedy="calibrate again") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DamagedFileError(f"{where}: {error}", remedy="calibrate again") from error
     return Calibration(where, hashlib.sha256(data).hexdigest(), values)
 
 
@@ -154,28 +169,49 @@ def now_utc() -> datetime:
 
 
 def _check(values: Mapping[str, Any]) -> None:
-    for key in _NUMBERS:
-        _demand(_possible(values[key]), f"{key} is {ascii(values[key])[:40]}, allowed: a finite number of at least 0")
-    for key in _INTERVALS:
-        low, high = values[key]
-        fine = _possible(low) and (high is None or (_possible(high) and high >= low))
-        _demand(fine, f"{key} is {ascii(values[key])[:60]}, allowed: low and high, or null where nothing bounds it")
-    _demand(values["exposure_us"] > 0, "exposure_us is 0, allowed: above 0")
-    made = datetime.fromisoformat(values["made_utc"])
-    _demand(made.utcoffset() is not None, f"made_utc {values['made_utc']} has no time zone")
+    for key, allowed in _NUMBERS.items():
+        allowed.checked(values[key], key)
+    for key, (of, bounded) in _INTERVALS.items():
+        _check_interval(values[key], _NUMBERS[of], bounded, key)
+    made = values["made_utc"]
+    _demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
+    _demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
     rows = values["channels"]
-    _demand(isinstance(rows, list) and len(rows) > 0, "channels is empty, allowed: one row for each channel")
+    fits = isinstance(rows, list) and 0 < len(rows) <= CHANNELS_MAX
+    _demand(fits, f"channels is no list of 1 to {CHANNELS_MAX}, allowed: one row for each channel")
     for number, row in enumerate(rows):
-        low, high = row["dark_ci"]
-        fine = 0 <= low <= row["dark_per_exposure"] <= high <= 1
-        _demand(fine, f"channel {number}: dark rate {row['dark_per_exposure']} not within {row['dark_ci']} of 0 to 1")
+        _demand(isinstance(row, dict), f"channel {number} is {number_text(row)}, allowed: an object")
+        _check_channel(row, f"channel {number}")
     for key, part in (("name", "profile"), ("sha256", "profile")):
+        _demand(isinstance(values[part], dict), f"{part} holds no facts")
         _demand(isinstance(values[part][key], str), f"{part}.{key} is no text")
     _demand(isinstance(values["device"], dict), "device holds no facts")
+    serial = values["device"].get("serial")
+    _demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
 
 
-def _possible(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+def _check_channel(row: Mapping[str, Any], what: str) -> None:
+    for key in ("dark_clicks", "dark_exposures"):
+        COUNTS.checked(row[key], f"{what}: {key}")
+    clicks, exposures = row["dark_clicks"], row["dark_exposures"]
+    _demand(clicks <= exposures, f"{what}: {clicks} dark clicks in {exposures} exposures, allowed: at most one in each")
+    CHANCE.checked(row["dark_per_exposure"], f"{what}: dark_per_exposure")
+    _check_interval(row["dark_ci"], CHANCE, True, f"{what}: dark_ci")
+    low, high = row["dark_ci"]
+    fine = low <= row["dark_per_exposure"] <= high
+    _demand(fine, f"{what}: dark rate {row['dark_per_exposure']} not within {low} to {high}")
+
+
+def _check_interval(value: Any, allowed: Range, bounded: bool, what: str) -> None:
+    """Check [low, high], both in the range; high may be null where `bounded` is false."""
+    pair = isinstance(value, list) and len(value) == 2
+    _demand(pair, f"{what} is {number_text(value)}, allowed: low and high, or null where nothing bounds it")
+    low, high = value
+    allowed.checked(low, f"{what}, low")
+    if high is None and not bounded:
+        return
+    allowed.checked(high, f"{what}, high")
+    _demand(low <= high, f"{what} goes from {low} to {high}, allowed: low before high")
 
 
 def _demand(holds: bool, message: str) -> None:

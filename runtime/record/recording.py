@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle, parse_bundle
-from pans.runtime.container import FILE_PROLOGUE, MIB, Block, check_prologue, parse_json_object, read_block
+from pans.runtime.container import (
+    FILE_PROLOGUE,
+    MIB,
+    Block,
+    check_prologue,
+    open_regular,
+    parse_json_object,
+    read_block,
+)
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
@@ -44,7 +52,7 @@ class Recording:
 
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
-        with open(self.path, "rb") as file:
+        with open_regular(self.path) as file:
             _, chain = _start(file, str(self.path))
             for block in _blocks(file, chain, str(self.path)):
                 if not wanted or block.kind in wanted:
@@ -186,7 +194,7 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
     """
     scan, damage = _Scan(Path(path)), ""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             try:
                 scan.version, chain = _start(file, str(path))

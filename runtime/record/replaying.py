@@ -25,14 +25,20 @@ from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
 from pans.runtime.flow.matching import PassageFigures
+from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
+from .format import Kind
 from .log import LogEncoder
 from .parts import place_of
 from .pictures import PictureLog
 from .recording import Recording
-from .sent_plan import sent_plan
+from .sent_plan import TICK_HZ, sent_plan
+
+SHOTS = Range(1, 1 << 20, whole=True)
+# what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
+_NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
 
 
 class Replayed(NamedTuple):
@@ -63,17 +69,7 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
 
 def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, int, str]:
     """Drive a core through `recording`; return it, the number of decisions and the SHA-256 of their log."""
-    config = recording.header.get("config", {})
-    try:
-        chunks, arms = sent_plan(recording)
-        plan = plan_from_chunks(chunks, int(config["tick_hz"]))
-        shots = int(config["shots"])
-    except (KeyError, TypeError, ValueError, MalformedMessage) as error:
-        raise DamagedFileError(f"{recording.path}: the run cannot be rebuilt: {error}") from error
-    decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")))
-    if pictures is not None:
-        decider = pictures.over(decider)
-    core = _core(config, plan, decider, bundle, shots, arms[0][1].n_cycles)
+    core, arms = _rebuilt(recording, bundle, pictures)
     log, n_decisions = LogEncoder(), 0
     for decisions in _decisions(core, arms, recording):
         log.update(np.array(decisions, DECISION_DTYPE))
@@ -81,6 +77,53 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None)
         if pictures is not None:
             pictures.note(decisions)
     return core, n_decisions, log.hexdigest()
+
+
+def _rebuilt(
+    recording: Recording, bundle: Bundle, pictures: PictureLog | None
+) -> tuple[Core | FlowCore, list[tuple[int, Arm]]]:
+    """Return the core of the run and its ARM commands; DamagedFileError if the header or the commands do not tell."""
+    try:
+        config = recording.header["config"]
+        chunks, arms = sent_plan(recording)
+        tick_hz, shots = TICK_HZ.checked(config["tick_hz"], "tick_hz"), SHOTS.checked(config["shots"], "shots")
+        plan = plan_from_chunks(chunks, tick_hz)
+        decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")))
+        if pictures is not None:
+            decider = pictures.over(decider)
+        return _core(config, plan, decider, bundle, shots, arms[0][1].n_cycles), arms
+    except _NOT_REBUILT as error:
+        raise DamagedFileError(
+            f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"
+        ) from error
+
+
+def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
+    """Return why `recording` could not be replayed with `bundle`, [] if it can; nothing is decided.
+
+    Nothing is said of a recording that holds no commands or no messages: it does not claim that it can be.
+    """
+    if not {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
+        return []
+    try:
+        _, arms = _rebuilt(recording, bundle, None)
+        place = place_of(recording)
+        if place is not None:
+            Place.of(place)
+        later, session = iter(arms), 0
+        for _, body in recording.messages():
+            frame = unpack_body(body)
+            while frame.session != session:
+                session = next(later)[0]
+    except StopIteration:
+        return ["a message of a session that never armed the device"]
+    except UsageError as error:
+        return [f"the run cannot be rebuilt: {error.message}"]
+    except DamagedFileError as error:
+        return [error.message]
+    except _NOT_REBUILT as error:
+        return [f"a message or the place where the part begins cannot be read: {error}"]
+    return []
 
 
 def _core(

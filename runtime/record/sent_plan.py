@@ -8,10 +8,13 @@ from __future__ import annotations
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.errors import DamagedFileError
+from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
 from pans.runtime.wire.messages import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command
 
 from .recording import Recording
+
+TICK_HZ = Range(1000, 10_000_000_000, whole=True)
 
 
 def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Arm]]]:
@@ -38,6 +41,6 @@ def recorded_plan(recording: Recording) -> Plan:
     """Return the plan that the device was sent; DamagedFileError if the recording does not hold it whole."""
     try:
         chunks, _ = sent_plan(recording)
-        return plan_from_chunks(chunks, int(recording.header["config"]["tick_hz"]))
+        return plan_from_chunks(chunks, TICK_HZ.checked(recording.header["config"]["tick_hz"], "tick_hz"))
     except (KeyError, TypeError, ValueError, MalformedMessage) as error:
         raise DamagedFileError(f"{recording.path}: its plan cannot be rebuilt: {error}") from error

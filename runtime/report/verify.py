@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.facts import GOLDEN_WORK_MAX
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
 from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, parse_bundle, word_means
+from pans.runtime.container import open_regular
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import OnnxDecider
@@ -27,6 +28,7 @@ from pans.runtime.instrument.profile import load_profile, parse_profile, shipped
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
 from pans.runtime.record.parts import chain_violations, first_decision, parts_in
+from pans.runtime.record.replaying import replay_faults
 
 _COMPARE_FEATURES_MAX = 16
 _COMPARE_SCORES = 1 << 20  # at once
@@ -53,11 +55,8 @@ def file_kind(path: str | Path) -> str:
     """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(len(BUNDLE_MAGIC))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with open_regular(path) as file:
+        start = file.read(len(BUNDLE_MAGIC))
     suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
     by_magic = {BUNDLE_MAGIC: "bundle", RECORDING_MAGIC: "recording"}
     kind = by_magic.get(start) or suffixes.get(Path(path).suffix)  # a damaged magic still has its name
@@ -182,6 +181,8 @@ def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
         times = np.fromiter((host_ns for host_ns, _ in items), dtype=np.int64)
         if (np.diff(times) < 0).any():
             verdict.alerts.append(f"the host times of the {stream} go back at {int(np.argmax(np.diff(times) < 0)) + 1}")
+    if recording.complete and recording.bundle_data() and not verdict.violations:
+        verdict.violations += replay_faults(recording, recording.bundle())
 
 
 def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:

@@ -1,0 +1,162 @@
+"""`pans fuzz --files`: changed files with right checksums, verified, and used where they were accepted.
+
+Owns the files to begin with, the limits and the judgement. `fuzz_files` returns counts and "" or what went wrong; a seed repeats it.
+"""
+
+from __future__ import annotations
+
+import random
+import resource
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.firmware_sim.testing import small_setup
+from pans.hw_profiles import __file__ as _profiles
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import BackEnd, Shown, bundle_bytes, load_bundle, make_bundle
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.errors import PansError
+from pans.runtime.report.verify import verify_file
+
+from .contents import mutated_toml
+from .sealing import changed_bundle, changed_calibration, changed_recording
+from .uses import record_run, small_calibration, use_file
+
+ANSWER_S = 2.0  # of processor time for one answer; the files have up to 140 kB
+MEMORY_MIB = 400
+
+
+@dataclass(slots=True)
+class FileCounts:
+    """How many files were made of each kind, how many were accepted, and the slowest answer."""
+
+    made: Counter[str] = field(default_factory=Counter)
+    accepted: Counter[str] = field(default_factory=Counter)
+    slowest_answer_s: float = 0.0
+
+    @property
+    def files(self) -> int:
+        """All files that were made."""
+        return sum(self.made.values())
+
+
+class LimitBroken(AssertionError):
+    """A file that took too long or too much memory, or that was accepted and could not be used."""
+
+
+@dataclass(slots=True)
+class _Kind:
+    files: list[bytes]
+    change: Callable[[random.Random, bytes], bytes]
+    suffix: str
+    share: int
+
+
+def fuzz_files(seed: int, count: int, folder: Path) -> tuple[FileCounts, str]:
+    """Make `count` changed files in `folder`; return the counts, and "" or the traceback of the first that broke a rule."""
+    dice, counts = random.Random(seed), FileCounts()
+    kinds = _base_files()
+    names = list(kinds)
+    shares = [kinds[name].share for name in names]
+    before_mib = _peak_mib()
+    for number in range(count):
+        name = dice.choices(names, shares)[0]
+        kind = kinds[name]
+        data = kind.change(dice, dice.choice(kind.files))
+        path = folder / f"changed{kind.suffix}"
+        path.write_bytes(data)
+        counts.made[name] += 1
+        try:
+            _judge(name, path, counts)
+            if _peak_mib() - before_mib > MEMORY_MIB:
+                raise LimitBroken(f"{_peak_mib() - before_mib:.0f} MiB more than before, allowed: {MEMORY_MIB}")
+        except Exception:
+            kept = Path(tempfile.mkdtemp(prefix="pans-fuzz-")) / f"seed-{seed}-file-{number}{kind.suffix}"
+            kept.write_bytes(data)
+            return counts, f"{traceback.format_exc()}\nseed {seed}, file {number} ({name}), kept as {kept}"
+    return counts, ""
+
+
+def _judge(name: str, path: Path, counts: FileCounts) -> None:
+    started = time.process_time()
+    try:
+        if name in ("scene", "flow"):  # they have no verify of their own: being read is the check
+            use_file(name, path)
+            counts.accepted[name] += 1
+        else:
+            verdict = verify_file(path)
+            if not verdict.violations and not verdict.damaged:
+                counts.accepted[name] += 1
+                _use(name, path)
+    except PansError as error:
+        if name not in ("scene", "flow"):
+            raise LimitBroken(f"accepted by verify, refused later: {error}") from error
+    taken_s = time.process_time() - started
+    counts.slowest_answer_s = max(counts.slowest_answer_s, taken_s)
+    if taken_s > ANSWER_S:
+        raise LimitBroken(f"{taken_s:.1f} s of processor time, allowed {ANSWER_S}")
+
+
+def _use(name: str, path: Path) -> None:
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        use_file(name, path)
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _base_files() -> dict[str, _Kind]:
+    profiles = [path.read_bytes() for path in sorted(Path(_profiles).parent.glob("*.toml"))]
+    scenes = [path.read_bytes() for path in sorted((Path(__file__).parent.parent / "scenes").glob("*.toml"))]
+    flows = [path.read_bytes() for path in sorted(SHIPPED.glob("flow-*.toml"))]
+
+    def text(dice: random.Random, data: bytes) -> bytes:
+        return mutated_toml(dice, data.decode()).encode("utf-8", "replace")
+
+    return {
+        "bundle": _Kind(_bundles(), changed_bundle, ".pans", 40),
+        "recording": _Kind([_made(lambda folder: record_run(folder).read_bytes())], changed_recording, ".pansrec", 25),
+        "calibration": _Kind([_made(small_calibration)], changed_calibration, ".json", 15),
+        "profile": _Kind(profiles, text, ".toml", 10),
+        "scene": _Kind(scenes, text, ".toml", 6),
+        "flow": _Kind(flows, text, ".toml", 4),
+    }
+
+
+def _bundles() -> list[bytes]:
+    """The shipped bundle, a table alone, passive optics, a head that gives pictures back."""
+    shipped, _ = load_bundle(SHIPPED / "fashion10.pans")
+    rng = np.random.default_rng(1)
+    facts: dict[str, Any] = {"task": "small", "provenance": {"seed": 1, "losses": [0.5, 0.25]}}
+    optics = Analyser("coherent", rng.normal(size=(3, 4)).astype(np.complex64), "field", "none", 10.0, 100.0)
+    passive = make_bundle(
+        name="passive",
+        classes=("a", "b"),
+        image_shape=(2, 2),
+        optics=optics,
+        back_end=BackEnd(table=rng.normal(size=(8, 2))),
+        **facts,
+    )
+    picture = make_bundle(
+        name="picture",
+        picture_shape=(2, 5),
+        image_shape=(28, 28),
+        optics=Shown(shipped.levels, shipped.pattern_levels, shipped.photons_per_level),
+        back_end=BackEnd(head_onnx=shipped.head_onnx),
+        **facts,
+    )
+    return [bundle_bytes(bundle) for bundle in (shipped, small_setup()[1], small_setup()[1], passive, picture)]
+
+
+def _made(make: Callable[[Path], bytes]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return make(Path(folder))

@@ -1,0 +1,151 @@
+"""What an accepted file must be good for: a bundle to decide and to run, a recording to be replayed, the others to be planned with.
+
+Owns these uses and the recording to begin with. PlanError is an answer ("this hardware cannot do it"); anything else that is raised is a
+fault of the check that accepted the file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.core.plan import build_plan
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.flow.settings import flow_limits, read_flow
+from pans.runtime.instrument.calibration import load_calibration, now_utc, save_calibration
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.record import read_recording, replay
+from pans.runtime.record.format import Kind
+from pans.runtime.record.sent_plan import recorded_plan
+
+RUN_EVERY = 20  # accepted bundles: one in that many, told by its bytes, is run through the whole loop
+DECISIONS = 3
+
+
+def record_run(folder: Path, bundle: Path | None = None, profile: str = "ideal") -> Path:
+    """Return the recording of a small run in virtual time, written in `folder`."""
+    from pans.runtime.commands.carry_out import run_job
+    from pans.runtime.commands.job import Job
+
+    if bundle is None:
+        bundle = folder / "small.pans"
+        write_bundle(small_setup()[1], bundle)
+    loaded = load_profile(profile)
+    job = Job(
+        bundle_path=bundle,
+        device=f"sim:{profile}?scene=uniform&seed=1&pace=fast",
+        profile=loaded,
+        deadline_us=loaded.timing.decision_deadline_us,
+        act_profile=loaded,
+        record=folder / "run.pansrec",
+        decisions=DECISIONS,
+        realtime=False,
+        command="pans fuzz",
+        shows=False,
+    )
+    run_job(job)
+    return folder / "run.pansrec"
+
+
+def small_calibration(folder: Path) -> bytes:
+    """Return a calibration of the profile `ideal`, as `pans calibrate` writes it."""
+    profile = load_profile("ideal")
+    row = {"dark_per_exposure": 0.001, "dark_ci": [0.0, 0.004], "dark_clicks": 4, "dark_exposures": 4000}
+    values = {
+        "made_utc": now_utc().isoformat(),
+        "profile": {"name": profile.name, "sha256": profile.sha256},
+        "device": {"name": "sim:ideal", "serial": "SIM-1", "firmware": "1", "simulated": True},
+        "exposure_us": 100.0,
+        **{"photons_per_level": 0.02, "photons_per_level_ci": [0.019, 0.021]},
+        **{"dark_per_exposure": 0.001, "dark_ci": [0.0, 0.004]},
+        **{"peak_photoelectrons_hz": 4e3, "peak_photoelectrons_hz_ci": [3.8e3, None]},
+        "counts": {"clicks": 3141, "exposures": 4751},
+        "channels": [row, row],
+    }
+    save_calibration(folder / "calibration.json", values)
+    return (folder / "calibration.json").read_bytes()
+
+
+def use_file(kind: str, path: Path) -> None:
+    """Use an accepted file for what it is for; whatever this raises is a finding."""
+    _USES[kind](path)
+
+
+def _use_bundle(path: Path) -> None:
+    bundle, _ = load_bundle(path)
+    for shots in (1, 3):
+        with suppress(UsageError):  # a table alone answers single shots only
+            decider = make_decider(bundle, shots=shots)
+            counts = np.random.default_rng(1).integers(0, shots + 1, (4, bundle.n_features))
+            decider.decide(counts[0], shots)
+            if not np.isfinite(decider.scores_batch(counts, shots)).all() and bundle.table is not None and shots == 1:
+                raise ValueError("scores that are not finite from a checked table")
+    if not (math.isfinite(bundle.illumination()) and np.isfinite(bundle.patterns()).all()):
+        raise ValueError("a light that is not finite")
+    planned = [
+        profile for profile in (load_profile("ideal"), load_profile("oled-qcmos")) if _plannable(profile, bundle)
+    ]
+    if planned and zlib.crc32(path.read_bytes()) % RUN_EVERY == 0:
+        record_run(path.parent, path, planned[0].name).unlink()
+
+
+def _plannable(profile: Profile, bundle: Bundle) -> bool:
+    try:
+        build_plan(profile, bundle)
+    except PlanError:
+        return False
+    return bundle.analyser is None
+
+
+def _use_recording(path: Path) -> None:
+    recording = read_recording(path)
+    if recording.bundle_data() and {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
+        recorded_plan(recording)
+        replay(recording, recording.bundle())
+
+
+def _use_calibration(path: Path) -> None:
+    calibration, profile = load_calibration(path), load_profile("ideal")
+    calibration.age_h(now_utc())
+    for channels in (1, 4):
+        chance, low, high = calibration.dark_probability(profile, 250.0, channels)
+        if not (
+            np.isfinite([chance, low, high]).all() and (low >= 0).all() and (low <= high).all() and (high <= 1).all()
+        ):
+            raise ValueError(f"dark probabilities {chance}, {low}, {high}")
+        calibration.dark_clicks(channels)
+    with suppress(PlanError):
+        build_plan(calibration.applied_to(profile), small_setup()[1])
+    json.dumps(calibration.values, allow_nan=False)
+
+
+def _use_profile(path: Path) -> None:
+    with suppress(PlanError):
+        build_plan(load_profile(path), small_setup()[1])
+
+
+def _use_scene(path: Path) -> None:
+    open_scene(path)
+
+
+def _use_flow(path: Path) -> None:
+    flow_limits(read_flow(str(path)), small_setup("parallel")[2], 1e-6)
+
+
+_USES = {
+    "bundle": _use_bundle,
+    "recording": _use_recording,
+    "calibration": _use_calibration,
+    "profile": _use_profile,
+    "scene": _use_scene,
+    "flow": _use_flow,
+}
