@@ -4,6 +4,13 @@ Owns the changes, the sealing and the judgement: `pans verify` must answer withi
 accepts can be run or replayed. Never changes a file that exists.
 """
 
-from .fuzz_files import FileCounts, fuzz_files
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from .judging import FileCounts, fuzz_files
 
 __all__ = ["FileCounts", "fuzz_files"]
+
+__getattr__ = lazy_names(__name__, {"FileCounts": ".judging", "fuzz_files": ".judging"})
