@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from pans.firmware_sim.checks.checkers import Checker, WatchedInstrument
+from pans.firmware_sim.checks.reconciliation import ObservedLink, reconcile
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.faults import NAMES, parse_faults
@@ -35,8 +37,6 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.wire.commands import Gate
 
 from . import Report, Trial, figures_text
-from .checkers import Checker, WatchedInstrument
-from .reconciliation import ObservedLink, reconcile
 
 SHOTS = 1
 GATE_EVERY = 32  # decisions

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from pans.firmware_sim.checks import reconciliation
 from pans.firmware_sim.device.stream_buffer import StreamBuffer
-from pans.firmware_sim.trials import reconciliation
 from pans.firmware_sim.trials.fault_grid import run_case
 from pans.runtime.record import Recorder
 from pans.runtime.wire import FrameDecoder, Status, StreamTracker
