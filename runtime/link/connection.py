@@ -66,13 +66,23 @@ class Connection:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
         self.session.poll(self.link.now_ns())
         asked = self.flush()
-        stream: list[Arrived] = []
         began_ns = self.link.now_ns()
         chunks = self.reader.wait(timeout_s, eager=asked)
         if self.evidence is not None:
             self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
             for chunk in chunks:
                 self.evidence.arrived(chunk.arrival_ns)
+        stream = self._take(chunks)
+        self._take_pongs()
+        return stream
+
+    def rest(self) -> list[Arrived]:
+        """Stop reading and return what has arrived and was never taken: what a host finds that stood still while its device was lost."""
+        return self._take(self.reader.rest())
+
+    def _take(self, chunks: list[Chunk]) -> list[Arrived]:
+        """Digest chunks and return what of them is the core's, in order."""
+        stream: list[Arrived] = []
         bulk = self.decoder.bulk
         for place, chunk in enumerate(chunks):
             if bulk is None:
@@ -81,16 +91,18 @@ class Connection:
                         stream.append(Arrived(chunk.arrival_ns, frame))
             else:
                 self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
-        if self.clock is not None:
-            while self.session.pongs:
-                pong, arrival_ns = self.session.pongs.popleft()
-                step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
-                if step is not None:
-                    self.clock_steps.append(step)
-                if self.evidence is not None:
-                    reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
-                    self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
         return stream
+
+    def _take_pongs(self) -> None:
+        """Give the clock what came for it."""
+        while self.clock is not None and self.session.pongs:
+            pong, arrival_ns = self.session.pongs.popleft()
+            step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
+            if step is not None:
+                self.clock_steps.append(step)
+            if self.evidence is not None:
+                reached_ns, left_ns = (self.clock.to_host_ns(tick)[0] for tick in (pong.rx_tick, pong.tx_tick))
+                self.evidence.stamped(Stamped(pong.host_ns, reached_ns, left_ns, arrival_ns))
 
     def _digest(self, bulk: BulkDecoder, chunk: Chunk, stream: list[Arrived], *, last: bool) -> None:
         """Decode a chunk and sort its messages: runs of stream messages stay together; unless they are the `last`, as a copy."""

@@ -11,7 +11,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
+
+from pans.runtime.errors import PansError
 
 if TYPE_CHECKING:
     from .base import Link
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 LOOK_EVERY_S = 0.002  # how often the stand-in looks whether the loop has left
 STAND_IN_POLL_S = 0.005  # and how long it may keep a loop that has come back from the chair, if nothing arrives
 EAGER_NS = 200_000
+REST_NS = 1_000_000_000  # how long a device that goes on sending is listened to when its link is given up
 MAX_QUEUED_BYTES = 1 << 24
 
 
@@ -88,6 +92,19 @@ class LinkReader:
             with self._ready:
                 self._ready.notify_all()
             self._thread.join(timeout=2.0)
+
+    def rest(self) -> list[Chunk]:
+        """Stop the thread and return what has arrived and nobody has taken: in the queue, then in the link, as far as it can be read."""
+        self.stop()
+        chunks = list(self._chunks)
+        self._chunks.clear()
+        until_ns = self._link.now_ns() + REST_NS
+        with suppress(PansError):  # the link is gone, and with it what stood in it
+            while self._death is None and (data := self._link.read(0.0)):
+                chunks.append(Chunk(self._link.now_ns(), data))
+                if self._link.now_ns() > until_ns:
+                    break
+        return chunks
 
     def close(self) -> None:
         """Stop the thread and close the link."""

@@ -84,6 +84,7 @@ def reconnect(
 
 def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Callable[[Link], Connection]) -> None:
     """Find the device again and arm it for what is left of the run, or end the run because that failed."""
+    run.take_rest()
     now_ns = run.now_ns()
     run.outage_ns = now_ns if run.outage_ns is None else run.outage_ns
     run.journal.note("link_lost", reason=error.message)

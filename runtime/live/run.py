@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -152,12 +153,18 @@ class LiveRun:
             self.lose_link(error)
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest
             self.ended = self.ended or "interrupted"
+        self.take_rest()
         self.settle(self.core.end())
         self.gates.finish(session)
         for verdict in self.lateness.closing_verdicts(self.now_ns()):
             self.journal.take(verdict)
         self.lateness.close()
         self.journal.clock(self.connection)
+
+    def take_rest(self) -> None:
+        """Decide on and record what has arrived on a connection that is given up: lost is only what never came."""
+        with suppress(LinkError):  # nothing can be sent any more
+            self.take(self.connection.rest())
 
     def _is_dark(self) -> bool:
         status = self.connection.session.status

@@ -54,6 +54,7 @@ def read_trace(path: Path) -> list[Opening]:
     return openings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped_s", [0.6, STOPPED_S])
 def test_what_arrived_while_the_host_stood_still_is_accounted_for(tmp_path: Path, stopped_s: float) -> None:
     (tmp_path / "lab.toml").write_text(profile_text("sequential", 900.0))
