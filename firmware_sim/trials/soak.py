@@ -26,7 +26,7 @@ from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
-from pans.runtime.report.verify import verify_folder
+from pans.runtime.report.verify import verify_parts
 
 from . import Report, Trial, figures_text
 from .processes import start_command, wait_until
@@ -95,7 +95,7 @@ def judged(
     missed = sum(not sample["metrics"] for sample in samples)
     if missed:
         broken.append(f"{missed} of {len(samples)} scrapes of the metrics gave nothing")
-    verdicts = verify_folder(out)
+    verdicts = verify_parts(out)
     broken += [f"{verdict.path}: {text}" for verdict in verdicts for text in (*verdict.violations, *verdict.alerts)]
     paths = parts_in(out)
     broken += [problem for path in paths if (problem := _replay_problem(path))]

@@ -25,8 +25,9 @@ from pans.runtime.container import read_file
 from pans.runtime.core.plan import exposure_us
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.record.parts import is_of_parts
 from pans.runtime.report.file_facts import file_facts
-from pans.runtime.report.verify import FileVerdict, verify_file, verify_folder
+from pans.runtime.report.verify import FileVerdict, verify_file, verify_parts
 
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
@@ -45,7 +46,7 @@ def _configure_verify(parser: argparse.ArgumentParser) -> None:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    groups = [verify_folder(path) if Path(path).is_dir() else [verify_file(path)] for path in args.paths]
+    groups = [verify_parts(path) if is_of_parts(path) else [verify_file(path)] for path in args.paths]
     verdicts = [verdict for group in groups for verdict in group]
     payload = {
         "ok": all(verdict.ok for verdict in verdicts),

@@ -18,7 +18,9 @@ if TYPE_CHECKING:  # `pans replay --help` loads no kernels
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="a recording (.pansrec), or a folder with one in parts")
+    parser.add_argument(
+        "recording", type=Path, help="a recording (.pansrec), a folder with one in parts, or the index of its parts"
+    )
     parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
     parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head gives back")
     parser.add_argument(
@@ -30,7 +32,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    if args.recording.is_dir():
+    from pans.runtime.record.parts import is_of_parts
+
+    if is_of_parts(args.recording):
         return _run_parts(args)
     from pans.runtime.record.pictures import PictureLog
 

@@ -25,6 +25,7 @@ from pans.runtime.errors import PansError, UsageError
 from .recorder import Recorder
 
 INDEX_FORMAT = "pans-parts 1"
+INDEX_SUFFIX = ".parts.json"
 LONGEST_END_S = 60.0  # that the end of a run waits for the thread
 RETRY_S = 5.0
 RESERVE_PARTS = 2  # of free disk, below which the oldest parts go before their time
@@ -66,7 +67,7 @@ def part_path(first: Path, number: int) -> Path:
 
 def index_path(first: Path) -> Path:
     """Return the path of the index beside the parts."""
-    return first.with_name(f"{first.stem}.parts.json")
+    return first.with_name(f"{first.stem}{INDEX_SUFFIX}")
 
 
 def chained(chain_sha256: str, decisions_sha256: str) -> str:
@@ -84,6 +85,7 @@ class PartKeeper:
         self._run = secrets.token_hex(8)
         self._header, self._bundle = dict(header), bundle
         self._closed: deque[PartFacts] = deque()
+        self._struck: deque[Path] = deque()  # no longer in the index, not deleted yet
         self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
         self._news: deque[dict[str, Any]] = deque(maxlen=100)
         self.ready: queue.SimpleQueue[Recorder] = queue.SimpleQueue()
@@ -166,6 +168,7 @@ class PartKeeper:
         while self._limits.keep_bytes and self._kept_bytes() > self._limits.keep_bytes and len(self._closed) > 1:
             self._delete_oldest("the cap")
         self._write_index()
+        self._unlink_deleted()
 
     def _kept_bytes(self) -> int:
         return sum(part.bytes for part in self._closed) + self._limits.rotate_bytes  # and the open one, when it is full
@@ -175,13 +178,19 @@ class PartKeeper:
         while len(self._closed) > 1 and shutil.disk_usage(self._path.parent).free < needed:
             self._delete_oldest("the disk is nearly full")
             self._write_index()
+            self._unlink_deleted()
 
     def _delete_oldest(self, why: str) -> None:
+        """Strike the oldest part off; its file goes once the index says so, so that no index ever names a file that was deleted."""
         oldest = self._closed.popleft()
-        self._path.with_name(oldest.name).unlink(missing_ok=True)
+        self._struck.append(self._path.with_name(oldest.name))
         for key, value in (("parts", 1), ("bytes", oldest.bytes), ("decisions", oldest.decisions)):
             self._deleted[key] += value
         self._news.append({"kind": "part_deleted", "name": oldest.name, "bytes": oldest.bytes, "why": why})
+
+    def _unlink_deleted(self) -> None:
+        while self._struck:
+            self._struck.popleft().unlink(missing_ok=True)
 
     def _write_index(self) -> None:
         index = {

@@ -1,21 +1,24 @@
 """Reading recordings that come in parts: a part's place in the run, the chain from one to the next, a folder of them.
 
-Owns the questions across files; blocks are recording.py's, what one file promises is verify.py's, and writing parts parted_recorder.py's.
-`verify_folder` returns one verdict on the chain; a deleted beginning is no fault, a hole is.
+Owns the questions across files; blocks are recording.py's, the index part_index.py's, what one file promises is verify.py's, and writing
+parts parted_recorder.py's. `chain_violations` says what is wrong between parts; a deleted beginning is no fault, a hole is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from glob import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.errors import DamagedFileError, UsageError
 
-from .part_keeper import chained
+from .part_keeper import INDEX_SUFFIX, chained
 from .parted_recorder import PART_EVENT
 from .recording import Recording
+
+NUMBER_DIGITS_MAX = 10  # the index of a block is a u32, and a part has several
 
 
 def part_of(recording: Recording) -> Mapping[str, Any] | None:
@@ -43,14 +46,36 @@ def first_decision(recording: Recording) -> int:
     return 0 if part is None else int(part["first_decision"])
 
 
-def parts_in(folder: str | Path) -> list[Path]:
-    """Return the parts in `folder`, in order; UsageError if there are none."""
-    paths = sorted(Path(folder).glob("*-[0-9]*.pansrec"), key=lambda path: (len(path.name), path.name))
-    if not paths:
-        raise UsageError(
-            f"{folder}: no parts of a recording are in this folder", remedy="parts are named like run-0001.pansrec"
-        )
-    return paths
+def is_of_parts(path: str | Path) -> bool:
+    """Say whether `path` stands for a recording in parts: a folder, or the index beside the parts."""
+    return Path(path).is_dir() or Path(path).name.endswith(INDEX_SUFFIX)
+
+
+def parts_in(place: str | Path) -> list[Path]:
+    """Return the parts in a folder, or those beside an index, in order; UsageError if there are none."""
+    if paths := find_parts(place):
+        return paths
+    raise UsageError(f"{place}: no parts of a recording are here", remedy="parts are named like run-0001.pansrec")
+
+
+def find_parts(place: str | Path) -> list[Path]:
+    """Return the parts in a folder, or those beside an index, in order."""
+    folder, stem = Path(place), "*"
+    if folder.name.endswith(INDEX_SUFFIX) and not folder.is_dir():
+        folder, stem = folder.parent, escape(folder.name.removesuffix(INDEX_SUFFIX))
+    found = [path for path in folder.glob(f"{stem}-[0-9]*.pansrec") if part_number(path) is not None]
+    return sorted(found, key=lambda path: (stem_of(path), part_number(path)))
+
+
+def part_number(path: Path) -> int | None:
+    """Return the number in the name of a part: 12 for `run-0012.pansrec`; None for other names."""
+    digits = path.stem.rpartition("-")[2]
+    return int(digits) if digits.isdecimal() and len(digits) <= NUMBER_DIGITS_MAX else None
+
+
+def stem_of(path: Path) -> str:
+    """Return what the parts of one run have in common: `run` for `run-0012.pansrec`."""
+    return path.stem.rpartition("-")[0]
 
 
 def chain_violations(recordings: list[Recording]) -> list[str]:
@@ -61,6 +86,9 @@ def chain_violations(recordings: list[Recording]) -> list[str]:
     runs = {recording.header["part"].get("run") for recording, _ in known}
     if len(runs) > 1:
         violations.append(f"parts of {len(runs)} runs are in one folder")
+    for recording, part in known:
+        if part["number"] != part_number(recording.path):
+            violations.append(f"{recording.path.name}: it is part {part['number']} of its run: it was renamed")
     for (earlier, first), (later, second) in pairwise(known):
         where = f"{later.path.name}"
         if second["number"] != first["number"] + 1:

@@ -23,7 +23,7 @@ from pans.runtime.live.metrics import FIGURES, MetricsServer, parse_address
 from pans.runtime.live.state_file import FORMAT, StateFile, picture_of
 from pans.runtime.record import read_recording
 from pans.runtime.record.parts import parts_in
-from pans.runtime.report.verify import verify_folder
+from pans.runtime.report.verify import verify_parts
 
 
 def test_the_state_file_is_always_whole(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_sigterm_ends_a_continuous_run_well(bundle_file: Path, tmp_path: Path, l
     assert (process.returncode, summary["ended"]) == (code, ASKED_TO_STOP if code == 0 else INTERRUPTED)
     state = _state(tmp_path)
     assert (state["state"], state["decisions"]) == ("stopped", summary["decisions"])
-    assert all(verdict.ok for verdict in verify_folder(tmp_path / "out"))
+    assert all(verdict.ok for verdict in verify_parts(tmp_path / "out"))
     assert sum(read_recording(path).n_decisions for path in parts_in(tmp_path / "out")) == summary["decisions"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult
 from pans.runtime.record import PartedRecorder, read_recording, replay
 from pans.runtime.record.part_keeper import PartLimits, index_path, part_path
 from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in
-from pans.runtime.report.verify import verify_folder
+from pans.runtime.report.verify import verify_parts
 
 KIB = 1024
 
@@ -38,6 +39,7 @@ def record(
     header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
     core = Core(plan, make_decider(bundle, backend="table"), 1, cycles)
     config = RunConfig(n_cycles=cycles, deadline_us=1e9, realtime=False)
+    folder.mkdir(exist_ok=True)
     with PartedRecorder(folder / "run.pansrec", header, limits, bundle=bundle_bytes(bundle)) as recorder:
 
         def wait(run: LiveRun, output: Any) -> None:
@@ -73,7 +75,7 @@ def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
         numbers += recording.decisions()["index"].tolist()
         assert len(recording.clock_samples())
     assert numbers == list(range(len(numbers)))
-    assert all(verdict.ok for verdict in verify_folder(parts)), verify_folder(parts)
+    assert all(verdict.ok for verdict in verify_parts(parts)), verify_parts(parts)
     assert not list(parts.glob(".*"))
 
 
@@ -100,7 +102,7 @@ def test_parts_replay_under_faults(tmp_path: Path, faults: str) -> None:
     for path in paths:
         recording = read_recording(path)
         assert replay(recording, recording.bundle())[:2] == (recording.n_decisions, recording.decisions_sha256), path
-    assert all(verdict.ok for verdict in verify_folder(tmp_path)), verify_folder(tmp_path)
+    assert all(verdict.ok for verdict in verify_parts(tmp_path)), verify_parts(tmp_path)
     assert sum(read_recording(path).n_decisions for path in paths) == result.tally.decisions
 
 
@@ -114,7 +116,7 @@ def test_the_cap_deletes_the_oldest_and_never_the_open_one(tmp_path: Path) -> No
     assert index["deleted"]["parts"] + len(paths) == part_of(read_recording(paths[-1]))["number"]  # type: ignore[index]
     assert index["deleted"]["decisions"] + sum(entry["decisions"] for entry in index["parts"]) == result.tally.decisions
     assert index["parts"][-1]["chain_sha256"] == result.decisions_sha256
-    assert all(verdict.ok for verdict in verify_folder(tmp_path)), verify_folder(tmp_path)
+    assert all(verdict.ok for verdict in verify_parts(tmp_path)), verify_parts(tmp_path)
     assert "part_deleted" in {event["kind"] for event in result.events}
 
 
@@ -127,6 +129,66 @@ def test_a_hole_and_a_strange_part_are_found(parts: Path, tmp_path: Path) -> Non
     others = [read_recording(path) for path in parts_in(tmp_path)]
     text = " ".join(chain_violations([recordings[0], others[1]]))
     assert "parts of 2 runs" in text
+
+
+def test_a_part_that_is_missing_is_found_wherever_it_was(parts: Path, tmp_path: Path) -> None:
+    names = [path.name for path in parts_in(parts)]
+    for place, name in enumerate(names):
+        for with_index in (True, False):
+            folder = tmp_path / f"{place}-{with_index}"
+            shutil.copytree(parts, folder)
+            (folder / name).unlink()
+            if not with_index:
+                index_path(folder / "run.pansrec").unlink()
+            *others, found = verify_parts(folder)
+            assert all(other.ok for other in others)
+            assert found.violations, (name, with_index)
+            if with_index:
+                assert f"{name} is missing" in " ".join(found.violations)
+
+
+def test_a_surplus_part_is_found_wherever_it_is(parts: Path, tmp_path: Path) -> None:
+    paths = parts_in(parts)
+    record(tmp_path / "other", PartLimits(48 * KIB), cycles=1500)
+    stranger = parts_in(tmp_path / "other")[0]
+    for place, number in enumerate((2, len(paths), len(paths) + 1, 99)):
+        folder = tmp_path / str(place)
+        shutil.copytree(parts, folder)
+        shutil.copy(stranger, folder / f"run-{number:04d}.pansrec")
+        *_, found = verify_parts(folder)
+        text = " ".join(found.violations)
+        assert "the index of run" in text, number
+        assert "renamed" in text
+        if number > len(paths):
+            assert "is surplus: the run ended with" in text
+
+
+def test_the_index_stands_for_its_parts(parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "parts"
+    shutil.copytree(parts, folder)
+    index_file = index_path(folder / "run.pansrec")
+    assert json_of(capsys, "verify", index_file)["ok"]
+    assert json_of(capsys, "replay", index_file)["identical"]
+    index = json.loads(index_file.read_text())
+    for change, words in (
+        (lambda it: it["parts"][0].update(decisions=7), "the index says decisions = 7"),
+        (lambda it: it["parts"].pop(1), "is surplus: it is not in the index"),
+        (lambda it: it["deleted"].update(parts=1), "as part 2"),
+        (lambda it: it.update(run="0"), "the index of run '0'"),
+        (lambda it: it.update(format="x"), "not an index of the form"),
+        (lambda it: it["parts"][0].update(name="../run-0001.pansrec"), "not an index of the form"),
+    ):
+        changed = json.loads(json.dumps(index))
+        change(changed)
+        index_file.write_text(json.dumps(changed))
+        found = json_of(capsys, "verify", index_file, code=1)
+        assert words in " ".join(violation["message"] for violation in found["violations"]), words
+    for path in parts_in(folder):
+        path.unlink()
+    index_file.write_text(json.dumps(index))
+    assert len(json_of(capsys, "verify", folder, code=1)["violations"]) == len(index["parts"])
+    index_file.unlink()
+    assert main(["verify", str(folder)]) == main(["verify", str(index_file)]) == 2
 
 
 def test_a_part_without_its_place_is_refused(parts: Path) -> None:
