@@ -23,6 +23,7 @@ from pans.runtime.wire.commands import (
     pack_pattern,
     pack_plan,
 )
+from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome
 from pans.runtime.wire.session import HostSession
@@ -39,7 +40,6 @@ ARM_LEAD_NS = NS_PER_S // 10
 SETUP_POLL_S = 0.02
 CLOCK_BURST = 16
 PROBE_GIVE_UP_NS = NS_PER_S // 4  # of one probe of the burst: a lost one is not waited for
-REQUIRED_FACTS = ("tick_hz", "mode", "channels", "levels", "pattern_memory", "pattern_pixels", "slot_memory")
 
 
 class Arrived(NamedTuple):
@@ -138,10 +138,9 @@ class Connection:
         while self.session.welcome is None:
             self.pump(SETUP_POLL_S)
         welcome = self.session.welcome
-        missing = [key for key in REQUIRED_FACTS if key not in welcome.facts]
-        if missing:
+        if wrong := wrong_facts(welcome.facts):
             raise DeviceError(
-                f"the device's WELCOME lacks {', '.join(missing)}", remedy="see docs/reference/protocol.md, section 3"
+                f"the device's WELCOME: {'; '.join(wrong)}", remedy="see docs/reference/protocol.md, section 3"
             )
         self.clock = ClockModel(int(welcome.facts["tick_hz"]))
         self.session.submit(Opcode.RESET)

@@ -7,6 +7,7 @@ or raise `MalformedMessage`, which callers count.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
+from .fields import FACTS, FROM_DEVICE, LARGEST_TICK, narrow_fields
 from .frame import Frame as Frame
 from .frame import pack_body as pack_body
 from .frame import unpack_body as unpack_body
@@ -44,6 +46,9 @@ from .schema import MessageType as MessageType
 from .schema import Opcode as Opcode
 from .schema import StateReason as StateReason
 
+# Of a block's fields these can hold more than they mean: two comparisons settle it for the many good ones, the table names a bad one.
+_BLOCKS = ("CLICKS", "FRAMES")
+_CHECKED = {name: narrow_fields(name) for name in FROM_DEVICE}
 _LITTLE_U16 = np.dtype("<u2")
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")  # of each byte value
 U16 = npt.NDArray[np.uint16]
@@ -171,11 +176,28 @@ class Mark(NamedTuple):
 
 
 def fields(name: str, payload: bytes, *, exact: bool = True) -> tuple[Any, ...]:
-    """Unpack the struct of layout `name` from the start of `payload`; MalformedMessage when it is too short (or, `exact`, too long)."""
+    """Unpack the struct of layout `name` from the start of `payload`.
+
+    MalformedMessage when it is too short (or, `exact`, too long), or when a device sent what the message dictionary does not allow.
+    """
     layout = STRUCTS[name]
     if len(payload) < layout.size or (exact and len(payload) != layout.size):
         raise MalformedMessage(f"{name} has {len(payload)} bytes, expected {'' if exact else 'at least '}{layout.size}")
-    return layout.unpack_from(payload)
+    values = layout.unpack_from(payload)
+    if name in _BLOCKS:
+        if (values[2] | values[3]) > LARGEST_TICK or not (values[4] and values[5] and (values[6] or name == "CLICKS")):
+            _check(name, values)
+    elif name in _CHECKED:
+        _check(name, values)
+    return values
+
+
+def _check(name: str, values: tuple[Any, ...]) -> None:
+    """Raise MalformedMessage when a value lies outside the range of its field."""
+    for place, field in _CHECKED[name]:
+        if not field.allows(values[place]):
+            low, high = field.range
+            raise MalformedMessage(f"{name}: {field.name} is {values[place]}, allowed {low} to {high}")
 
 
 def encode_hello(session: int) -> bytes:
@@ -207,13 +229,29 @@ def decode_welcome(payload: bytes) -> Welcome:
         return Welcome(schema, protocol, {})
     try:
         facts = msgpack.unpackb(
-            body, max_str_len=256, max_bin_len=256, max_array_len=64, max_map_len=64, max_ext_len=0, strict_map_key=True
-        )
+            body, max_str_len=256, max_bin_len=256, max_array_len=64, max_map_len=64, max_ext_len=0, strict_map_key=True,
+            object_pairs_hook=_flat_map,
+        )  # fmt: skip
     except Exception as error:  # msgpack raises many kinds, a plain ValueError among them
         raise MalformedMessage(f"WELCOME facts are no msgpack map: {error}") from None
     if not isinstance(facts, dict):
         raise MalformedMessage(f"WELCOME facts are a {type(facts).__name__}, expected a map")
     return Welcome(schema, protocol, facts)
+
+
+def _flat_map(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    """Return the map of `pairs`; what is no text, boolean or finite number is left out, unless the protocol names its key."""
+    facts = dict(pairs)
+    if len(facts) < len(pairs):
+        raise MalformedMessage("a key stands twice")
+    if not all(isinstance(key, str) for key in facts):
+        raise MalformedMessage("a key is no text")
+    plain = (str, bool, int)
+    return {
+        key: value
+        for key, value in facts.items()
+        if key in FACTS or isinstance(value, plain) or (isinstance(value, float) and math.isfinite(value))
+    }
 
 
 def encode_ping(probe_id: int, host_ns: int, session: int) -> bytes:
@@ -233,7 +271,10 @@ def encode_pong(pong: Pong, session: int) -> bytes:
 
 def decode_pong(payload: bytes) -> Pong:
     """Decode PONG."""
-    return Pong(*fields("PONG", payload))
+    pong = Pong(*fields("PONG", payload))
+    if pong.tx_tick < pong.rx_tick:
+        raise MalformedMessage(f"PONG left at tick {pong.tx_tick}, before PING came at {pong.rx_tick}")
+    return pong
 
 
 def encode_command(command_id: int, opcode: int, body: bytes, session: int) -> bytes:
@@ -260,6 +301,8 @@ def decode_ack(payload: bytes) -> Ack:
     text = payload[STRUCTS["ACK"].size :]
     if len(text) != size or size > MAX_ACK_TEXT_BYTES:
         raise MalformedMessage(f"ACK text has {len(text)} bytes, announced {size}, allowed {MAX_ACK_TEXT_BYTES}")
+    if refused_id > last_id or (status and not refused_id):
+        raise MalformedMessage(f"ACK of command {last_id} names {refused_id} as refused, with status {status}")
     return Ack(last_id, refused_id, status, text.decode("utf-8", "replace"), mask)
 
 

@@ -1,7 +1,7 @@
 """Protocol 1 in tables: message types, states, limits and byte layouts (docs/reference/protocol.md is its specification).
 
-Owns the numbers that both ends must agree on, and the schema hash made from them; never encodes a message (wire.py does) and never
-frames one (framing.py does).
+Owns the numbers that both ends must agree on, and the schema hash made from the fields (fields.py); never encodes a message (messages.py
+does) and never frames one (framing.py does).
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from enum import IntEnum
 import numpy as np
 
 from pans.runtime.errors import PansError
+
+from .fields import MESSAGES, layout
 
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 65536
@@ -85,27 +87,9 @@ class AckStatus(IntEnum):
     TOO_LATE = 5
 
 
-# Layouts, in the order of the fields of the tuples below. The schema hash is computed from this table, so that a change to any
-# layout makes the two ends refuse each other at the handshake instead of misreading each other's bytes.
-LAYOUTS: dict[str, str] = {
-    "HEADER": "<BBHI",
-    "HELLO": "<IHH",
-    "WELCOME": "<IHH",
-    "PING": "<IQ",
-    "PONG": "<IQQQ",
-    "COMMAND": "<IBBH",
-    "ACK": "<IIIHH",
-    "GRANT": "<II",
-    "STATUS": "<BBHIIQQ",
-    "CLICKS": "<IIQQIHHI",
-    "FRAMES": "<IIQQIHHI",
-    "MARK": "<IIhHQQf",
-    "LOAD_PATTERN": "<HHII",
-    "LOAD_PLAN": "<BBHIIIIQHHI",
-    "PLAN_SLOT": "<QHH",
-    "ARM": "<QQII",
-    "GATE": "<QIHH",
-}
+# The schema hash is computed from the layouts of fields.py, in its order, so that a change to any of them makes the two ends refuse each
+# other at the handshake instead of misreading each other's bytes.
+LAYOUTS: dict[str, str] = {name: layout(name) for name in MESSAGES}
 SCHEMA_TEXT = f"pans-wire/{PROTOCOL_VERSION};" + ";".join(f"{name}={layout}" for name, layout in LAYOUTS.items())
 SCHEMA = zlib.crc32(SCHEMA_TEXT.encode("ascii"))
 STRUCTS = {name: struct.Struct(layout) for name, layout in LAYOUTS.items()}

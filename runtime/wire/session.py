@@ -41,6 +41,7 @@ class SessionCounters:
     malformed: int = 0
     unknown_type: int = 0
     stale_probes: int = 0
+    implausible: int = 0  # well formed, but no answer to what was sent
     repeated_welcomes: int = 0
 
 
@@ -77,7 +78,7 @@ class HostSession:
         self._oldest_ns = 0
         self._fast_retry_ns = 0  # not before
         self._probe_id = 0
-        self._probes: deque[int] = deque(maxlen=MAX_PROBES)  # sent and not answered
+        self._probes: dict[int, int] = {}  # sent and not answered: id and host time
 
     # -- what the host wants -------------------------------------------------------------------------------------------
 
@@ -104,7 +105,9 @@ class HostSession:
     def probe(self, now_ns: int) -> None:
         """Send one clock probe stamped with `now_ns`."""
         self._probe_id = (self._probe_id + 1) & 0xFFFFFFFF
-        self._probes.append(self._probe_id)
+        self._probes[self._probe_id] = now_ns
+        if len(self._probes) > MAX_PROBES:
+            del self._probes[next(iter(self._probes))]
         self._output.append(wire.encode_ping(self._probe_id, now_ns, self.nonce))
 
     def grant(self, stream_limit: int, lease_ms: int) -> None:
@@ -205,11 +208,14 @@ class HostSession:
 
     def _on_pong(self, pong: wire.Pong, now_ns: int) -> None:
         """Keep the first answer to each probe: a repetition would lie about its round trip."""
-        if pong.probe_id in self._probes:
-            self._probes.remove(pong.probe_id)
-            self.pongs.append((pong, now_ns))
-        else:
+        sent_ns = self._probes.get(pong.probe_id)
+        if sent_ns is None:
             self.counters.stale_probes += 1
+        elif sent_ns != pong.host_ns:  # the echo must not change
+            self.counters.implausible += 1
+        else:
+            del self._probes[pong.probe_id]
+            self.pongs.append((pong, now_ns))
 
     def _on_welcome(self, welcome: wire.Welcome) -> None:
         if self.welcome is not None:
@@ -227,6 +233,9 @@ class HostSession:
         self._hello_due_ns = None
 
     def _on_ack(self, ack: wire.Ack, now_ns: int) -> None:
+        if ack.last_id >= self.next_id - len(self._waiting):  # a command that was never sent
+            self.counters.implausible += 1
+            return
         oldest = self._unacknowledged[0][0] if self._unacknowledged else 0
         if oldest > ack.last_id and now_ns >= self._fast_retry_ns:
             # A later command was answered, so the oldest is lost: a gate cannot wait for the time-out.

@@ -18,6 +18,8 @@ NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, MESSAGES, EXPOSURES, N_PLACE = ran
 FRAMES, MARK = int(MessageType.FRAMES), int(MessageType.MARK)
 BODY_HEADER, BLOCK_HEADER, MARK_BYTES = HEADER.size, BLOCK_HEADER_BYTES, STRUCTS["MARK"].size
 LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
+_INFINITE = np.uint64(0x7F800000)  # float32's bits: numbers from 0 on lie below, NaN above once the sign is taken away
+_MAGNITUDE = np.uint64(0x7FFFFFFF)
 _U = np.uint64
 
 
@@ -37,6 +39,7 @@ def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
         or load4(buffer, payload + _U(4)) != _U(place[DROPS])
         or load8(buffer, payload + _U(8)) >= LARGEST
         or load8(buffer, payload + _U(16)) != _U(place[NEXT_EXPOSURE])
+        or load4(buffer, payload + _U(24)) == _U(0)
         or place[NEXT_EXPOSURE] + count > place[END_EXPOSURE]
     ):
         return 0, 0
@@ -45,8 +48,19 @@ def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
-    """Whether the payload from `payload` to `stop` is a whole MARK and follows `place` without loss."""
-    return stop - payload == _U(MARK_BYTES) and load4(buffer, payload) == _U(place[NEXT_SEQ])
+    """Whether the payload from `payload` to `stop` is a whole MARK, follows `place` without loss and holds what the dictionary allows.
+
+    Its truth is compared with -1 alone here: how many classes there are, the caller knows.
+    """
+    if stop - payload != _U(MARK_BYTES) or load4(buffer, payload) != _U(place[NEXT_SEQ]):
+        return False
+    photons = load4(buffer, payload + _U(28))
+    return (
+        (photons < _INFINITE or photons & _MAGNITUDE > _INFINITE)
+        and mark_truth(buffer, payload) >= -1
+        and load8(buffer, payload + _U(12)) < LARGEST
+        and load8(buffer, payload + _U(20)) < LARGEST
+    )
 
 
 @njit(cache=True, nogil=True)

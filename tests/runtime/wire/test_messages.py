@@ -153,9 +153,9 @@ def test_messages_survive_the_round_trip() -> None:
     patterns = np.arange(300, dtype=np.uint16) % 11
     bits = (np.arange(300) % 3 == 0).astype(np.uint8)
     block = wire.decode_clicks(
-        one(wire.encode_clicks(wire.ClickBlock(2**32 - 1, 2, 2**63, 2**40, 5, 9, patterns, bits), SESSION)).payload
+        one(wire.encode_clicks(wire.ClickBlock(2**32 - 1, 2, 2**63 - 1, 2**40, 5, 9, patterns, bits), SESSION)).payload
     )
-    assert block[:6] == (2**32 - 1, 2, 2**63, 2**40, 5, 9)
+    assert block[:6] == (2**32 - 1, 2, 2**63 - 1, 2**40, 5, 9)
     np.testing.assert_array_equal(block.patterns, patterns)
     np.testing.assert_array_equal(block.bits, bits)
     for mark in (wire.Mark(1, 2, 9, 3, 4, 1.5), wire.Mark(1, 2, -1, 3, 4, 1.5, 0xFFFF)):
