@@ -21,6 +21,7 @@ from typing import Any
 from pans.runtime import __version__
 
 from .errors import PansError, UsageError
+from .safe_text import lines, one_line
 
 EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 
@@ -36,7 +37,7 @@ class Command:
 
 def say(text: str) -> None:
     """Print for people, on stderr: stdout belongs to the JSON object or the answer itself."""
-    print(text, file=sys.stderr, flush=True)
+    print(lines(text), file=sys.stderr, flush=True)
 
 
 def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -> None:
@@ -44,7 +45,7 @@ def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -
     if args.json:
         print(json.dumps(payload, allow_nan=False, default=_plain), flush=True)
     elif text:
-        print(text, flush=True)
+        print(lines(text), flush=True)
 
 
 def _plain(value: Any) -> Any:
@@ -116,7 +117,8 @@ def _written_help(point: EntryPoint) -> str:
 def _failed(error: PansError, debug: bool) -> int:
     if debug:
         raise error
-    say(f"pans: {error}")
+    remedy = f"\n  remedy: {one_line(error.remedy)}" if error.remedy else ""
+    say(f"pans: {error.message}".replace("\n", "\n    ") + remedy)  # no line of a message can pass for one of ours
     return error.exit_code
 
 

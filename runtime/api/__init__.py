@@ -159,7 +159,8 @@ def _file_of(name: str | Path) -> Path:
 
 def _written(bundle: Bundle, folder: Path) -> Path:
     from pans.runtime.bundle.model import write_bundle
+    from pans.runtime.safe_text import file_name
 
-    path = folder / f"{bundle.name}.pans"
+    path = folder / f"{file_name(bundle.name)}.pans"
     write_bundle(bundle, path)
     return path

@@ -28,6 +28,7 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record.parts import is_of_parts
 from pans.runtime.report.file_facts import file_facts
 from pans.runtime.report.verify import FileVerdict, verify_file, verify_parts
+from pans.runtime.safe_text import one_line
 
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
@@ -93,20 +94,15 @@ def _info(args: argparse.Namespace) -> int:
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield (dotted key, printable value); a stranger's text must not steer the terminal."""
     for key, value in facts.items():
-        name = _printable(f"{prefix}{key}")
+        name = one_line(f"{prefix}{key}", _VALUE_CHARACTERS)
         if isinstance(value, dict):
             yield from _flat(value, f"{name}.")
         elif isinstance(value, list | tuple):
-            yield name, _printable(", ".join(str(item) for item in value))
+            yield name, one_line(", ".join(str(item) for item in value), _VALUE_CHARACTERS)
         elif key == "simulated" and value is True:
             yield name, "SIMULATED"
         elif value is not None and value != "":
-            yield name, _printable(str(value))
-
-
-def _printable(text: str) -> str:
-    short = text if len(text) <= _VALUE_CHARACTERS else f"{text[:_VALUE_CHARACTERS]}…"
-    return "".join(letter if letter.isprintable() else "�" for letter in short)
+            yield name, one_line(value, _VALUE_CHARACTERS)
 
 
 def _show_table(rows: list[tuple[str, str]]) -> None:

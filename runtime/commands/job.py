@@ -66,8 +66,8 @@ def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary:
         "device": f"{job.device} (firmware {summary.device.get('firmware', 'unknown')})",
         "profile": f"{job.profile.name}: {job.profile.description}",
         "decision back end": backend,
-        "recording": f"{job.recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; `pans replay` recomputes it)",
-        "command": f"`{job.command}`",
+        "recording": f"{job.recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it)",
+        "command": job.command,
         "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
     }
 

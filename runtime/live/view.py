@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pans.runtime.cli import say
 from pans.runtime.core.decision import NO_LABEL, Decision, Output
+from pans.runtime.safe_text import lines, one_line
 
 from .run import LiveRun, Watcher
 
@@ -94,13 +95,17 @@ class _Panel:
             style = "" if not known else "green" if decision.truth == decision.label else "red"
             table.add_row(
                 str(decision.object),
-                Text(name_of(decision.label, self._classes), style=style),
+                Text(one_line(name_of(decision.label, self._classes), 40), style=style),
                 f"{decision.probability:4.0%}",
                 f"{'●' * min(decision.clicks, 20)} {decision.clicks}",
-                self._classes[decision.truth] if known else "?",
+                Text(one_line(self._classes[decision.truth], 40)) if known else "?",
             )
         bar = ProgressBar(total=self._expected or None, completed=run.tally.decisions, width=60)
-        return Panel(Group(Text(_headline(run, self._expected)), bar, Text(""), table), title=self._banner, width=84)
+        return Panel(
+            Group(Text(lines(_headline(run, self._expected))), bar, Text(""), table),
+            title=Text(one_line(self._banner, 70)),
+            width=84,
+        )
 
 
 def name_of(label: int, classes: Sequence[str]) -> str:

@@ -18,6 +18,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList, is_dark
+from pans.runtime.safe_text import csv_cell
 
 DECISIONS = (
     *("decision", "tick", "time_us", "exposure", "object", "first_shot", "clicks", "label", "class"),
@@ -75,7 +76,7 @@ def _decision_row(row: Any, first_tick: int, us: float, classes: tuple[str, ...]
         *(int(row["index"]), int(row["tick"]), f"{(int(row['tick']) - first_tick) * us:.3f}"),
         *(int(row[name]) for name in ("exposure_index", "object", "shot", "clicks")),
         label if known else "",
-        classes[label] if known and label < len(classes) else "",
+        csv_cell(classes[label]) if known and label < len(classes) else "",
         int(row["truth"]) if row["truth"] >= 0 else "",
         repr(float(row["probability"])) if known else "",
         *(int(flags), "|".join(str(flag.name) for flag in flags)),

@@ -1,15 +1,16 @@
 """One self-contained HTML page: text, tables and pictures in a single file that needs nothing else.
 
-Owns escaping, layout and the inlining of pictures; never measures and never draws (figures.py). Nothing in the page is loaded from
+Owns layout and the inlining of pictures; never measures and never draws (figures.py). Nothing in the page is loaded from
 elsewhere and nothing in it runs: no script, no font, no style sheet of another.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from pans.runtime import safe_text
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -28,7 +29,7 @@ class Page:
 
     def __init__(self, title: str, *, simulated: bool) -> None:
         self._title = title
-        self._parts = [f"<h1>{_safe(title)}</h1>"]
+        self._parts = [f"<h1>{safe_text.html(title)}</h1>"]
         if simulated:
             self._parts.append(
                 '<p class="banner">SIMULATED: the clicks come from a simulated instrument, not from light.</p>'
@@ -36,20 +37,22 @@ class Page:
 
     def heading(self, text: str) -> None:
         """Begin a section."""
-        self._parts.append(f"<h2>{_safe(text)}</h2>")
+        self._parts.append(f"<h2>{safe_text.html(text)}</h2>")
 
     def text(self, text: str, kind: str = "") -> None:
         """Add a paragraph; `kind` is pass, fail, note or nothing."""
-        self._parts.append(f'<p class="{kind}">{_safe(text)}</p>' if kind else f"<p>{_safe(text)}</p>")
+        self._parts.append(
+            f'<p class="{kind}">{safe_text.html(text)}</p>' if kind else f"<p>{safe_text.html(text)}</p>"
+        )
 
     def table(self, rows: Iterable[Sequence[object]], head: Sequence[str] = ()) -> None:
         """Add a table; the first column names the row."""
         lines = ["<table>"]
         if head:
-            lines.append("<tr>" + "".join(f"<th>{_safe(name)}</th>" for name in head) + "</tr>")
+            lines.append("<tr>" + "".join(f"<th>{safe_text.html(name)}</th>" for name in head) + "</tr>")
         for row in rows:
-            cells = "".join(f"<td>{_safe(value)}</td>" for value in row[1:])
-            lines.append(f"<tr><th>{_safe(row[0])}</th>{cells}</tr>")
+            cells = "".join(f"<td>{safe_text.html(value)}</td>" for value in row[1:])
+            lines.append(f"<tr><th>{safe_text.html(row[0])}</th>{cells}</tr>")
         self._parts.append("\n".join([*lines, "</table>"]))
 
     def facts(self, facts: Mapping[str, Any]) -> None:
@@ -60,14 +63,13 @@ class Page:
         """Add a picture, PNG or SVG, with its caption."""
         kind = "png" if picture.startswith(b"\x89PNG") else "svg+xml"
         data = base64.b64encode(picture).decode()
-        self._parts.append(
-            f'<figure><img alt="{_safe(caption)}" src="data:image/{kind};base64,{data}"><figcaption>{_safe(caption)}</figcaption></figure>'
-        )
+        words, source = safe_text.html(caption), f"data:image/{kind};base64,{data}"
+        self._parts.append(f'<figure><img alt="{words}" src="{source}"><figcaption>{words}</figcaption></figure>')
 
     def html(self) -> bytes:
         """Return the whole page."""
         body = "\n".join(self._parts)
-        head = f'<meta charset="utf-8"><title>{_safe(self._title)}</title><style>{_STYLE}</style>'
+        head = f'<meta charset="utf-8"><title>{safe_text.html(self._title)}</title><style>{_STYLE}</style>'
         return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'.encode()
 
 
@@ -81,8 +83,3 @@ def flat(facts: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]
                 yield f"{prefix}{name}", ", ".join(str(item) for item in value)
         elif value is not None and value != "":
             yield f"{prefix}{name}", f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _safe(value: object) -> str:
-    text = "".join(letter if letter.isprintable() or letter in "\n\t" else "�" for letter in str(value))
-    return html.escape(text, quote=True)

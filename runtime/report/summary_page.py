@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.container import replace_file
+from pans.runtime.safe_text import markdown
 
 from .summary import Summary
 from .words import flow_rows
@@ -24,10 +25,10 @@ def write_markdown(
 ) -> None:
     """Write the summary page; `facts` are name -> text lines about what was run (bundle, profile, device, command)."""
     simulated = " (SIMULATED)" if summary.simulated else ""
-    lines = [f"# Run of {facts.get('bundle', 'a bundle')}{simulated}", ""]
+    lines = [f"# Run of {markdown(facts.get('bundle', 'a bundle'))}{simulated}", ""]
     if summary.simulated:
         lines += ["> **SIMULATED**: the clicks come from a simulated instrument, not from light.", ""]
-    lines += [f"**{summary.verdict}**" + "".join(f"\n- {fault}" for fault in summary.faults), ""]
+    lines += [f"**{summary.verdict}**" + "".join(f"\n- {markdown(fault)}" for fault in summary.faults), ""]
     lines += [
         *_figures(summary),
         "",
@@ -39,7 +40,7 @@ def write_markdown(
         "## What was run",
         "",
     ]
-    lines += [f"- {name}: {text}" for name, text in facts.items()]
+    lines += [f"- {name}: {markdown(text)}" for name, text in facts.items()]
     replace_file(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -61,7 +62,13 @@ def _figures(summary: Summary) -> list[str]:
     ]
     if summary.flow is not None:
         rows += flow_rows(summary.flow.passages, summary.flow.gates)
-    return ["## Results", "", "| figure | value |", "| --- | --- |", *(f"| {name} | {text} |" for name, text in rows)]
+    return [
+        "## Results",
+        "",
+        "| figure | value |",
+        "| --- | --- |",
+        *(f"| {markdown(name)} | {markdown(text)} |" for name, text in rows),
+    ]
 
 
 def _timing(summary: Summary) -> list[str]:
@@ -76,14 +83,15 @@ def _timing(summary: Summary) -> list[str]:
     for name, row in stages.items():
         table.append(f"| {name} | {row['p50']:.0f} | {row['p99']:.0f} | {row['p999']:.0f} | {row['max']:.0f} |")
     granted = (
-        ", ".join(f"{what}: {answer}" for what, answer in summary.realtime.items()) or "virtual time: nothing asked for"
+        ", ".join(f"{what}: {markdown(answer)}" for what, answer in summary.realtime.items())
+        or "virtual time: nothing asked for"
     )
     tail = [
         "",
         f"- deadline {summary.deadline_us:.0f} us: {summary.late} late; {summary.lost} exposures lost",
         f"- clock: uncertainty at most {summary.clock['worst_uncertainty_us']:.0f} us, "
         f"drift {summary.clock.get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary.slot_jitter_us:.1f} us",
-        f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {summary.ended}",
+        f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {markdown(summary.ended)}",
         f"- real-time set-up: {granted}",
     ]
     return head + table + tail
@@ -103,13 +111,16 @@ def _causes(summary: Summary) -> list[str]:
     for event in summary.blame:
         late = event["what"] == "late"
         what = f"{event['decisions']} late" if late else f"{event['exposures']} exposures missing"
-        lines.append(f"| {what} | {event['cause']} | {'yes' if event['sure'] else 'no'} | {event['why']} |")
+        lines.append(
+            f"| {what} | {markdown(event['cause'])} | {'yes' if event['sure'] else 'no'} | {markdown(event['why'])} |"
+        )
     return [*lines, ""]
 
 
 def _confusion(confusion: NDArray[np.int64], classes: Sequence[str]) -> list[str]:
     if not confusion.any():
         return []
+    classes = [markdown(name) for name in classes]
     head = ["## Decisions by class", "", "Rows: truth; columns: decision.", "", "| | " + " | ".join(classes) + " |"]
     rule = "| --- |" + " --- |" * len(classes)
     body = [

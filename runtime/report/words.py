@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from pans.runtime.safe_text import one_line
+
 if TYPE_CHECKING:
     from pans.runtime.flow.matching import PassageFigures, Share
     from pans.runtime.live.flow_run import FlowFigures
@@ -28,9 +30,9 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
         f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
         f"max {latency['max']:.0f} us; late {summary.late}, lost {summary.lost}",
         *([] if summary.flow is None else flow_words(summary.flow)),
-        *(f"  fault         {fault}" for fault in summary.faults),
-        f"  recording     {recording}",
-        f"  report        {report}",
+        *(f"  fault         {one_line(fault)}" for fault in summary.faults),
+        f"  recording     {one_line(recording)}",
+        f"  report        {one_line(report)}",
     ]
     return "\n".join(lines)
 

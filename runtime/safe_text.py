@@ -1,0 +1,78 @@
+"""Text from outside made inert for where it goes: a terminal, a Markdown page, HTML, a CSV cell, a file name.
+
+Owns these rules; every output of device strings, class names, file names and calibrations goes through one of them. JSON needs none: it
+is ASCII with escapes, and stays exact. Characters that do something instead of being seen (controls, line and paragraph separators,
+changes of the writing direction, surrogates, private ones) become their Python escapes; what is too long is cut and ends in an ellipsis.
+
+>>> one_line("SN-1\\x1b[2J\\nPASS")
+'SN-1\\\\x1b[2J\\\\nPASS'
+>>> csv_cell("=HYPERLINK(1)")
+"'=HYPERLINK(1)"
+"""
+
+from __future__ import annotations
+
+import html as _html
+import re
+from typing import Any
+
+LINE_MAX = 2000  # characters of one line of foreign text
+FILE_NAME_MAX = 100
+_MARKDOWN = re.compile(r"([\\`*_{}\[\]<>()#|~&!$^])")
+_FORMULA = (
+    "=",
+    "+",
+    "-",
+    "@",
+    "\t",
+    "\r",
+    "＝",
+    "＋",
+    "－",
+    "＠",
+)  # what spreadsheets take for a formula; the wide forms too
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?")
+_NO_FILE_NAME = re.compile(r"[^A-Za-z0-9._-]+")
+_DEVICES = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names that Windows keeps for itself
+
+
+def one_line(value: Any, most: int = LINE_MAX) -> str:
+    """Return `value` as one visible line of at most `most` characters."""
+    text = str(value)
+    cut = text[:most]
+    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in cut)
+    return f"{shown[: most - 1]}…" if len(text) > most or len(shown) > most else shown
+
+
+def lines(value: Any) -> str:
+    """Return a text that we made, of several lines, for a terminal: foreign parts of it can move nothing and recolour nothing."""
+    return "\n".join(
+        "".join(letter if letter.isprintable() or letter == "\t" else ascii(letter)[1:-1] for letter in line)
+        for line in str(value).split("\n")
+    )
+
+
+def markdown(value: Any, most: int = LINE_MAX) -> str:
+    """Return `value` as one line that Markdown shows as it is, in a paragraph, a list or a cell of a table."""
+    text = _MARKDOWN.sub(r"\\\1", one_line(value, most))
+    return re.sub(r"^(\s*)([-+=:.]|\d+[.)])", r"\1\\\2", text) if re.match(r"\s*([-+=:]|\d+[.)]\s)", text) else text
+
+
+def html(value: Any, most: int = 100 * LINE_MAX) -> str:
+    """Return `value` for a text or an attribute of an HTML page; its line ends stay."""
+    return _html.escape("\n".join(one_line(line, most) for line in str(value).split("\n")), quote=True)
+
+
+def csv_cell(value: Any) -> Any:
+    """Return a text that no spreadsheet takes for a formula, on one line; anything but text stays as it is."""
+    if not isinstance(value, str):
+        return value
+    shown = one_line(value)
+    formula = value.lstrip(" ").startswith(_FORMULA) and not _NUMBER.fullmatch(value)
+    return f"'{shown}" if formula else shown
+
+
+def file_name(value: Any, otherwise: str = "unnamed") -> str:
+    """Return a name for a file made from `value`: letters, digits, dot, dash and underscore, no leading dot."""
+    name = _NO_FILE_NAME.sub("-", str(value)).strip(".-")[:FILE_NAME_MAX].rstrip(".-")
+    return f"{otherwise}-{name}" if _DEVICES.fullmatch(name) else name or otherwise

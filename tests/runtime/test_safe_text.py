@@ -1,0 +1,144 @@
+"""One list of nasty texts, every kind of output: shown, never obeyed; JSON stays exact."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from nasty import NASTY
+
+from pans.firmware_sim.testing import small_setup
+from pans.runtime import cli, safe_text
+from pans.runtime.errors import UsageError
+from pans.runtime.report.page import Page
+
+nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
+
+
+def is_inert(line: str, most: int = safe_text.LINE_MAX) -> bool:
+    return line.isprintable() and len(line) <= most
+
+
+@nasty
+def test_one_line(text: str) -> None:
+    shown = safe_text.one_line(text)
+    assert is_inert(shown)
+    assert shown == text or not text.isprintable() or len(text) > safe_text.LINE_MAX
+
+
+@nasty
+def test_the_terminal(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    class Args:
+        json = False
+
+    cli.say(f"pans: {text}")
+    cli.emit(Args(), {}, f"found {text}")  # type: ignore[arg-type]
+    assert cli._failed(UsageError(f"the device says {text}", remedy=text), debug=False) == 2
+    found = capsys.readouterr()
+    for line in (found.out + found.err).split("\n"):
+        assert line.replace("\t", "").isprintable()
+    message = found.err.split("the device says")[1].split("\n  remedy")[0]
+    assert not re.search(r"^\S", message.split("\n", 1)[1] if "\n" in message else "", re.MULTILINE)
+
+
+@nasty
+def test_json_stays_exact(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    class Args:
+        json = True
+
+    cli.emit(Args(), {"serial": text})  # type: ignore[arg-type]
+    out = capsys.readouterr().out
+    assert json.loads(out) == {"serial": text}
+    assert out.isascii()
+    assert out.count("\n") == 1
+
+
+class Tags(HTMLParser):
+    """What a browser sees: elements, their attributes, text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[Any] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.found.append((tag, tuple(name for name, _ in attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def tags_of(text: str) -> Tags:
+    page = Page(text, simulated=False)
+    page.text(text)
+    page.heading(text)
+    page.table([(text, text)], head=(text,))
+    page.facts({text: {"inner": [text]}})
+    page.figure(b"\x89PNG", text)
+    tags = Tags()
+    tags.feed(page.html().decode())
+    return tags
+
+
+@nasty
+def test_html(text: str) -> None:
+    found, plain = tags_of(text or "x"), tags_of("plain")
+    assert found.found == plain.found
+    assert found.text.replace("\n", "").isprintable()
+
+
+@nasty
+def test_markdown(text: str) -> None:
+    shown = safe_text.markdown(text)
+    assert is_inert(shown, 2 * safe_text.LINE_MAX + 2)
+    assert not re.search(r"(?<!\\)(?:\\\\)*[|<>`*_\[\]!&#$~]", shown)  # each has an odd number of backslashes before it
+    assert not re.match(r"\s*([-+=]|\d+[.)])(\s|$)", shown)
+
+
+@nasty
+def test_csv(text: str) -> None:
+    out = io.StringIO()
+    csv.writer(out).writerow([safe_text.csv_cell(text), safe_text.csv_cell(-3), safe_text.csv_cell("-3.5e2"), "end"])
+    row = next(csv.reader(io.StringIO(out.getvalue())))
+    assert row[1:] == ["-3", "-3.5e2", "end"]
+    assert row[0].isprintable()
+    assert not row[0].lstrip().startswith(("=", "+", "-", "@", "＝"))
+
+
+@nasty
+def test_file_names(text: str, tmp_path: Path) -> None:
+    name = safe_text.file_name(text)
+    assert re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,110}", name)
+    (tmp_path / name).write_text("")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@nasty
+def test_the_summary_page_of_a_run(text: str, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    import pans
+    from pans.runtime.report.summary_page import write_markdown
+    from pans.runtime.report.words import closing_words
+
+    if not hasattr(test_the_summary_page_of_a_run, "done"):
+        done = pans.run(small_setup()[1], "sim:ideal?scene=uniform&seed=1&pace=fast", decisions=2)
+        test_the_summary_page_of_a_run.done = done.summary  # type: ignore[attr-defined]
+    summary = replace(test_the_summary_page_of_a_run.done, faults=[text], ended=text)  # type: ignore[attr-defined]
+    facts = {"bundle": text, "device": text, "command": text}
+    plain, found = tmp_path / "plain.md", tmp_path / "summary.md"
+    write_markdown(
+        plain, replace(summary, faults=["x"], ended="x"), dict.fromkeys(facts, "x"), np.eye(2, dtype=np.int64), "ab"
+    )
+    write_markdown(found, summary, facts, np.eye(2, dtype=np.int64), [text, "b"])
+    assert found.read_text().count("\n") == plain.read_text().count("\n")
+    assert all(line.isprintable() for line in found.read_text().split("\n"))
+    words = closing_words(summary, text, text)
+    assert words.count("\n") == closing_words(replace(summary, faults=["x"]), "x", "x").count("\n")

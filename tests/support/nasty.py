@@ -1,0 +1,38 @@
+"""Texts that a device, a bundle, a file name or a calibration may hold, and that no output may obey."""
+
+from __future__ import annotations
+
+NASTY = (
+    "",
+    "plain",
+    "\x1b[2J\x1b[31mred\x1b]0;title\x07",
+    "one\ntwo\r\nthree\rfour",
+    "tab\tand\x00nul\x7fdel\x9bcsi",
+    "safe\u202egnp.exe\u202c \u2066x\u2069",
+    "zero\u200bwidth\ufeff \u2028line \u2029paragraph",
+    "\ud800 half a surrogate",
+    '=HYPERLINK("http://x";"y")',
+    "+1+1",
+    "-2+3",
+    "@SUM(A1)",
+    " =1+1",
+    "\t=1",
+    "＝1",
+    "<script>alert(1)</script>",
+    '" onmouseover="x',
+    "[link](http://x) ![picture](http://x/y.png)",
+    "| a | b |\n| --- | --- |",
+    "# heading",
+    "- item",
+    "1. first",
+    "`code` **bold** _it_ ~~gone~~ &amp; <b>",
+    "[bold red]rich[/bold red] [/nothing]",
+    "../../etc/passwd",
+    "/absolute",
+    "C:\\con",
+    "con.txt",
+    "...",
+    "x" * 100_000,
+    "é" * 5000,
+    "{{ template }} ${shell} $(rm) `rm`",
+)
