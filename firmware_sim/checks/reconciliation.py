@@ -184,6 +184,6 @@ def _device_and_wire(device: dict[int, DeviceBooks], wire: ObservedLink) -> Iter
 def _recording_and_replay(recording: Recording, result: RunResult, bundle: Bundle) -> Iterator[str]:
     if result.tally.decisions != recording.n_decisions:
         yield f"{result.tally.decisions} decisions were made, {recording.n_decisions} are recorded"
-    n_decisions, sha256, _ = replay(recording, bundle)
+    n_decisions, sha256 = replay(recording, bundle)[:2]
     if (n_decisions, sha256) != (recording.n_decisions, recording.decisions_sha256):
         yield f"a replay gives {n_decisions} decisions of {recording.n_decisions}, or other ones"

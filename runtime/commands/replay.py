@@ -40,23 +40,20 @@ def _run(args: argparse.Namespace) -> int:
 
     pictures = PictureLog() if args.pictures or args.truth else None
     recording, found = _replayed(args, args.recording, pictures)
-    identical = found.sha256 == recording.decisions_sha256
     payload = {
         "decisions": found.decisions,
         "sha256": found.sha256,
         "recorded_sha256": recording.decisions_sha256,
-        "identical": identical,
-        "complete": recording.complete,
+        **_agreement(recording, found),
         **_figures(found),
     }
     if pictures is not None and args.pictures:
         pictures.write(args.pictures)
     if pictures is not None and args.truth:
         payload |= pictures.compare(args.truth)
-    words = "identical" if identical else f"DIFFERENT from the recorded log ({recording.n_decisions} decisions)"
-    head = f"{found.decisions} decisions, SHA-256 {found.sha256}: {words}"
+    head = f"{found.decisions} decisions, SHA-256 {found.sha256}: {_agreement_words(recording, found)}"
     emit(args, payload, "\n".join([head, *_words(found)]))
-    return EXIT_FINE if identical else EXIT_ALERT
+    return EXIT_FINE if found.as_recorded else EXIT_ALERT
 
 
 def _run_parts(args: argparse.Namespace) -> int:
@@ -67,10 +64,9 @@ def _run_parts(args: argparse.Namespace) -> int:
     lines: list[str] = []
     for path in parts_in(args.recording):
         recording, found = _replayed(args, path)
-        same = found.sha256 == recording.decisions_sha256
-        facts = {"part": path.name, "decisions": found.decisions, "sha256": found.sha256, "identical": same}
-        rows.append(facts | _figures(found))
-        lines += [f"{path.name}: {found.decisions} decisions: {'identical' if same else 'DIFFERENT'}", *_words(found)]
+        facts = {"part": path.name, "decisions": found.decisions, "sha256": found.sha256}
+        rows.append(facts | _agreement(recording, found) | _figures(found))
+        lines += [f"{path.name}: {found.decisions} decisions: {_agreement_words(recording, found)}", *_words(found)]
     identical = all(row["identical"] for row in rows)
     payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}
     emit(args, payload, "\n".join(lines))
@@ -84,6 +80,24 @@ def _replayed(args: argparse.Namespace, path: Path, pictures: PictureLog | None 
     recording = read_recording(path)
     bundle = load_bundle(args.bundle)[0] if args.bundle else recording.bundle()
     return recording, replay(recording, bundle, pictures)
+
+
+def _agreement(recording: Recording, found: Replayed) -> dict[str, Any]:
+    return {
+        "identical": found.as_recorded,
+        "complete": recording.complete,
+        "decisions_recorded": found.recorded,
+        "decisions_more": found.more,
+    }
+
+
+def _agreement_words(recording: Recording, found: Replayed) -> str:
+    if not found.as_recorded:
+        return f"DIFFERENT from the recorded log ({found.recorded} decisions)"
+    if recording.complete:
+        return "identical"
+    more = f", {found.more} more can be decided" if found.more else ""
+    return f"identical as far as recorded: {found.recorded} of {found.recorded}{more}"
 
 
 def _figures(found: Replayed) -> dict[str, Any]:

@@ -53,6 +53,8 @@ class Recorder:
         self._events = ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
         self._decisions = RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
         self._timings = RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
+        # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
+        self._in_order = (self._commands, self._messages, self._decisions, self._timings)
         self._log = LogEncoder()
         from .kernels import pack_messages  # numba is loaded only by who records
 
@@ -155,14 +157,14 @@ class Recorder:
 
     def flush(self) -> None:
         """Write everything that is buffered to the file, in one call; it then survives the death of this process."""
-        self._flush(self._commands, self._messages, self._decisions, self._timings, self._events)
+        self._flush(*self._in_order, self._events)
 
     def flush_decisions(self) -> None:
         """Write what the decisions so far are made of, and these: as much as an action upon them needs on record before it."""
-        self._flush(self._commands, self._messages, self._decisions)
+        self._empty(self._decisions)
 
     def _flush(self, *buffers: RowBuffer | ByteBuffer) -> None:
-        n_decisions = self._decisions.used
+        n_decisions = self._decisions.used if self._decisions in buffers else 0
         blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
         if blocks:
             self._write(b"".join(blocks))
@@ -200,10 +202,11 @@ class Recorder:
         buffer.add(data)
 
     def _empty(self, buffer: RowBuffer | ByteBuffer) -> None:
-        if buffer.used:
-            n_decisions = self._decisions.used if buffer is self._decisions else 0
-            self._write(self._block_of(buffer))
-            self._n_decisions += n_decisions
+        """Write a buffer to the file, and before it what must stand before it."""
+        if buffer in self._in_order:
+            self._flush(*self._in_order[: self._in_order.index(buffer) + 1])
+        else:
+            self._flush(buffer)
 
     def _block_of(self, buffer: RowBuffer | ByteBuffer) -> bytes:
         """Empty a buffer into a block, which must be written next."""

@@ -1,7 +1,7 @@
 """A recording decided again: from its raw messages to decisions, with the same core as in the live run.
 
-Owns the way from a recording back to a core and the frames' order; never judges. `replay` returns the number of decisions and the hash
-of their log, which is the recorded one when nothing has changed.
+Owns the way from a recording back to a core and the frames' order; never judges. `replay` returns the number of decisions, the hash
+of their log, which is the recorded one when nothing has changed, and how far they agree with a recording that was cut off.
 """
 
 from __future__ import annotations
@@ -42,18 +42,65 @@ _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, Ove
 
 
 class Replayed(NamedTuple):
-    """What a replay gave: how many decisions, the SHA-256 of their log, and what those about passing objects were worth."""
+    """What a replay gave: how many decisions, the SHA-256 of their log, what those about passing objects were worth, the agreement.
+
+    `as_recorded`: every recorded decision was made again, bit for bit, and, where the recording has its end, no other one. A
+    recording that was cut off may hold messages of decisions that it has lost: there may be more than the `recorded` ones.
+    """
 
     decisions: int
     sha256: str
     passages: PassageFigures | None
+    recorded: int
+    as_recorded: bool
+
+    @property
+    def more(self) -> int:
+        """Decisions beyond those that are recorded."""
+        return max(0, self.decisions - self.recorded)
 
 
 def replay(recording: Recording, bundle: Bundle, pictures: PictureLog | None = None) -> Replayed:
     """Decide `recording` again with `bundle`; `pictures` collects those given back."""
-    core, n_decisions, sha256 = _replayed(recording, bundle, pictures)
+    if _was_cut_before_messages(recording):
+        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True)
+    core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
-    return Replayed(n_decisions, sha256, passages)
+    sha256 = log.sha256()
+    same = sha256 if recording.complete else log.sha256_as_far
+    return Replayed(log.decisions, sha256, passages, recording.n_decisions, same == recording.decisions_sha256)
+
+
+def _was_cut_before_messages(recording: Recording) -> bool:
+    """Whether the run was cut off before anything could be decided: while the device was set up."""
+    return not (recording.complete or recording.n_decisions or Kind.MESSAGES in recording.kinds)
+
+
+class _Log:
+    """The log of a replay; `sha256_as_far` is its hash after as many decisions as are recorded, "" while there are fewer."""
+
+    def __init__(self, n_recorded: int, pictures: PictureLog | None) -> None:
+        self.decisions = 0
+        self.sha256_as_far = ""
+        self._n_recorded, self._pictures = n_recorded, pictures
+        self._encoder = LogEncoder()
+        self.take([])
+
+    def take(self, decisions: list[Any]) -> None:
+        rows = np.array(decisions, DECISION_DTYPE)
+        here = self._n_recorded - self.decisions  # rows up to the last recorded one
+        if 0 <= here <= len(rows) and not self.sha256_as_far:
+            self._encoder.update(rows[:here])
+            self.sha256_as_far = self._encoder.hexdigest()
+            self._encoder.update(rows[here:])
+        else:
+            self._encoder.update(rows)
+        self.decisions += len(rows)
+        if self._pictures is not None:
+            self._pictures.note(decisions)
+
+    def sha256(self) -> str:
+        return self._encoder.hexdigest()
 
 
 def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures, NDArray[np.int64]]:
@@ -61,22 +108,23 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
 
     UsageError where nothing passed.
     """
-    core, _, _ = _replayed(recording, bundle, None)
+    core, _ = _replayed(recording, bundle, None)
     if not isinstance(core, FlowCore):
         raise UsageError(f"{recording.path}: no objects pass by in this run")
     return replayed_figures(core, recording.events()), core.matcher.confusion
 
 
-def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, int, str]:
-    """Drive a core through `recording`; return it, the number of decisions and the SHA-256 of their log."""
+def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, _Log]:
+    """Drive a core through `recording`; return it and the log of its decisions."""
     core, arms = _rebuilt(recording, bundle, pictures)
-    log, n_decisions = LogEncoder(), 0
+    log = _Log(recording.n_decisions, pictures)
     for decisions in _decisions(core, arms, recording):
-        log.update(np.array(decisions, DECISION_DTYPE))
-        n_decisions += len(decisions)
-        if pictures is not None:
-            pictures.note(decisions)
-    return core, n_decisions, log.hexdigest()
+        log.take(decisions)
+    went_on = "part_ended" in recording.summary  # in the next part
+    was_cut = not recording.complete and log.decisions >= recording.n_decisions  # the run did not end there
+    if not (went_on or was_cut):
+        log.take(core.end().decisions)
+    return core, log
 
 
 def _rebuilt(
@@ -166,5 +214,3 @@ def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording
             yield begin_next()
         except StopIteration:
             break
-    if "part_ended" not in recording.summary:  # the run went on in the next part
-        yield core.end().decisions
