@@ -196,7 +196,8 @@ class LiveRun:
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
-        outputs = self.take(self.connection.pump(self.lateness.poll_s(self.now_ns())))
+        looked_ns = self.now_ns()
+        outputs = self.take(self.connection.pump(self.lateness.poll_s(looked_ns)))
         now_ns = self.now_ns()
         self._act(now_ns)
         if (verdict := self.lateness.settled(self.connection, now_ns, idle=not outputs)) is not None:
@@ -215,10 +216,13 @@ class LiveRun:
             self._recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self._turn_page(now_ns)
-        self.ended = self._why_ended(now_ns)
+        self.ended = self._why_ended(now_ns, looked_ns, idle=not outputs)
 
-    def _why_ended(self, now_ns: int) -> str:
-        """Return why the run is over ("" while it is not); LinkError when the device is lost in a way that may be recovered from."""
+    def _why_ended(self, now_ns: int, looked_ns: int, *, idle: bool) -> str:
+        """Return why the run is over ("" while it is not); LinkError when the device is lost in a way that may be recovered from.
+
+        Silence counts up to `looked_ns`, and only where nothing came since: after a stop of this process what came meanwhile is read first.
+        """
         if self.core.completed:
             return "completed"
         session = self.connection.session
@@ -231,9 +235,9 @@ class LiveRun:
             return f"the device went dark by itself: reason {status.reason}"
         if self.config.seconds and now_ns - self.start_ns >= self.config.seconds * NS_PER_S:
             return "time is up"
-        if now_ns - session.heard_ns > UNHEARD_NS:
+        if idle and looked_ns - session.heard_ns > UNHEARD_NS:
             raise LinkError("the device fell silent")
-        if now_ns - self.last_data_ns > SILENCE_NS + self.plan.cycle_us * NS_PER_US:
+        if idle and looked_ns - self.last_data_ns > SILENCE_NS + self.plan.cycle_us * NS_PER_US:
             raise LinkError("the device answers, but sends no clicks")
         return ""
 

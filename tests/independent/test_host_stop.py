@@ -54,6 +54,18 @@ def read_trace(path: Path) -> list[Opening]:
     return openings
 
 
+def from_first_block(messages: list[Message]) -> list[Message]:
+    """Leave out what a session says before its first block: a STATUS that came just before ARM may be on record or not."""
+    begun: set[int] = set()
+    kept = []
+    for message in messages:
+        if message[0] in STREAM:
+            begun.add(message[1])
+        if message[1] in begun:
+            kept.append(message)
+    return kept
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stopped_s", [0.6, STOPPED_S])
 def test_what_arrived_while_the_host_stood_still_is_accounted_for(tmp_path: Path, stopped_s: float) -> None:
@@ -95,10 +107,14 @@ def test_what_arrived_while_the_host_stood_still_is_accounted_for(tmp_path: Path
     recorded = [(body[0], int.from_bytes(body[4:8], "little"), body[8:]) for _, body in recording.messages]
     stream = summary["stream"]
     print(len(arrived), len(recorded), stream, summary["link"], books)
-    assert arrived == recorded
+    assert from_first_block(arrived) == from_first_block(recorded)
     counted = stream["messages"] + stream["repeated"] + stream["malformed"]
     assert sum(kind in STREAM for kind, _, _ in arrived) == counted
     assert sum(opening.from_device.damaged for opening in openings) == 0
+    lost = [event["reason"] for event in recording.events if event["kind"] == "link_lost"]
+    assert all("lease" in reason for reason in lost), (
+        lost
+    )  # it was the host that stood still, not the device that fell silent
     assert books["lease_expiries"] == summary["reconnects"] == int(stopped_s > 1)
 
 
