@@ -78,7 +78,20 @@ def strict_json(data: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise Damaged(str(error)) from error
     demand(isinstance(value, dict), "no JSON object")
+    _within_limits(value, 1)
     return dict(value)
+
+
+def _within_limits(value: Any, depth: int) -> None:
+    """Demand nesting of at most 64, whole numbers of 64 bits and finite others."""
+    demand(depth <= 64, "nested too deep")
+    if isinstance(value, int):
+        demand(-(1 << 63) <= value < 1 << 64, "a whole number beyond 64 bits")
+    elif isinstance(value, float):
+        demand(abs(value) <= 1.7976931348623157e308, "a number beyond float64")
+    elif isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            _within_limits(item, depth + isinstance(item, dict | list))
 
 
 def read_bundle(data: bytes) -> Bundle:

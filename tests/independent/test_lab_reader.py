@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bundles import made_bundle
 from heads import onnx_chain, random_layers
-from lab_bundle import Damaged, read_bundle
+from lab_bundle import Damaged, read_bundle, strict_json
 from lab_decisions import decide_again
 from lab_recording import read_recording
 from tree import ROOT
@@ -18,6 +18,7 @@ from tree import ROOT
 from pans.runtime.bundle import Bundle, load_bundle, write_bundle
 from pans.runtime.bundle.int8 import quantise_head
 from pans.runtime.cli import main
+from pans.runtime.container import parse_json_object
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record import read_recording as our_reader
 
@@ -127,6 +128,29 @@ def test_a_bundle_means_the_same() -> None:
             x = x @ weights + bias
             x = np.maximum(x, 0) if relu else x
         assert np.abs(x - scores).max() <= 1e-5 * max(1.0, np.abs(scores).max())
+
+
+NOT_JSON = [
+    '{"a":1e999}',
+    '{"a":NaN}',
+    '{"a":1,"a":1}',
+    '{"a":18446744073709551616}',
+    "[1]",
+    '{"a":' + "[" * 64 + "]" * 64 + "}",
+]
+
+
+@pytest.mark.parametrize("text", NOT_JSON, ids=lambda text: text[:20])
+def test_both_readers_refuse_the_same_json(text: str) -> None:
+    with pytest.raises(Damaged):
+        strict_json(text.encode())
+    with pytest.raises(DamagedFileError):
+        parse_json_object(text.encode(), "here")
+
+
+@pytest.mark.parametrize("text", ['{"a":18446744073709551615}', '{"a":1e308}', '{"a":' + "[" * 63 + "]" * 63 + "}"])
+def test_both_readers_take_the_same_json(text: str) -> None:
+    assert strict_json(text.encode()) == parse_json_object(text.encode(), "here")
 
 
 def test_both_readers_notice_every_change(tmp_path: Path) -> None:
