@@ -21,6 +21,7 @@ from typing import Any
 from pans.runtime import __version__
 
 from .errors import PansError, UsageError
+from .ranges import FINITE, WHOLE
 from .safe_text import lines, one_line
 
 EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
@@ -70,6 +71,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--json", action="store_true", help="print one JSON object on stdout, everything else on stderr"
     )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    for kind, numbers in (
+        (int, WHOLE),
+        (float, FINITE),
+    ):  # of every option of that type: no nan, no inf, nothing beyond 64 bits
+        parser.register("type", kind, numbers.option)
     command.configure(parser)
     rest = list(words)
     rest.remove(wanted)

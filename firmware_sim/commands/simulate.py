@@ -20,6 +20,7 @@ from pans.firmware_sim.ports.faults import check_possible, parse_faults
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument, check_options
 from pans.firmware_sim.ports.shell import open_port, serve
 from pans.runtime.cli import Command, emit, say
+from pans.runtime.ranges import Range
 from pans.runtime.timing.cpu import check_core
 
 
@@ -28,7 +29,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
     parser.add_argument("--core", type=int, metavar="N", help="bind it to processor core N and keep that awake")
     parser.add_argument(
-        "--echo", type=int, metavar="BYTES", help="no instrument: answer each frame with BYTES bytes (for benchmarks)"
+        "--echo",
+        type=Range(0, 1 << 20, whole=True).option,
+        metavar="BYTES",
+        help="no instrument: answer each frame with BYTES bytes (for benchmarks)",
     )
     parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started this one")
 

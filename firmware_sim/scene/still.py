@@ -7,19 +7,17 @@ scene file is measured before anything is allocated, and never unpickled.
 
 from __future__ import annotations
 
-import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.errors import ConfigError, PansError
+from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.images import read_class_folder
+from pans.runtime.npz_file import read_arrays
 
 MAX_OBJECTS = 1 << 17
 MAX_PIXELS = 1 << 22
@@ -29,8 +27,6 @@ NAME_MAX = 250  # of a file: longer ones no system has
 UNKNOWN_LABEL = -1
 SCENE_FOLDER = Path(__file__).parent.parent / "scenes"
 TARGETS = ("uniform", "dark")
-# RuntimeError: an encrypted member; NotImplementedError: an unknown compression
-_UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +101,15 @@ def load_images(name: str, base: Path) -> Scene:
 
 def scene_from_arrays(name: str, images: NDArray[Any], labels: NDArray[Any] | None, classes: tuple[str, ...]) -> Scene:
     """Make a `Scene` of images uint8 (n, height, width), labels integer (n,) or None, and class names; ConfigError."""
+    if images.ndim != 3 and images.dtype == np.uint8:
+        raise ConfigError(f"{name}: images must be (objects, height, width), found {_kind(images)}")
     if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
         raise ConfigError(f"{name}: images must be uint8 (objects, height, width) and not empty, found {_kind(images)}")
+    if len(images) > MAX_OBJECTS or images.shape[1] * images.shape[2] > MAX_PIXELS:
+        raise ConfigError(
+            f"{name}: images must be (objects, height, width), at most {MAX_OBJECTS} objects of {MAX_PIXELS} pixels,"
+            f" found {images.shape}"
+        )
     if labels is None:
         labels = np.full(images.shape[0], UNKNOWN_LABEL, np.int16)
     if labels.dtype.kind not in "iu" or labels.shape != images.shape[:1]:
@@ -129,8 +132,8 @@ def _target(name: str) -> Scene:
 
 def _read_scene(path: Path, name: str) -> Scene:
     try:
-        arrays = _read_npz(path)
-    except _UNREADABLE as error:
+        arrays = read_arrays(path, ("images", "labels", "classes"), MAX_SCENE_BYTES)
+    except (ValueError, UsageError) as error:
         raise ConfigError(
             f"{path}: not a readable scene file: {error}",
             remedy="write it with numpy.savez(FILE, images=, labels=, classes=)",
@@ -148,38 +151,6 @@ def _classes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
     if names.dtype.kind != "U" or names.ndim != 1 or names.size > MAX_CLASSES:
         raise ConfigError(f"{path}: classes must be a list of at most {MAX_CLASSES} names, found {_kind(names)}")
     return tuple(str(name) for name in names)
-
-
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the three arrays after their sizes were found sane in the archive's directory and in their own headers."""
-    wanted = ("images", "labels", "classes")
-    with zipfile.ZipFile(path) as archive:
-        sizes = {info.filename: info.file_size for info in archive.infolist()}
-        present = [name for name in wanted if f"{name}.npy" in sizes]
-        total = sum(sizes[f"{name}.npy"] for name in present)
-        if total > MAX_SCENE_BYTES:
-            raise ConfigError(f"{path}: holds {total} bytes of arrays, allowed are {MAX_SCENE_BYTES}")
-        for name in present:
-            with archive.open(f"{name}.npy") as member:
-                _check_header(path, name, member, sizes[f"{name}.npy"])
-    with np.load(path, allow_pickle=False) as loaded:
-        return {name: loaded[name] for name in present}
-
-
-def _check_header(path: Path, name: str, member: IO[bytes], size: int) -> None:
-    version = np.lib.format.read_magic(member)
-    if version not in ((1, 0), (2, 0)):
-        raise ConfigError(f"{path}: {name} is stored in npy version {version}, allowed are 1.0 and 2.0")
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(member)
-    claimed = math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or claimed > size:
-        raise ConfigError(f"{path}: {name} claims {claimed} bytes as {dtype} {shape}, the file holds {size}")
-    if name == "images" and (len(shape) != 3 or shape[0] > MAX_OBJECTS or shape[1] * shape[2] > MAX_PIXELS):
-        raise ConfigError(
-            f"{path}: images must be (objects, height, width), at most {MAX_OBJECTS} objects of {MAX_PIXELS} pixels,"
-            f" found {shape}"
-        )
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -14,6 +14,7 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, emit, say
 from pans.runtime.errors import UsageError
+from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "sim")
 
@@ -30,9 +31,19 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="decide: .npz with counts (n, d_f), shots, labels; one per --bundle",
     )
-    parser.add_argument("--seconds", type=float, default=5.0, help="loop: length of each of its four runs (default 5)")
+    parser.add_argument(
+        "--seconds",
+        type=Range(0.01, 86_400).option,
+        default=5.0,
+        help="loop: length of each of its four runs (default 5)",
+    )
     parser.add_argument("--load", action="store_true", help="loop: keep both cores busy with other processes")
-    parser.add_argument("--frames", type=int, default=0, help="ingest: also run the whole way over this many frames")
+    parser.add_argument(
+        "--frames",
+        type=Range(0, 10**12, whole=True).option,
+        default=0,
+        help="ingest: also run the whole way over this many frames",
+    )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
     parser.add_argument("--plot", type=Path, help="write a picture of speed against error (plot extra)")
 

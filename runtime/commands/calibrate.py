@@ -17,6 +17,7 @@ from typing import Any
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.ranges import Range
 
 from .run import profile_of
 
@@ -32,8 +33,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", required=True, type=Path, metavar="FILE", help="calibration file to write (.json)"
     )
-    parser.add_argument("--seconds", type=float, default=10.0, help="instrument time (default 10)")
-    parser.add_argument("--seed", type=int, default=1, help="of the random patterns (default 1)")
+    parser.add_argument("--seconds", type=Range(0.5, 86_400).option, default=10.0, help="instrument time (default 10)")
+    parser.add_argument(
+        "--seed", type=Range(0, (1 << 63) - 1, whole=True).option, default=1, help="of the random patterns (default 1)"
+    )
 
 
 def _calibrate(args: argparse.Namespace) -> int:

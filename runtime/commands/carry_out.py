@@ -212,7 +212,7 @@ def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
         illumination=ready.bundle.illumination() * frames,
         expected_decisions=ready.expected_decisions,
         flow=None if ready.flow_run is None else ready.flow_run.figures(),
-        dark=ready.dark.figures(),
+        dark=ready.dark.figures(result.dark),
     )
 
 

@@ -131,7 +131,12 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--levels", type=int, metavar="N", help=f"intensity levels (default {DEFAULT_LEVELS})")
+    group.add_argument(
+        "--levels",
+        type=int,
+        metavar="N",
+        help=f"intensity levels (default {DEFAULT_LEVELS})",
+    )
     group.add_argument(
         "--profile", metavar="P", help="take the levels of this profile, and check that it can expose them"
     )

@@ -14,8 +14,25 @@ from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
 from pans.runtime.instrument.calibration import MAX_AGE_H
 from pans.runtime.live.config import DarkSettings
 from pans.runtime.live.continuous import Continuous
+from pans.runtime.ranges import Range
 
 MIB = 1 << 20
+# What the numbers of a run may be. 10**12 decisions are thirty years at 1000 a second; 1e9 s are as many years.
+RANGES = {
+    "shots": Range(1, 1 << 20, whole=True),
+    "trials": Range(1, 1 << 20, whole=True),
+    "decisions": Range(0, 10**12, whole=True),
+    "seconds": Range(0, 1e9),
+    "deadline_us": Range(0, 1e9),
+    "dark_slots": Range(0, 65534, whole=True),
+    "reconnect_s": Range(0, 1e6),
+    "gate_delay_us": Range(0, 1e6),
+    "pool": Range(1, 64, whole=True),
+    "calibration_max_age_h": Range(1e-3, 1e6),
+    "rotate_mb": Range(0, 1e6),
+    "keep_mb": Range(0, 1e9),
+    "seed": Range(0, (1 << 63) - 1, whole=True),
+}
 
 
 def add_flow_options(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +43,10 @@ def add_flow_options(parser: argparse.ArgumentParser) -> None:
         "--gate-class", action="append", default=[], metavar="NAME", help="class to pulse for (repeatable, or a,b)"
     )
     group.add_argument(
-        "--gate-delay-us", type=float, metavar="US", help="from leaving to the pulse (default: the settings', 900)"
+        "--gate-delay-us",
+        type=RANGES["gate_delay_us"].option,
+        metavar="US",
+        help="from leaving to the pulse (default: the settings', 900)",
     )
     group.add_argument(
         "--act",
@@ -40,7 +60,10 @@ def add_flow_options(parser: argparse.ArgumentParser) -> None:
         help="hardware profile of the second instrument (default: that of the first)",
     )
     group.add_argument(
-        "--pool", type=int, metavar="N", help="windows side by side whose evidence is added (default: the settings', 1)"
+        "--pool",
+        type=RANGES["pool"].option,
+        metavar="N",
+        help="windows side by side whose evidence is added (default: the settings', 1)",
     )
 
 
@@ -63,7 +86,7 @@ def add_dark_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--calibration-max-age-h",
-        type=float,
+        type=RANGES["calibration_max_age_h"].option,
         default=MAX_AGE_H,
         metavar="H",
         help=f"older is stale (default {MAX_AGE_H:g})",

@@ -14,13 +14,13 @@ from pathlib import Path
 from pans.runtime import SHIPPED
 from pans.runtime.cli import Command
 from pans.runtime.decide.names import backend_names
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.timing.cpu import check_core
 
 from .carry_out import carry_out
 from .job import Job
-from .options import add_continuous_options, add_dark_options, add_flow_options, continuous_of, dark_of, flow_of
+from .options import RANGES, add_continuous_options, add_dark_options, add_flow_options, continuous_of, dark_of, flow_of
 
 DEMO_BUNDLE = "fashion10.pans"
 DEMO_PROFILE = "oled-qcmos"
@@ -30,16 +30,29 @@ DEMO_TRIALS = 5
 
 
 def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
-    parser.add_argument("--shots", type=int, default=1, metavar="K", help="shots per decision (default 1)")
     parser.add_argument(
-        "--trials", type=int, default=trials, metavar="N", help=f"decisions per object (default {trials})"
+        "--shots", type=RANGES["shots"].option, default=1, metavar="K", help="shots per decision (default 1)"
     )
-    parser.add_argument("--seconds", type=float, default=0.0, help="stop after this time")
-    parser.add_argument("--deadline-us", type=float, default=0.0, help="decision deadline (default: the profile's)")
+    parser.add_argument(
+        "--trials",
+        type=RANGES["trials"].option,
+        default=trials,
+        metavar="N",
+        help=f"decisions per object (default {trials})",
+    )
+    parser.add_argument("--seconds", type=RANGES["seconds"].option, default=0.0, help="stop after this time")
+    parser.add_argument(
+        "--deadline-us",
+        type=RANGES["deadline_us"].option,
+        default=0.0,
+        help="decision deadline (default: the profile's)",
+    )
     parser.add_argument(
         "--order", default="auto", choices=("auto", "pattern-major", "shot-major"), help="pattern order"
     )
-    parser.add_argument("--dark-slots", type=int, default=1, help="dark displays per cycle (default 1)")
+    parser.add_argument(
+        "--dark-slots", type=RANGES["dark_slots"].option, default=1, help="dark displays per cycle (default 1)"
+    )
     parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     parser.add_argument(
@@ -47,7 +60,10 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     )
     parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
     parser.add_argument(
-        "--reconnect-s", type=float, default=10.0, help="how long to look for a lost device (default 10, 0: not at all)"
+        "--reconnect-s",
+        type=RANGES["reconnect_s"].option,
+        default=10.0,
+        help="how long to look for a lost device (default 10, 0: not at all)",
     )
     parser.add_argument(
         "--trace", type=Path, metavar="FILE", help="write all bytes of both directions as hex, with times"
@@ -61,7 +77,9 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
     parser.add_argument("--record", type=Path, help="recording to write (default: run.pansrec in --out)")
-    parser.add_argument("--decisions", type=int, default=0, help="stop after this many decisions")
+    parser.add_argument(
+        "--decisions", type=RANGES["decisions"].option, default=0, help="stop after this many decisions"
+    )
     _configure_common(parser, trials=1)
     add_flow_options(parser)
     add_dark_options(parser)
@@ -69,7 +87,9 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated detector (default 1)")
+    parser.add_argument(
+        "--seed", type=RANGES["seed"].option, default=1, help="seed of the simulated detector (default 1)"
+    )
     parser.add_argument(
         "--pace", default="real", choices=("real", "fast"), help="real time in a process of its own, or virtual"
     )
@@ -94,11 +114,10 @@ def _demo(args: argparse.Namespace) -> int:
 def _job(
     args: argparse.Namespace, bundle: Path, device: str, profile: str, out: Path, decisions: int, record: Path | None
 ) -> Job:
-    for name in ("shots", "trials"):
-        if getattr(args, name) < 1:
-            raise UsageError(f"--{name} must be at least 1, found {getattr(args, name)}")
-    if min(args.seconds, decisions, args.deadline_us, args.dark_slots, args.reconnect_s) < 0:
-        raise UsageError("--seconds, --decisions, --deadline-us, --dark-slots and --reconnect-s must not be negative")
+    with as_usage_error():
+        for name, allowed in RANGES.items():
+            if getattr(args, name, None) is not None:
+                allowed.checked(getattr(args, name), f"--{name.replace('_', '-')}")
     check_core(args.core)
     loaded, flow = load_profile(profile), flow_of(args)
     if flow is not None and (decisions or args.trials != 1):

@@ -24,8 +24,10 @@ from pans.runtime.instrument.calibration import (
     now_utc,
 )
 from pans.runtime.instrument.click_law import click_law, click_probability
+from pans.runtime.instrument.dark_rate import DarkReport
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.intervals import binomial_tail
 
 from .config import DarkSettings
 
@@ -37,6 +39,7 @@ FALSE_ALARM_H = (
 )
 LEAST_ARL = 1e4  # dark exposures
 FEW_CLICKS = 10
+CONTRADICTION_CHANCE = 1e-9  # of dark counts as far off the end of the calibration's 95 % interval, in one run
 NOT_MEASURED = DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.INCOMPLETE
 
 
@@ -131,9 +134,32 @@ class DarkRun:
                 if words:
                     run.journal.note("light_changed", **self.light.found[-1])
 
-    def figures(self) -> DarkFigures:
-        """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults."""
+    def figures(self, dark: DarkReport | None = None) -> DarkFigures:
+        """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults.
+
+        `dark` is what the run's dark exposures gave.
+        """
         one = self.calibration
         facts = None if one is None else {"path": one.path, "sha256": one.sha256, "made_utc": one.values["made_utc"]}
         faults = [] if one is None else [str(found["words"]) for found in self.light.found]
+        if one is not None and dark is not None:
+            faults += self._contradictions(dark)
         return DarkFigures(facts, self.warnings, self.light.report(), faults)
+
+    def _contradictions(self, dark: DarkReport) -> list[str]:
+        """Compare the run's dark clicks, of all channels, with the ends of the calibration's interval: one sentence, or none.
+
+        With afterpulses the clicks are not independent, and the watch alone judges them.
+        """
+        if not self._header or self._header["afterpulses"]:
+            return []
+        low, high = (float(np.mean(self._header[end])) for end in ("low", "high"))
+        clicks, exposures = dark.clicks, dark.exposures
+        above = binomial_tail(clicks, exposures, high)
+        below = binomial_tail(exposures - clicks, exposures, 1 - low)
+        if min(above, below) >= CONTRADICTION_CHANCE:
+            return []
+        said = f"{low:.3g} to {high:.3g} per exposure"
+        return [
+            f"the calibration contradicts the dark counts: it says {said}, this run had {clicks} clicks in {exposures}"
+        ]

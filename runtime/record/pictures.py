@@ -7,7 +7,6 @@ recording (replaying.py). A decision that abstained has no picture.
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,9 @@ from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
+from pans.runtime.npz_file import read_arrays
+
+TRUTH_MAX_BYTES = 1 << 29  # as a scene file
 
 
 class PictureLog:
@@ -98,10 +100,9 @@ class PictureLog:
 
 def _images(path: Path) -> NDArray[np.uint8]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            images = arrays["images"]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        images = read_arrays(path, ("images",), TRUTH_MAX_BYTES).get("images", np.zeros(0))
+    except ValueError as error:
         raise UsageError(f"{path}: no scene with an array `images`: {error}") from error
-    if images.dtype != np.uint8 or images.ndim != 3 or not len(images):
+    if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
         raise UsageError(f"{path}: images are {images.dtype} {images.shape}, allowed: uint8 (n, height, width)")
     return np.asarray(images)
