@@ -5,6 +5,7 @@ Owns the comparison and the observer on the wire; it changes no byte. `ObservedL
 
 - wire and host: every frame that arrived was counted, whole or damaged;
 - wire and recording: every message of an armed session is on record, once and in order;
+- wire and recording: every WELCOME, ACK and PONG is on record, of whatever session, once and in order;
 - recording and host: every recorded stream message was taken, or counted as repeated or malformed;
 - device and host: every exposure was received or reported lost, and what the device dropped is what the host says it dropped;
 - device and wire: the STATUS that closes a stream claims what the device has made;
@@ -25,6 +26,7 @@ from pans.runtime.live import RunResult
 from pans.runtime.record import Recording, replay
 from pans.runtime.wire import DeviceState, FrameDecoder, MessageType, Opcode, Status, decode_status
 from pans.runtime.wire.messages import decode_command, pack_body, unpack_body
+from pans.runtime.wire.session import ANSWER_TYPES
 
 from .checkers import DeviceBooks
 
@@ -61,12 +63,13 @@ class Opened:
 
 
 class ObservedLink:
-    """An ordinary Link around another one, with books on what passed; `heard` by session, `openings` in their order."""
+    """An ordinary Link around another one, with books on what passed; `heard` by session, `answers`, `openings` in their order."""
 
     def __init__(self, link: Any) -> None:
         self._link = link
         self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
         self.heard: dict[int, Heard] = {}
+        self.answers = Heard()  # WELCOME, ACK and PONG of all openings
         self.openings = [Opened()]
 
     def read(self, timeout_s: float) -> bytes:
@@ -74,6 +77,8 @@ class ObservedLink:
         data: bytes = self._link.read(timeout_s)
         now = self.openings[-1]
         for frame in now.from_device.feed(data):
+            if frame.type in ANSWER_TYPES:
+                self.answers.take(pack_body(frame))
             if now.armed and frame.session == now.session and frame.type in RECORDED:
                 heard = self.heard[now.session]
                 heard.take(pack_body(frame))
@@ -118,6 +123,7 @@ def reconcile(
     return [
         *_wire_and_host(wire, result),
         *_wire_and_recording(wire, recording),
+        *_answers_and_recording(wire, recording),
         *_recording_and_host(recording, result),
         *_device_and_host(device, result),
         *_device_and_wire(device, wire),
@@ -149,6 +155,14 @@ def _wire_and_recording(wire: ObservedLink, recording: Recording) -> Iterator[st
             yield (
                 f"session {session:08x}: {there.messages} messages arrived, {here.messages} are recorded, or other ones"
             )
+
+
+def _answers_and_recording(wire: ObservedLink, recording: Recording) -> Iterator[str]:
+    recorded = Heard()
+    for _, body in recording.answers():
+        recorded.take(body)
+    if not wire.answers.same(recorded):
+        yield f"{wire.answers.messages} answers arrived, {recorded.messages} are recorded, or other ones"
 
 
 def _recording_and_host(recording: Recording, result: RunResult) -> Iterator[str]:

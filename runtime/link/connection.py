@@ -25,8 +25,8 @@ from pans.runtime.wire.commands import (
 )
 from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome
-from pans.runtime.wire.session import HostSession
+from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pack_body
+from pans.runtime.wire.session import ANSWER_TYPES, HostSession
 
 from .base import Link
 from .reader import Chunk, LinkReader
@@ -50,9 +50,17 @@ class Arrived(NamedTuple):
 
 
 class Connection:
-    """Link, reader, decoder, session and clock of one session; `on_sent` sees every outgoing byte string (for the recording)."""
+    """Link, reader, decoder, session and clock of one session.
 
-    def __init__(self, link: Link, on_sent: Callable[[int, bytes], None] | None = None) -> None:
+    For the recording: `on_sent` sees every outgoing byte string, `on_answer` the header and payload of every WELCOME, ACK and PONG.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        on_sent: Callable[[int, bytes], None] | None = None,
+        on_answer: Callable[[int, bytes], None] | None = None,
+    ) -> None:
         self.link = link
         self.reader = LinkReader(link)
         self.decoder = FrameDecoder()
@@ -60,7 +68,7 @@ class Connection:
         self.clock: ClockModel | None = None
         self.clock_steps: list[ClockStep] = []  # since the last look
         self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
-        self.on_sent = on_sent
+        self.on_sent, self.on_answer = on_sent, on_answer
 
     def pump(self, timeout_s: float) -> list[Arrived]:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
@@ -87,8 +95,7 @@ class Connection:
         for place, chunk in enumerate(chunks):
             if bulk is None:
                 for frame in self.decoder.feed(chunk.data):
-                    if self.session.on_frame(frame, chunk.arrival_ns):
-                        stream.append(Arrived(chunk.arrival_ns, frame))
+                    self._sort(frame, chunk.arrival_ns, stream)
             else:
                 self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
         return stream
@@ -118,10 +125,15 @@ class Connection:
                     messages = Messages(bulk.buffer, spans[place:stop])
                     stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
                 if stop < len(spans):
-                    frame = bulk.frame(*spans[stop].tolist())
-                    if session.on_frame(frame, arrival_ns):
-                        stream.append(Arrived(arrival_ns, frame))
+                    self._sort(bulk.frame(*spans[stop].tolist()), arrival_ns, stream)
                 place = stop + 1
+
+    def _sort(self, frame: Frame, arrival_ns: int, stream: list[Arrived]) -> None:
+        """Give a frame to the session, and to the core what is the core's; an answer is on record before it can end the session."""
+        if self.on_answer is not None and frame.type in ANSWER_TYPES:
+            self.on_answer(arrival_ns, pack_body(frame))
+        if self.session.on_frame(frame, arrival_ns):
+            stream.append(Arrived(arrival_ns, frame))
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""

@@ -65,10 +65,9 @@ def run_live(
     `recovery` says how to reconnect when the device is lost; without it the run ends there.
     """
     started_ns = config.started_ns or time.perf_counter_ns()
-    on_sent = None if recorder is None else recorder.add_command
 
     def prepare(opened: Link) -> Connection:
-        return open_session(opened, on_sent, plan, bundle, profile.clock.tick_hz)
+        return open_session(opened, recorder, plan, bundle, profile.clock.tick_hz)
 
     try:
         connection = prepare(link)
@@ -102,11 +101,9 @@ def run_live(
         run.connection.close()
 
 
-def open_session(
-    link: Link, on_sent: Callable[[int, bytes], None] | None, plan: Plan, bundle: Bundle, tick_hz: int
-) -> Connection:
+def open_session(link: Link, recorder: AnyRecorder | None, plan: Plan, bundle: Bundle, tick_hz: int) -> Connection:
     """Open a session, check that it is the right device, and bring it to where ARM can follow."""
-    connection = Connection(link, on_sent)
+    connection = Connection(link) if recorder is None else Connection(link, recorder.add_command, recorder.add_answer)
     try:
         facts = connection.handshake().facts
         check_device(facts, plan, bundle, tick_hz)

@@ -343,7 +343,7 @@ class LiveRun:
     def drop_recorder(self) -> None:
         """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
         self._recorder = self.journal.recorder = None
-        self.connection.on_sent = None
+        self.connection.on_sent = self.connection.on_answer = None
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW

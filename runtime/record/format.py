@@ -14,7 +14,8 @@ import numpy as np
 from pans.runtime.container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+READABLE_VERSIONS = (2, 3)  # 2 has no ANSWERS
 MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
 RUN_ROWS_MAX = 1 << 31
@@ -33,9 +34,16 @@ class Kind(IntEnum):
     TIMINGS = 7
     EVENTS = 8
     END = 9
+    ANSWERS = 10
 
 
 LIMITS = {int(kind): 2 * MIB for kind in Kind} | {int(Kind.HEADER): 4 * MIB, int(Kind.BUNDLE): FILE_MAX_BYTES}
+_LIMITS_2 = {kind: limit for kind, limit in LIMITS.items() if kind != Kind.ANSWERS}
+
+
+def limits_of(version: int) -> dict[int, int]:
+    """Return the most bytes of a payload by the kinds that a recording of this version may have."""
+    return _LIMITS_2 if version == 2 else LIMITS
 
 
 TIMING_DTYPE = np.dtype(

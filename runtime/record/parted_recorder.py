@@ -77,6 +77,10 @@ class PartedRecorder:
         """See `Recorder`."""
         self.open_part.add_command(host_ns, data)
 
+    def add_answer(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """See `Recorder`."""
+        self.open_part.add_answer(host_ns, data)
+
     def add_decision(self, record: Sequence[Any]) -> None:
         """See `Recorder`."""
         self.open_part.add_decision(record)

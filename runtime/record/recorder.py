@@ -50,11 +50,12 @@ class Recorder:
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
         self._messages = ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
         self._commands = ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
+        self._answers = ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
         self._events = ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
         self._decisions = RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
         self._timings = RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
         # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
-        self._in_order = (self._commands, self._messages, self._decisions, self._timings)
+        self._in_order = (self._commands, self._answers, self._messages, self._decisions, self._timings)
         self._log = LogEncoder()
         from .kernels import pack_messages  # numba is loaded only by who records
 
@@ -119,6 +120,10 @@ class Recorder:
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
         self._add_bytes(self._commands, host_ns, data)
+
+    def add_answer(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
+        """Keep one decoded WELCOME, ACK or PONG of at most 1 MiB and the host time at which it arrived, in ns."""
+        self._add_bytes(self._answers, host_ns, data)
 
     def add_decision(self, record: Sequence[Any]) -> None:
         """Keep one decision: a tuple in the order of DECISION_DTYPE."""

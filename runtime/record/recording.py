@@ -30,7 +30,7 @@ from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
-from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, TIMING_DTYPE, Kind
+from .format import MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind, limits_of
 from .log import LogReader
 
 
@@ -53,8 +53,8 @@ class Recording:
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
         with open_regular(self.path) as file:
-            _, chain = _start(file, str(self.path))
-            for block in _blocks(file, chain, str(self.path)):
+            version, chain = _start(file, str(self.path))
+            for block in _blocks(file, version, chain, str(self.path)):
                 if not wanted or block.kind in wanted:
                     yield block
                 if block.end >= self.end_offset:
@@ -67,6 +67,10 @@ class Recording:
     def commands(self) -> Iterator[tuple[int, bytes]]:
         """Yield (sent host_ns, bytes) of the commands, in order."""
         return self._pairs(Kind.COMMANDS)
+
+    def answers(self) -> Iterator[tuple[int, bytes]]:
+        """Yield (arrival host_ns, decoded bytes) of WELCOME, ACK and PONG, in order; none before format version 3."""
+        return self._pairs(Kind.ANSWERS)
 
     def decisions(self) -> NDArray[np.void]:
         """Return all decisions, DECISION_DTYPE (n,)."""
@@ -129,12 +133,12 @@ def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
 
 def _start(file: Any, where: str) -> tuple[int, int]:
     """Read the prologue: the format version and the checksum that seeds the first block."""
-    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, (FORMAT_VERSION,), where)
+    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, where)
 
 
-def _blocks(file: Any, chain: int, where: str) -> Iterator[Block]:
-    index = 0
-    while (block := read_block(file, index, chain, LIMITS, where)) is not None:
+def _blocks(file: Any, version: int, chain: int, where: str) -> Iterator[Block]:
+    index, limits = 0, limits_of(version)
+    while (block := read_block(file, index, chain, limits, where)) is not None:
         yield block
         if block.kind == Kind.END:
             if rest := len(file.read(MIB)):
@@ -198,7 +202,7 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
             size = os.fstat(file.fileno()).st_size
             try:
                 scan.version, chain = _start(file, str(path))
-                for block in _blocks(file, chain, str(path)):
+                for block in _blocks(file, scan.version, chain, str(path)):
                     scan.take(block)
             except DamagedFileError as error:
                 if not salvage or not scan.kinds[Kind.HEADER]:

@@ -21,6 +21,7 @@ from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording, read_recording
 
+from .handshakes import handshakes
 from .verify import file_kind
 
 
@@ -102,6 +103,8 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "clicks_mean": float(decided["clicks"].mean()) if len(decided) else None,
         "accuracy": float(np.mean(known["label"] == known["truth"])) if len(known) else None,
         "messages": sum(1 for _ in recording.messages()),
+        "answers": sum(1 for _ in recording.answers()),
+        "handshakes": handshakes(recording),
         "events": dict(Counter(str(event.get("kind", "?")) for event in recording.events())),
         "header": header,
         "summary": dict(recording.summary),

@@ -31,6 +31,8 @@ from pans.runtime.record.part_index import compare_with_index
 from pans.runtime.record.part_keeper import INDEX_SUFFIX
 from pans.runtime.record.parts import chain_violations, find_parts, first_decision, parts_in, stem_of
 from pans.runtime.record.replaying import replay_faults
+from pans.runtime.wire.messages import MalformedMessage, unpack_body
+from pans.runtime.wire.session import ANSWER_TYPES
 
 _COMPARE_FEATURES_MAX = 16
 _COMPARE_SCORES = 1 << 20  # at once
@@ -198,12 +200,27 @@ def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
     verdict.violations += _timing_violations(recording.timings(), first + len(decisions))
     for _ in recording.events():
         pass  # reading them is the check
-    for stream, items in (("messages", recording.messages()), ("commands", recording.commands())):
+    verdict.violations += _answer_violations(recording)
+    streams = {"messages": recording.messages(), "commands": recording.commands(), "answers": recording.answers()}
+    for stream, items in streams.items():
         times = np.fromiter((host_ns for host_ns, _ in items), dtype=np.int64)
         if (np.diff(times) < 0).any():
             verdict.alerts.append(f"the host times of the {stream} go back at {int(np.argmax(np.diff(times) < 0)) + 1}")
     if recording.complete and recording.bundle_data() and not verdict.violations:
         verdict.violations += replay_faults(recording, recording.bundle())
+
+
+def _answer_violations(recording: Recording) -> Iterator[str]:
+    """What a host does not record as an answer; what the device wrote into a message of the right type is the device's matter."""
+    for place, (_, body) in enumerate(recording.answers()):
+        try:
+            found = unpack_body(body).type
+        except MalformedMessage as error:
+            yield f"answer {place}: {error}"
+            return
+        if found not in ANSWER_TYPES:
+            yield f"answer {place} is a message of type {found}, allowed: WELCOME, ACK, PONG"
+            return
 
 
 def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:

@@ -22,6 +22,7 @@ HELLO_EVERY_NS = 200 * NS_PER_MS
 HELLO_GIVE_UP_NS = 5_000 * NS_PER_MS
 COMMAND_WINDOW = 8
 STREAM_TYPES = frozenset(int(kind) for kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
+ANSWER_TYPES = frozenset(int(kind) for kind in (MessageType.WELCOME, MessageType.ACK, MessageType.PONG))
 GRANT, _GRANT = int(MessageType.GRANT), wire.STRUCTS["GRANT"]
 RETRY_FIRST_NS = 250 * NS_PER_MS
 RETRY_LONGEST_NS = 2_000 * NS_PER_MS

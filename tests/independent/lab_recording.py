@@ -16,8 +16,8 @@ import numpy as np
 from lab_bundle import MIB, demand, strict_json
 from numpy.typing import NDArray
 
-HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END = range(1, 10)
-LIMITS = {kind: 2 * MIB for kind in range(1, 10)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
+HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS = range(1, 11)
+LIMITS = {kind: 2 * MIB for kind in range(1, 11)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
 ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:]])
@@ -39,6 +39,7 @@ class Recording:
     header: dict[str, Any] = field(default_factory=dict)
     bundle: bytes = b""
     messages: list[tuple[int, bytes]] = field(default_factory=list)  # arrival in ns, header and payload
+    answers: list[tuple[int, bytes]] = field(default_factory=list)  # arrival in ns, header and payload
     commands: list[tuple[int, bytes]] = field(default_factory=list)  # sent in ns, bytes on the wire
     clock: list[tuple[int, int, int]] = field(default_factory=list)
     timings: list[tuple[int, ...]] = field(default_factory=list)
@@ -71,14 +72,16 @@ def read_recording(data: bytes) -> Recording:
 def iter_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, payload) of every block, with the chain of checksums checked."""
     magic, version, chain = struct.unpack_from("<8sII", data)
-    demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain and version == 2, "no recording of version 2")
+    demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain, "no recording")
+    demand(version in (2, 3), f"version {version}")
+    known = set(LIMITS) - ({ANSWERS} if version == 2 else set())
     at, index, kind = 16, 0, 0
     while at < len(data):
         demand(kind != END, "bytes behind END")
         demand(at + 20 <= len(data), "cut within a block")
         length, number, kind, zeros, crc = struct.unpack_from("<IIB3sI", data, at)
         demand(zlib.crc32(data[at : at + 12], chain) == crc, f"the head of block {index}")
-        demand(number == index and zeros == b"\0\0\0" and kind in LIMITS and length <= LIMITS[kind], f"block {index}")
+        demand(number == index and zeros == b"\0\0\0" and kind in known and length <= LIMITS[kind], f"block {index}")
         payload, tail = data[at + 16 : at + 16 + length], data[at + 16 + length : at + 20 + length]
         demand(len(tail) == 4, "cut within a block")
         chain = zlib.crc32(payload, crc)
@@ -95,6 +98,8 @@ def _take(recording: Recording, kind: int, payload: bytes) -> None:
         recording.bundle = payload
     elif kind == MESSAGES:
         recording.messages += _entries(payload)
+    elif kind == ANSWERS:
+        recording.answers += _entries(payload)
     elif kind == COMMANDS:
         recording.commands += _entries(payload)
     elif kind == CLOCK:

@@ -70,7 +70,7 @@ def test_every_part_replays_and_verifies_by_itself(parts: Path) -> None:
         assert recording.complete
         count, sha256 = replay(recording, recording.bundle())[:2]
         assert (count, sha256) == (recording.n_decisions, recording.decisions_sha256)
-        assert count > 50
+        assert count > (0 if path == paths[-1] else 50)
         assert recording.decisions()["index"][0] == first_decision(recording)
         numbers += recording.decisions()["index"].tolist()
         assert len(recording.clock_samples())

@@ -62,7 +62,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert found.complete
     assert found.damage == ""
     assert found.header["seed"] == 7
-    assert found.header["format_version"] == found.version == 2
+    assert found.header["format_version"] == found.version == 3
     assert found.summary == {"accuracy": 0.75}
     assert found.end_offset == found.size == path.stat().st_size
     assert list(found.messages()) == [(100 + i, bytes([i]) * i) for i in range(5)]
@@ -88,17 +88,18 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
         last = zlib.crc32(payload, first)
         return start + struct.pack("<I", first) + payload + struct.pack("<I", last), last
 
-    start = b"PANSRECD" + struct.pack("<I", 2)
+    start = b"PANSRECD" + struct.pack("<I", 3)
     chain = zlib.crc32(start)
     wanted = start + struct.pack("<I", chain)
     run = struct.pack("<QQQIIIIIIhH", 0, 0, 8, 0, 0, 1, 0, 0, 0, -1, 0)
     verdict = struct.pack("<IHIfI", 4, 0, 0, 0.5, 12345)
     parts = [hashlib.sha256(part).digest() for part in (verdict, bytes(2), run)]
     log = hashlib.sha256(b"".join(parts)).hexdigest()
-    end = {"blocks": 3, "decisions": 1, "decisions_sha256": log, "summary": {}}
-    header = {**HEADER, "format_version": 2}
+    end = {"blocks": 4, "decisions": 1, "decisions_sha256": log, "summary": {}}
+    header = {**HEADER, "format_version": 3}
     payloads = [
         (1, json.dumps(header, sort_keys=True, separators=(",", ":")).encode()),
+        (10, struct.pack("<qI", -6, 3) + b"yes"),
         (3, struct.pack("<qI", -5, 2) + b"hi"),
         (6, struct.pack("<III", 1, 1, 1) + run + verdict + bytes(2)),
         (9, json.dumps(end, sort_keys=True, separators=(",", ":")).encode()),
@@ -109,6 +110,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
     with Recorder(tmp_path / "a.pansrec", HEADER) as recorder:
         recorder.add_decision(decision(0))
         recorder.add_message(-5, b"hi")
+        recorder.add_answer(-6, b"yes")
         recorder.close({})
     assert (tmp_path / "a.pansrec").read_bytes() == wanted
 
