@@ -36,6 +36,11 @@ class Command:
     run: Callable[[argparse.Namespace], int]
 
 
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Add `--force`, of every command that writes files."""
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
 def say(text: str) -> None:
     """Print for people, on stderr: stdout belongs to the JSON object or the answer itself."""
     print(lines(text), file=sys.stderr, flush=True)

@@ -1,14 +1,13 @@
-"""What bundles and recordings have in common on disk: strict JSON, whole-or-nothing files, chained blocks.
+"""What bundles and recordings have in common on disk: strict JSON, reading within limits, chained blocks.
 
 Owns the byte framing and its limits; never knows what a part or a block means. Readers take bytes or an open file and
-raise DamagedFileError; `replace_file` writes beside and renames, so that no reader ever meets half a file.
+raise DamagedFileError; files are created by outputs.py.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import secrets
 import stat
 import struct
 import zlib
@@ -147,37 +146,6 @@ def read_file(path: str | Path, max_bytes: int = FILE_MAX_BYTES) -> bytes:
     if len(data) > max_bytes:
         raise DamagedFileError(f"{path}: more than {max_bytes} bytes")
     return data
-
-
-def replace_file(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path` whole or not at all (beside it, synced, renamed over it); UsageError if that fails."""
-    target = Path(path)
-    beside = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        try:
-            with open(beside, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(beside, target)
-        finally:
-            beside.unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"{target}: cannot be written: {error.strerror or error}") from error
-    sync_folder(target.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a new or renamed entry of `folder` survive a power cut, where the system can sync folders."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError:
-        pass  # some network file systems refuse; the file itself is on the disk
-    finally:
-        os.close(handle)
 
 
 # ---- chained blocks: an append-only file in which every byte is covered, readable up to where it was cut ----

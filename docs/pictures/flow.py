@@ -1,6 +1,6 @@
 """Draw docs/pictures/flow.png from a recording of `pans run --flow cells`: click sums, posteriors, marks, decisions, pulses (extra `plot`).
 
-python docs/pictures/flow.py pans-run/run.pansrec [first exposure] [exposures]
+python docs/pictures/flow.py pans-runs/latest/run.pansrec [first exposure] [exposures]
 """
 
 from __future__ import annotations

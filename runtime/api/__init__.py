@@ -118,10 +118,12 @@ def run(
     shots: int = 1,
     out: str | Path | None = None,
     shows: bool = False,
+    force: bool = False,
 ) -> Outcome:
     """Run `bundle` on the device behind a URL until `decisions` are made or `seconds` have passed; without both, until interrupted.
 
-    It is what `pans run` does: `out` is a folder for the recording and a page (None: neither), `shows` draws the live view on stderr.
+    It is what `pans run` does: `out` is a folder for the recording and a page (None: neither; UsageError if they
+    are there already, unless `force`), `shows` draws the live view on stderr.
     `profile` is by default the one that a `sim:` URL names. The result has `summary` (`accuracy`, `verdict`, ...; `as_json()` is what
     the command prints), `confusion`, and the paths `recording` and `report`. DeviceError and LinkError if the device cannot be armed.
     """
@@ -148,6 +150,7 @@ def run(
             realtime=False,
             command="pans.run",
             shows=shows,
+            force=force,
         )
         return run_job(job)
 

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
+from pans.runtime.container import canonical_json, parse_json_object, read_file
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import replace_file
 
 from .facts import (
     GOLDEN_WORK_MAX,

@@ -19,6 +19,7 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 
 from .job import Job, recording_header, what_was_run
+from .run_files import check_run_files, claimed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -84,6 +85,7 @@ def carry_out(args: argparse.Namespace, job: Job) -> int:
 
 def run_job(job: Job, started_ns: int = 0) -> Outcome:
     """Run the job and leave its files; `started_ns` (time.perf_counter_ns) is when it was asked for, 0: now."""
+    check_run_files(job)
     with stop_signals(continuous=not (job.seconds or job.decisions)) as stop:
         return _run_job(job, started_ns or time.perf_counter_ns(), stop)
 
@@ -136,8 +138,6 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
         core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
     config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
-    if job.out is not None:
-        job.out.mkdir(parents=True, exist_ok=True)
     header = recording_header(job, bundle_sha256, decider, n_objects)
     header["config"]["dark"] = dark.header()
     if flow_run is not None:
@@ -148,11 +148,6 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
 def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
     opening = _Background(lambda: open_link(job.device))
     try:
-        from pans.runtime.container import read_file
-        from pans.runtime.link.trace import TracedLink
-        from pans.runtime.live import Recovery
-        from pans.runtime.live.continuous import open_recorder
-
         ready = _prepare(job, started_ns)
     except BaseException:
         _close_quietly(opening)
@@ -160,14 +155,40 @@ def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
     for warning in ready.dark.warnings:
         say(f"pans: {warning}")
     link = opening.result()
-    if job.trace is not None:
-        link = TracedLink(link, job.trace, job.device)
+    try:
+        with claimed(job) as job:
+            return _traced(job, ready, link, stop)
+    finally:
+        link.close()
+
+
+def _traced(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
+    """Run with a trace, if one is wanted; one that could not be written to its end is told, and ends nothing."""
+    from pans.runtime.link.trace import TracedLink
+
+    if job.trace is None:
+        return _recorded(job, ready, link, stop)
+    traced = TracedLink(link, job.trace, job.device, force=job.force)
+    try:
+        return _recorded(job, ready, traced, stop)
+    finally:
+        traced.close()
+        if traced.trouble:
+            say(f"pans: {job.trace}: the trace is not whole: {traced.trouble}")
+
+
+def _recorded(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
+    from pans.runtime.container import read_file
+    from pans.runtime.live import Recovery
+    from pans.runtime.live.continuous import open_recorder
+
+    bundle_bytes = read_file(job.bundle_path)
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
     if job.recording is None:
         result = _watched(job, ready, link, None, recovery, stop)
         return _conclude(job, ready, result, _summary(job, ready, result))
-    bundle_bytes = read_file(job.bundle_path)
-    with open_recorder(job.recording, ready.header, bundle_bytes, job.continuous.limits) as recorder:
+    limits = job.continuous.limits
+    with open_recorder(job.recording, ready.header, bundle_bytes, limits, force=job.force) as recorder:
         result = _watched(job, ready, link, recorder, recovery, stop)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
@@ -220,14 +241,13 @@ def _conclude(job: Job, ready: _Prepared, result: RunResult, summary: Summary) -
     """Write the page and return what came of the run."""
     from pans.runtime.report.summary_page import write_markdown
 
-    confusion, page, bundle = result.tally.confusion, None, ready.bundle
+    confusion, page, bundle = result.tally.confusion, job.page, ready.bundle
     if ready.flow_run is not None:
         confusion = confusion + ready.flow_run.core.matcher.confusion
-    if job.out is not None:
-        page = job.out / "summary.md"
+    if page is not None:
         facts = what_was_run(job, bundle.name, ready.bundle_sha256, ready.decider.name, summary)
-        write_markdown(page, summary, facts, confusion, bundle.classes)
-    return Outcome(summary, confusion, job.recording, page)
+        write_markdown(page, summary, facts, confusion, bundle.classes, force=job.force)
+    return Outcome(summary, confusion, job.left_recording, page)
 
 
 def process_start_ns() -> int:

@@ -33,7 +33,11 @@ class Job:
     out: Path | None = (
         None  # folder for the recording and the summary page; None: no page, and no recording but `record`
     )
+    out_root: Path | None = None  # a new folder named by date and `run_name` is made in here, and becomes `out`
+    run_name: str = "run"
     record: Path | None = None
+    force: bool = False  # replace what exists
+    inputs: tuple[Path, ...] = ()  # files that are read, beside bundle, calibration and those in the device's URL
     shots: int = 1
     trials: int = 1
     decisions: int = 0
@@ -58,6 +62,22 @@ class Job:
         """The recording to write, if any."""
         return self.record if self.record or self.out is None else self.out / "run.pansrec"
 
+    @property
+    def page(self) -> Path | None:
+        """The summary page to write, if any."""
+        if self.out is not None:
+            return self.out / "summary.md"
+        return None if self.record is None else self.record.with_name(f"{self.record.stem}.summary.md")
+
+    @property
+    def left_recording(self) -> Path | None:
+        """What names the recording afterwards: of one in parts its index."""
+        if self.recording is None or self.continuous.limits is None:
+            return self.recording
+        from pans.runtime.record.part_keeper import index_path
+
+        return index_path(self.recording)
+
 
 def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary: Summary) -> dict[str, str]:
     """The lines below the summary page's figures."""
@@ -66,7 +86,7 @@ def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary:
         "device": f"{job.device} (firmware {summary.device.get('firmware', 'unknown')})",
         "profile": f"{job.profile.name}: {job.profile.description}",
         "decision back end": backend,
-        "recording": f"{job.recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it)",
+        "recording": f"{job.left_recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it)",
         "command": job.command,
         "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
     }

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from pans.runtime.cli import EXIT_FINE, Command, emit
-from pans.runtime.container import replace_file
+from pans.runtime.outputs import replace_file
 from pans.runtime.report.verify import file_kind
 
 

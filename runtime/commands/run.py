@@ -12,10 +12,11 @@ import sys
 from pathlib import Path
 
 from pans.runtime import SHIPPED
-from pans.runtime.cli import Command
+from pans.runtime.cli import Command, add_force
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.run_folder import RUNS
 from pans.runtime.timing.cpu import check_core
 
 from .carry_out import carry_out
@@ -58,7 +59,13 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     parser.add_argument(
         "--core", type=int, metavar="N", help="bind the loop to processor core N and keep that awake; takes all of it"
     )
-    parser.add_argument("--out", type=Path, help="folder for the recording and the summary")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help=f"folder for the recording and the summary (default: a new one in {RUNS})",
+    )
+    add_force(parser)
     parser.add_argument(
         "--reconnect-s",
         type=RANGES["reconnect_s"].option,
@@ -99,21 +106,16 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     profile = args.profile or profile_of(args.device)
-    out = args.out or (args.record.parent if args.record else Path("pans-run"))
-    return carry_out(args, _job(args, args.bundle, args.device, profile, out, args.decisions, args.record))
+    return carry_out(args, _job(args, args.bundle, args.device, profile, args.decisions, args.record))
 
 
 def _demo(args: argparse.Namespace) -> int:
     device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
     decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials
-    return carry_out(
-        args, _job(args, SHIPPED / DEMO_BUNDLE, device, args.profile, args.out or Path("pans-demo"), decisions, None)
-    )
+    return carry_out(args, _job(args, SHIPPED / DEMO_BUNDLE, device, args.profile, decisions, None))
 
 
-def _job(
-    args: argparse.Namespace, bundle: Path, device: str, profile: str, out: Path, decisions: int, record: Path | None
-) -> Job:
+def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, decisions: int, record: Path | None) -> Job:
     with as_usage_error():
         for name, allowed in RANGES.items():
             if getattr(args, name, None) is not None:
@@ -128,7 +130,13 @@ def _job(
         bundle_path=bundle,
         device=device,
         profile=loaded,
-        out=out,
+        out=args.out,
+        out_root=None if args.out or record else RUNS,
+        run_name=bundle.stem,
+        force=args.force,
+        inputs=tuple(
+            Path(name) for name in (profile, getattr(args, "flow", None), getattr(args, "act_profile", None)) if name
+        ),
         shots=args.shots,
         trials=args.trials,
         decisions=decisions,

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import canonical_json, parse_json_object, read_file, replace_file
+from pans.runtime.container import canonical_json, parse_json_object, read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
+from pans.runtime.outputs import replace_file
 from pans.runtime.ranges import Range, number_text
 
 from .click_law import ClickLaw, log_no_click

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.outputs import refuse_existing
 
 from .base import Link
 
@@ -19,15 +20,20 @@ from .base import Link
 class TracedLink:
     """Passes everything on to `link` and writes it down; what is lost in the middle of a line is at most the last one."""
 
-    def __init__(self, link: Link, path: Path, url: str = "") -> None:
+    def __init__(self, link: Link, path: Path, url: str = "", *, force: bool = False) -> None:
         self._link, self._url = link, url or link.name
+        self.trouble = ""  # why the trace ended before the link did
         self._lock = threading.Lock()  # the reader's thread and the loop both write
         self._started_ns = link.now_ns()
         self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
         self.now_ns = link.now_ns
         self.pause: Any = getattr(link, "pause", time.sleep)
         try:
-            self._file = open(path, "w", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
+            if force:
+                path.unlink(missing_ok=True)
+            self._file = open(path, "x", encoding="ascii", buffering=1)  # noqa: SIM115 - closed with the link
+        except FileExistsError as error:
+            raise refuse_existing(path) from error
         except OSError as error:
             raise UsageError(f"{path}: the trace cannot be written: {error.strerror or error}") from error
         self._note("#", f"{link.name} opened; > to the device, < from it; seconds since then")
@@ -65,10 +71,21 @@ class TracedLink:
         """Close the link, then the trace."""
         self._link.close()
         with self._lock:
+            self._end()
+
+    def _end(self) -> None:
+        try:
             self._file.close()
+        except OSError as error:  # what was still to be written
+            self.trouble = error.strerror or str(error)
 
     def _note(self, mark: str, text: str) -> None:
         since_s = (self._link.now_ns() - self._started_ns) / 1e9
         with self._lock:
-            if not self._file.closed:
+            if self._file.closed:
+                return
+            try:
                 self._file.write(f"{since_s:.9f} {mark} {text}\n")
+            except OSError as error:  # a run does not end because its trace cannot be written
+                self.trouble = error.strerror or str(error)
+                self._end()

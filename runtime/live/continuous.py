@@ -37,13 +37,15 @@ class Continuous:
     metrics: str = ""
 
 
-def open_recorder(path: Path, header: Mapping[str, Any], bundle: bytes, limits: PartLimits | None) -> AnyRecorder:
+def open_recorder(
+    path: Path, header: Mapping[str, Any], bundle: bytes, limits: PartLimits | None, *, force: bool = False
+) -> AnyRecorder:
     """Begin the recording, in parts where they are asked for."""
     from pans.runtime.record import PartedRecorder, Recorder
 
     if limits is None:
-        return Recorder(path, header, bundle=bundle, overwrite=True)
-    return PartedRecorder(path, header, limits, bundle=bundle, overwrite=True)
+        return Recorder(path, header, bundle=bundle, overwrite=force)
+    return PartedRecorder(path, header, limits, bundle=bundle, overwrite=force)
 
 
 class Attendants:

@@ -8,19 +8,21 @@ part readable.
 from __future__ import annotations
 
 import hashlib
+import os
 import queue
+import re
 import secrets
 import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.container import canonical_json, replace_file
-from pans.runtime.errors import PansError, UsageError
+from pans.runtime.container import canonical_json
+from pans.runtime.errors import PansError, RecordingError, UsageError
+from pans.runtime.outputs import place_new, refuse_existing, replace_file
 
 from .recorder import Recorder
 
@@ -107,6 +109,20 @@ class PartKeeper:
     def finish(self, full: Recorder, facts: PartFacts, following: Path) -> None:
         """Have a part closed that is full; `following` is the next one."""
         self._tasks.put(lambda: self._finish(full, facts, following))
+
+    def take(self, number: int) -> Recorder:
+        """Return the part that is ready, under its own name; RecordingError if that cannot be."""
+        made, path = self.ready.get_nowait(), part_path(self._path, number)
+        try:
+            place_new(made.path, path)
+        except OSError as error:
+            made.__exit__(None, None, None)
+            reason = f"{path} exists" if isinstance(error, FileExistsError) else error.strerror or error
+            raise RecordingError(
+                f"{path}: the next part cannot be begun: {reason}", remedy="the parts before it are readable"
+            ) from error
+        made.path = path
+        return made
 
     def settle(self, facts: PartFacts) -> None:
         """Have a part indexed that is closed, and the oldest ones deleted above the cap."""
@@ -202,12 +218,24 @@ class PartKeeper:
         replace_file(index_path(self._path), canonical_json(index) + b"\n")
 
     def _clear(self, overwrite: bool) -> None:
-        pattern = f"{self._path.stem}-[0-9]*{self._path.suffix}"
-        there = [*self._path.parent.glob(pattern), *self._path.parent.glob(f".{pattern}.next")]
+        there = files_of_parts(self._path)
         if there and not overwrite:
-            raise UsageError(
-                f"{there[0]}: parts of another run are here", remedy="choose another folder, or allow overwriting"
-            )
-        for old in there:
-            with suppress(FileNotFoundError):
-                old.unlink()
+            raise refuse_existing(there[0])
+        try:
+            for old in there:
+                old.unlink(missing_ok=True)
+        except OSError as error:
+            raise UsageError(f"{there[0]}: cannot be replaced: {error.strerror or error}") from error
+
+
+def files_of_parts(first: Path) -> list[Path]:
+    """Return the files of a recording in parts beside `first` that are there: index, parts, and one that was made ahead."""
+    stem, suffix = re.escape(first.stem), re.escape(first.suffix)
+    wanted = re.compile(rf"{stem}-\d{{4,}}{suffix}|\.{stem}-\d{{4,}}{suffix}\.next|{stem}\.parts\.json")
+    try:
+        names = sorted(name for name in os.listdir(first.parent) if wanted.fullmatch(name))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise UsageError(f"{first.parent}: cannot be read: {error.strerror or error}") from error
+    return [first.with_name(name) for name in names]

@@ -130,11 +130,11 @@ class PartedRecorder:
 
     def next_part(self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int) -> None:
         """Go on in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
-        made, full = self.keeper.ready.get_nowait(), self.open_part
+        full = self.open_part
         full.flush()
+        made = self.keeper.take(self.parts + 1)
         facts = self._facts(full, full.written[1])
         self._first_decision, self._chain = facts.first_decision + facts.decisions, facts.chain_sha256
-        made.path = made.path.rename(part_path(self.path, self.parts + 1))
         self.open_part = made
         self._begin(place, commands, host_ns, facts)
         full.watch_write = None  # from here on it is written by the keeper, which delays nobody

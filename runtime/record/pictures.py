@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.container import replace_file
 from pans.runtime.core.decision import Decision, DecisionFlag
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
 from pans.runtime.npz_file import read_arrays
+from pans.runtime.outputs import replace_file
 
 TRUTH_MAX_BYTES = 1 << 29  # as a scene file
 

@@ -18,9 +18,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue, sync_folder
+from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import PansError, RecordingError, UsageError
+from pans.runtime.outputs import beside_name, place_new, refuse_existing, sync_folder
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
@@ -44,6 +45,7 @@ class Recorder:
     ) -> None:
         """Create `path` (UsageError if it exists, unless `overwrite`) and write header and bundle to it.
 
+        The file is there with both or not at all.
         `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
         """
         self.path = Path(path)
@@ -66,14 +68,24 @@ class Recorder:
         facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
         facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
         text = canonical_json({**facts, **header})
-        self._file = _create(self.path, overwrite)
+        if not overwrite and os.path.lexists(self.path):
+            raise refuse_existing(self.path)
+        beside = beside_name(self.path)
+        self._file = _create(beside, self.path)
         start, self._chain = file_prologue(MAGIC, FORMAT_VERSION)
         self._end = 0
-        self._write(start)
-        self._write_block(Kind.HEADER, text)
-        if bundle:
-            self._write_block(Kind.BUNDLE, bundle)
-        self.sync()
+        try:
+            self._write(start)
+            self._write_block(Kind.HEADER, text)
+            if bundle:
+                self._write_block(Kind.BUNDLE, bundle)
+            self.sync()
+            _place(beside, self.path, overwrite)
+        except BaseException:
+            self._file.close()
+            with suppress(OSError):
+                beside.unlink(missing_ok=True)
+            raise
         sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:
@@ -264,12 +276,21 @@ class Recorder:
         )
 
 
-def _create(path: Path, overwrite: bool) -> Any:
+def _create(beside: Path, path: Path) -> Any:
+    try:
+        return open(beside, "xb", buffering=0)  # one write per block, nothing half written behind our back
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _place(beside: Path, path: Path, overwrite: bool) -> None:
+    """Give the file its name, now that what makes it readable is on the disk."""
     try:
         if overwrite:
-            path.unlink(missing_ok=True)
-        return open(path, "xb", buffering=0)  # one write per block, nothing half written behind our back
+            os.replace(beside, path)
+        else:
+            place_new(beside, path)
     except FileExistsError as error:
-        raise UsageError(f"{path}: exists already", remedy="choose another name, or allow overwriting") from error
+        raise refuse_existing(path) from error
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

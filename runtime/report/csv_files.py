@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.container import replace_file
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import replace_file
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList, is_dark
 from pans.runtime.safe_text import csv_cell

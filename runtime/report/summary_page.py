@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import replace_file
+from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown
 
 from .summary import Summary
@@ -21,9 +21,18 @@ from .words import flow_rows
 
 
 def write_markdown(
-    path: Path, summary: Summary, facts: Mapping[str, Any], confusion: NDArray[np.int64], classes: Sequence[str]
+    path: Path,
+    summary: Summary,
+    facts: Mapping[str, Any],
+    confusion: NDArray[np.int64],
+    classes: Sequence[str],
+    *,
+    force: bool = False,
 ) -> None:
-    """Write the summary page; `facts` are name -> text lines about what was run (bundle, profile, device, command)."""
+    """Write the summary page; UsageError if it exists, unless `force`.
+
+    `facts` are name -> text lines about what was run (bundle, profile, device, command).
+    """
     simulated = " (SIMULATED)" if summary.simulated else ""
     lines = [f"# Run of {markdown(facts.get('bundle', 'a bundle'))}{simulated}", ""]
     if summary.simulated:
@@ -41,7 +50,7 @@ def write_markdown(
         "",
     ]
     lines += [f"- {name}: {markdown(text)}" for name, text in facts.items()]
-    replace_file(path, ("\n".join(lines) + "\n").encode())
+    write_file(path, ("\n".join(lines) + "\n").encode(), force=force)
 
 
 def _figures(summary: Summary) -> list[str]:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from pans.runtime.cli import EXIT_FINE, Command, emit, say
-from pans.runtime.container import replace_file
 from pans.runtime.errors import PansError, UsageError
+from pans.runtime.outputs import replace_file
 from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.registry import Objects, draw_task, load_task
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.container import replace_file
+from pans.runtime.outputs import replace_file
 from pans.trainer.model.detection import sample_clicks
 from pans.trainer.model.heads import Heads
 from pans.trainer.tasks.registry import Objects

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task

@@ -21,8 +21,8 @@ from pathlib import Path
 import torch
 
 from pans.runtime.bundle.incident import incident_field
-from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.baselines.bayes import bayes
 from pans.trainer.baselines.common import measure as measure_frames
 from pans.trainer.baselines.common import run_trials

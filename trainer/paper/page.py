@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import say
-from pans.runtime.container import replace_file
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import replace_file
 from pans.trainer.options import Options, same_options
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"

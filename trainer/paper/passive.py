@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.export.writer import export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities

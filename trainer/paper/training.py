@@ -29,9 +29,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pans.runtime.container import replace_file
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks
 from pans.trainer.model.estimators import ESTIMATORS, cross_entropy
 from pans.trainer.options import Options

@@ -21,8 +21,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.container import replace_file
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.model.detection import click_probability, sample_clicks
 from pans.trainer.model.encoders import ActiveIllumination

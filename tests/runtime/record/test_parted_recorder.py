@@ -205,7 +205,7 @@ def test_a_part_without_its_place_is_refused(parts: Path) -> None:
 
 
 def test_parts_of_another_run_are_not_overwritten(parts: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="parts of another run"):
+    with pytest.raises(UsageError, match="exists already"):
         PartedRecorder(parts / "run.pansrec", {}, PartLimits(KIB))
     path = tmp_path / "run.pansrec"
     for _ in range(2):

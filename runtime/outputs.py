@@ -1,0 +1,212 @@
+"""Creating files so that none is ever lost: exclusive creation, whole files or none, and the checks before a command begins.
+
+Owns how every output comes to be. A command declares its outputs (`check_outputs`) before it does anything else; nothing that exists is
+replaced unless the user asked for it (`force`) or the file is one that this project rewrites in place (`ours`). Never reads what is in a
+file and never decides where an output belongs.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .errors import UsageError
+
+FORCE_REMEDY = "choose another name, or replace it with --force"
+_NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
+
+
+# ---- before a command begins ----
+
+
+def check_outputs(
+    outputs: Iterable[str | Path],
+    *,
+    inputs: Iterable[str | Path | None] = (),
+    force: bool = False,
+    ours: Callable[[Path], bool] = lambda path: False,
+    makes_folders: bool = False,
+) -> None:
+    """Check what a command is going to write; UsageError before anything is touched, and nothing stays behind.
+
+    No output is an input (`inputs`; None and what does not exist are skipped) or another output, through links too.
+    What exists is a regular file, and replaced only with `force` or where `ours` recognises it. Folders exist, or can be
+    made where the command makes them (`makes_folders`), and can be written to.
+
+    >>> check_outputs(["nowhere/notes.txt"])
+    Traceback (most recent call last):
+        ...
+    pans.runtime.errors.UsageError: nowhere is not a folder
+      remedy: make it first
+    """
+    read = {file_identity(path): path for path in inputs if path is not None and os.path.exists(path)}
+    written: dict[tuple[object, ...], Path] = {}
+    folders: dict[Path, None] = {}
+    for path in map(Path, outputs):
+        identity = file_identity(path)
+        if identity in read:
+            raise UsageError(
+                f"{path}: is the input {read[identity]} itself", remedy="choose another name for the output"
+            )
+        if identity in written:
+            raise UsageError(f"{path}: is also the output {written[identity]}", remedy="give each output its own name")
+        written[identity] = path
+        _check_replaceable(path, force, ours)
+        folders[_folder_of(path, makes_folders)] = None
+    for folder in folders:
+        _check_writable(folder)
+
+
+def file_identity(path: str | Path) -> tuple[object, ...]:
+    """Return what two paths of one file have in common: device and inode, for a new file those of its folder and its name."""
+    try:
+        real = Path(path).resolve()
+        try:
+            found = real.stat()
+            return found.st_dev, found.st_ino
+        except (FileNotFoundError, NotADirectoryError):
+            folder = real.parent
+            while not folder.exists():
+                folder = folder.parent
+            found = folder.stat()
+            return found.st_dev, found.st_ino, *real.relative_to(folder).parts
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links that point at each other
+        raise UsageError(f"{path}: not a usable path: {getattr(error, 'strerror', None) or error}") from error
+
+
+def refuse_existing(path: Path) -> UsageError:
+    """Return the error for a file that would be replaced."""
+    return UsageError(f"{path}: exists already", remedy=FORCE_REMEDY)
+
+
+def _check_replaceable(path: Path, force: bool, ours: Callable[[Path], bool]) -> None:
+    if not os.path.lexists(path):
+        return
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder, expected the name of a file", remedy="choose another name")
+    if path.exists() and not stat.S_ISREG(path.stat().st_mode):
+        raise UsageError(f"{path}: is not a regular file", remedy="choose another name")
+    if not force and not (path.exists() and ours(path)):
+        raise refuse_existing(path)
+
+
+def _folder_of(path: Path, makes_folders: bool) -> Path:
+    """Return the folder to be written to, or the existing one in which it will be made."""
+    folder = path.parent
+    while makes_folders and not os.path.lexists(folder) and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder", remedy="choose another one" if makes_folders else "make it first")
+    return folder
+
+
+def _check_writable(folder: Path) -> None:
+    """Make a file and remove it: permissions alone do not tell of read-only or full file systems."""
+    probe = folder / f".pans-{secrets.token_hex(8)}.probe"
+    try:
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        os.unlink(probe)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written to: {error.strerror or error}") from error
+
+
+# ---- creating ----
+
+
+def write_file(path: str | Path, data: bytes, *, force: bool = False) -> None:
+    """Write `data` to `path` whole or not at all, synced; UsageError if that fails, or if `path` exists, unless `force`.
+
+    >>> write_file("notes.txt", b"first")
+    >>> write_file("notes.txt", b"second")
+    Traceback (most recent call last):
+        ...
+    pans.runtime.errors.UsageError: notes.txt: exists already
+      remedy: choose another name, or replace it with --force
+    """
+    if not force and os.path.lexists(path):
+        raise refuse_existing(Path(path))
+    with whole_file(path, force=force) as beside, open(beside, "xb") as file:
+        file.write(data)
+
+
+def replace_file(path: str | Path, data: bytes) -> None:
+    """Write a file that this project keeps and rewrites: as `write_file`, in place of the one before."""
+    write_file(path, data, force=True)
+
+
+@contextmanager
+def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+    """Yield a name beside `path` to write to; what is there at the end is synced and becomes `path`, after an error nothing does."""
+    target = Path(path)
+    beside = beside_name(target)
+    try:
+        try:
+            yield beside
+            _sync(beside)
+            if force:
+                os.replace(beside, target)
+            else:
+                place_new(beside, target)
+        finally:
+            with suppress(OSError):
+                os.unlink(beside)
+    except FileExistsError as error:
+        raise refuse_existing(target) from error
+    except OSError as error:
+        raise UsageError(f"{target}: cannot be written: {error.strerror or error}") from error
+    sync_folder(target.parent)
+
+
+def beside_name(target: Path) -> Path:
+    """Return a hidden name beside `target` that nobody else has."""
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
+
+
+def place_new(beside: str | Path, target: str | Path) -> None:
+    """Rename `beside` to `target`, which must not exist: FileExistsError otherwise."""
+    if os.name == "nt":
+        os.rename(beside, target)  # refuses what exists
+        return
+    try:
+        os.link(beside, target)
+    except OSError as error:
+        if error.errno not in _NO_HARD_LINKS:
+            raise
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # taken: what is renamed over is our own
+        os.replace(beside, target)
+        return
+    with suppress(OSError):
+        os.unlink(beside)  # both names are whole
+
+
+def make_folder(folder: Path) -> None:
+    """Make `folder` and those above it where they are missing; UsageError if that fails."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: the folder cannot be made: {error.strerror or error}") from error
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDWR)  # Windows syncs only what is open for writing
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a new or renamed entry of `folder` survive a power cut, where the system can sync folders."""
+    if os.name != "posix":
+        return
+    with suppress(OSError):  # some network file systems refuse; the file itself is on the disk
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,121 @@
+"""`pans run` and what was there before it: nothing is replaced, nothing stays of a run that was refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from commands import json_of
+
+from pans.runtime import SHIPPED
+from pans.runtime.cli import main
+from pans.runtime.record import read_recording
+from pans.runtime.run_folder import locked
+
+DEVICE = "sim:oled-qcmos?pace=fast&scene=fashion200"
+RUN = ["run", "self.pans", "--device", DEVICE, "--decisions", "5"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with a bundle, to run in."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SHIPPED / "fashion10.pans", "self.pans")
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder, and every folder in it."""
+    paths = sorted(folder.rglob("*"))
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
+
+
+BEFORE = {  # what is there already
+    "out": ["taken/run.pansrec"],
+    "summary": ["taken/summary.md"],
+    "parts": ["taken/run-0001.pansrec", "taken/run.parts.json", "taken/run-0007.pansrec"],
+    "trace": ["trace.txt"],
+    "state": ["notes.json"],
+}
+REFUSED = {  # what is asked for, and why it is refused
+    "out": (["--out", "taken"], "exists already"),
+    "summary": (["--out", "taken"], "exists already"),
+    "parts": (["--out", "taken", "--rotate-mb", "1"], "exists already"),
+    "trace": (["--trace", "trace.txt"], "exists already"),
+    "state": (["--state", "notes.json"], "exists already"),
+    "bundle as recording": (["--record", "self.pans"], "is the input"),
+    "bundle as state": (["--state", "self.pans", "--force"], "is the input"),
+    "bundle as trace": (["--trace", "./self.pans", "--force"], "is the input"),
+    "state is the trace": (["--state", "x", "--trace", "x"], "is also the output"),
+    "state into nowhere": (["--state", "none/state.json"], "not a folder"),
+    "out is a file": (["--out", "self.pans"], "not a folder"),
+    "out below a file": (["--out", "self.pans/a/b"], "not a folder"),
+    "out in /proc": (["--out", "/proc/self/x"], "cannot be written to"),
+    "busy port": (["--out", "a/b", "--device", "serial:/dev/none", "--profile", "ideal"], "cannot open"),
+    "bad scene": (["--device", "sim:oled-qcmos?pace=fast&scene=none"], "none"),
+    "bad shots": (["--out", "a", "--shots", "0"], "shots"),
+    "impossible plan": (["--out", "a", "--device", "sim:dmd-spad?pace=fast"], ""),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_refused_run_touches_nothing(case: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words, why = REFUSED[case]
+    for name in BEFORE.get(case, []):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"another run's")
+    before = contents(folder)
+    assert main([*RUN, *words]) in (2, 3)
+    message = capsys.readouterr().err
+    assert not why or pytest.raises(AssertionError, match=why).matches(AssertionError(message)), message
+    assert "Traceback" not in message
+    assert contents(folder) == before
+
+
+def test_force_replaces_and_only_what_is_written(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    json_of(capsys, *words("--out", "a"))
+    (folder / "a" / "run-2notes.pansrec").write_bytes(b"mine")
+    first = read_recording("a/run.pansrec").decisions_sha256
+    assert main([*RUN, "--out", "a"]) == 2
+    json_of(capsys, *words("--out", "a", "--force", "--shots", "2"))
+    assert read_recording("a/run.pansrec").decisions_sha256 != first
+    parted = json_of(capsys, *words("--out", "a", "--force", "--rotate-mb", "0.3"))
+    assert parted["recording"] == "a/run.parts.json"
+    assert sorted(os.listdir("a")) == [
+        "run-0001.pansrec",
+        "run-2notes.pansrec",
+        "run.pansrec",
+        "run.parts.json",
+        "summary.md",
+    ]
+
+
+def words(*more: str) -> tuple[str, ...]:
+    return (RUN[0], *RUN[1:], *more)
+
+
+def test_a_run_of_its_own_gets_a_folder_with_its_date(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = [json_of(capsys, *words()) for _ in range(2)]
+    assert found[0]["recording"] != found[1]["recording"]
+    assert found[0]["recording"].startswith("pans-runs/20")
+    assert Path("pans-runs/latest/run.pansrec").samefile(found[1]["recording"])
+    assert all(Path(one[key]).is_file() for one in found for key in ("recording", "report"))
+    recorded = json_of(capsys, *words("--record", "a.pansrec"))
+    assert (recorded["recording"], recorded["report"]) == ("a.pansrec", "a.summary.md")
+    assert not [name for name in contents(folder) if "lock" in name or "partial" in name]
+
+
+def test_a_folder_belongs_to_one_run_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("a").mkdir()
+    with locked(Path("a/.pans-run.lock")):
+        assert main([*RUN, "--out", "a"]) == 2
+    assert f"process {os.getpid()}" in capsys.readouterr().err
+    assert main([*RUN, "--out", "a"]) == 0
+
+
+def test_a_state_file_of_ours_is_rewritten(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        json_of(capsys, *words("--state", "state.json"))
+    assert b'"pans-state 1"' in Path("state.json").read_bytes()

@@ -1,0 +1,155 @@
+"""No output ever destroys a file: checks before a command begins, exclusive creation, whole files or none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from pans.runtime import outputs
+from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs, file_identity, place_new, whole_file, write_file
+from pans.runtime.run_folder import locked, new_run_folder
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    path = tmp_path / "old"
+    path.write_bytes(b"precious")
+    return path
+
+
+def listing(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+def test_an_existing_file_stays_unless_forced(old: Path) -> None:
+    for refused in (lambda: check_outputs([old]), lambda: write_file(old, b"new")):
+        with pytest.raises(UsageError, match=r"exists already\n.*--force"):
+            refused()
+    assert old.read_bytes() == b"precious"
+    check_outputs([old], force=True)
+    check_outputs([old], ours=lambda path: path.read_bytes() == b"precious")
+    write_file(old, b"new", force=True)
+    assert old.read_bytes() == b"new"
+    assert listing(old.parent) == ["old"]
+
+
+@pytest.mark.parametrize("way", ["itself", "symlink", "hard link", "link to its folder", "dots"])
+def test_an_output_is_never_an_input_by_whatever_name(old: Path, way: str) -> None:
+    path = old.with_name("other")
+    match way:
+        case "itself":
+            path = old
+        case "symlink":
+            path.symlink_to(old)
+        case "hard link":
+            os.link(old, path)
+        case "link to its folder":
+            path.symlink_to(old.parent)
+            path = path / "old"
+        case "dots":
+            path = old.parent / "." / ".." / old.parent.name / "old"
+    with pytest.raises(UsageError, match="is the input"):
+        check_outputs([path], inputs=[None, old, old.with_name("none")], force=True)
+    assert file_identity(path) == file_identity(old)
+
+
+def test_two_outputs_in_one_file_are_refused_even_before_it_exists(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path)
+    with pytest.raises(UsageError, match="is also the output"):
+        check_outputs([tmp_path / "a" / "new", tmp_path / "link" / "a" / "new"], makes_folders=True)
+
+
+def test_links_are_not_written_through(old: Path) -> None:
+    link, dangling = old.with_name("link"), old.with_name("dangling")
+    link.symlink_to(old)
+    dangling.symlink_to(old.with_name("nothing"))
+    for path in (link, dangling):
+        with pytest.raises(UsageError, match="exists already"):
+            check_outputs([path])
+        with pytest.raises(UsageError, match="exists already"):
+            write_file(path, b"new")
+    write_file(link, b"new", force=True)
+    assert (old.read_bytes(), link.read_bytes(), link.is_symlink()) == (b"precious", b"new", False)
+
+
+def test_folders_devices_and_loops_are_no_outputs(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for path in (tmp_path, tmp_path / "fifo", tmp_path / "loop", tmp_path / "loop" / "x", Path("/dev/full")):
+        with pytest.raises(UsageError):
+            check_outputs([path], force=path.name != "loop")
+
+
+@pytest.mark.parametrize("where", ["none/x", "old/x", "old/x/y", "a" * 300])
+def test_impossible_folders_are_refused(old: Path, where: str) -> None:
+    with pytest.raises(UsageError):
+        check_outputs([old.parent / where], makes_folders=where != "none/x")
+    assert listing(old.parent) == ["old"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_found_before(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot be written to"):
+        check_outputs(["/proc/self/x"])
+    check_outputs([tmp_path / "a" / "b" / "c"], makes_folders=True)
+    assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_failed_file_leaves_nothing_and_the_old_one_stays(old: Path, force: bool) -> None:
+    target = old if force else old.with_name("new")
+    with pytest.raises(UsageError, match="No space left"), whole_file(target, force=force) as beside:
+        beside.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+    with pytest.raises(KeyError), whole_file(target, force=force):
+        raise KeyError
+    assert listing(old.parent) == ["old"]
+    assert old.read_bytes() == b"precious"
+
+
+def test_who_comes_first_wins(tmp_path: Path) -> None:
+    target = tmp_path / "x"
+    with pytest.raises(UsageError, match="exists already"), whole_file(target) as beside:
+        beside.write_bytes(b"late")
+        target.write_bytes(b"early")
+    assert target.read_bytes() == b"early"
+    assert listing(tmp_path) == ["x"]
+
+
+def test_exclusive_renaming_without_hard_links(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(source: object, target: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(outputs.os, "link", no_links)
+    beside = old.with_name("beside")
+    beside.write_bytes(b"new")
+    with pytest.raises(FileExistsError):
+        place_new(beside, old)
+    place_new(beside, old.with_name("free"))
+    assert old.read_bytes() == b"precious"
+    assert listing(old.parent) == ["free", "old"]
+
+
+def test_run_folders_are_new_and_latest_follows(tmp_path: Path) -> None:
+    made = [new_run_folder("fashion/../10 x", tmp_path / "runs") for _ in range(3)]
+    assert len(set(made)) == 3
+    assert all(folder.parent == tmp_path / "runs" and not listing(folder) for folder in made)
+    assert (tmp_path / "runs" / "latest").resolve() == made[-1].resolve()
+    assert made[0].name.endswith("-fashion-..-10-x")
+    (tmp_path / "runs" / "latest").unlink()
+    (tmp_path / "runs" / "latest").mkdir()  # somebody's own
+    new_run_folder("y", tmp_path / "runs")
+    assert not (tmp_path / "runs" / "latest").is_symlink()
+
+
+def test_a_lock_names_its_holder_and_is_free_afterwards(tmp_path: Path) -> None:
+    path = tmp_path / ".lock"
+    with locked(path):
+        with pytest.raises(UsageError, match=f"process {os.getpid()}"), locked(path):
+            pytest.fail("held twice")
+        assert path.exists()
+    with locked(path):
+        pass
+    assert listing(tmp_path) == []
