@@ -55,7 +55,7 @@ REFUSED = {  # what is asked for, and why it is refused
     "out in /proc": (["--out", "/proc/self/x"], "cannot be written to"),
     "busy port": (["--out", "a/b", "--device", "serial:/dev/none", "--profile", "ideal"], "cannot open"),
     "bad scene": (["--device", "sim:oled-qcmos?pace=fast&scene=none"], "none"),
-    "bad shots": (["--out", "a", "--shots", "0"], "shots"),
+    "flow with decisions": (["--out", "a", "--flow", "cells"], "as many decisions as objects pass"),
     "impossible plan": (["--out", "a", "--device", "sim:dmd-spad?pace=fast"], ""),
 }
 
