@@ -10,6 +10,7 @@ import difflib
 import math
 import re
 import tomllib
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,7 @@ KeyPath = tuple[str, ...]
 Position = tuple[int, int]  # line, column; both count from 1
 
 _KEY_PART = re.compile(r"""[ \t]*(?:"((?:[^"\\\n]|\\.)*)"|'([^'\n]*)'|([A-Za-z0-9_-]+))[ \t]*""")
+KEY_PARTS_MAX = 100
 _STRING = re.compile(
     r'"""(?:[^\\]|\\.)*?"{3,5}' r"|'''.*?'{3,5}" r'|"(?:[^"\\\n]|\\.)*"' r"|'[^'\n]*'" r"|#[^\n]*", re.DOTALL
 )  # strings and comments: what brackets and newlines inside of them must not be taken for structure
@@ -34,6 +36,9 @@ def read_toml(text: str, where: str) -> tuple[dict[str, Any], Mapping[KeyPath, P
     Raises ConfigError with the position if the text is not TOML 1.0.
     """
     try:
+        for number, line in enumerate(text.split("\n"), 1):  # a key of thousands of parts takes tomllib minutes
+            if line.partition("=")[0].count(".") >= KEY_PARTS_MAX and not line.lstrip().startswith("#"):
+                raise ConfigError(f"{where}:{number}:1: a line with {KEY_PARTS_MAX} dots or more before any =")
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise _not_toml(error, text, where) from error
@@ -47,8 +52,15 @@ def read_toml(text: str, where: str) -> tuple[dict[str, Any], Mapping[KeyPath, P
 def key_positions(text: str) -> dict[KeyPath, Position]:
     """Map each dotted path to the (line, column) of its first character; `text` must be valid TOML."""
     found: dict[KeyPath, Position] = {}
+    listed_before: dict[KeyPath, int] = {}
+    starts = [0, *(match.end() for match in re.finditer("\n", text))]
     section: KeyPath = ()
     at = 0
+
+    def place(offset: int) -> Position:
+        line = bisect_right(starts, offset)
+        return line, offset - starts[line - 1] + 1
+
     while at < len(text):
         if text[at] in " \t\r\n":
             at += 1
@@ -57,18 +69,17 @@ def key_positions(text: str) -> dict[KeyPath, Position]:
         elif text[at] == "[":
             listed = text.startswith("[[", at)
             section, _ = _dotted_key(text, at + (2 if listed else 1))
-            found.setdefault(section, _line_column(text, at))
+            found.setdefault(section, place(at))
             if listed:
-                number = 0
-                while (*section, str(number)) in found:
-                    number += 1
+                number = listed_before.get(section, 0)
+                listed_before[section] = number + 1
                 section = (*section, str(number))
-                found[section] = _line_column(text, at)
+                found[section] = place(at)
             at = _line_end(text, at)
         else:
             key, after = _dotted_key(text, at)
             for depth in range(1, len(key) + 1):
-                found.setdefault(section + key[:depth], _line_column(text, at))
+                found.setdefault(section + key[:depth], place(at))
             at = _value_end(text, after + 1)
     return found
 

@@ -1,8 +1,10 @@
 """Profiles: the shipped ones are complete and possible, and a wrong line is named with its place and its remedy."""
 
+import contextlib
 import dataclasses
 import hashlib
 import math
+import time
 import tomllib
 
 import pytest
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from tree import ROOT
 
 from pans.runtime.errors import ConfigError
-from pans.runtime.instrument.checked_toml import key_positions, position_of
+from pans.runtime.instrument.checked_toml import key_positions, position_of, read_toml
 from pans.runtime.instrument.profile import MAX_PROFILE_BYTES, load_profile, parse_profile, shipped_profiles
 
 GOOD = """\
@@ -389,3 +391,15 @@ def test_any_text_is_read_or_refused_and_positions_cover_every_table(text):
         return
     found = key_positions(text)
     assert {path[0] for path in found if path} == set(tables)
+
+
+@pytest.mark.parametrize(
+    "unit",
+    ["k{} = 1\n", "[[a]]\nx = {}\n", "[s{}]\nx = 1\n", "a.b.c{}.d = 1\n", 'k{} = """x"""\n', "a.", "[", "# {}\n"],
+)
+def test_reading_takes_time_in_proportion_to_the_size(unit: str) -> None:
+    text = "".join(unit.format(number) for number in range(256 * 1024 // len(unit)))
+    started = time.process_time()
+    with contextlib.suppress(ConfigError):
+        read_toml(text, "long.toml")
+    assert time.process_time() - started < 2.0  # about 0.2; where each key counted the lines before it, 24
