@@ -21,6 +21,7 @@ from typing import Any
 from pans.runtime import __version__
 
 from .errors import PansError, UsageError
+from .guests import load_guest
 from .ranges import FINITE, WHOLE
 from .safe_text import lines, one_line
 
@@ -99,9 +100,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _load(point: EntryPoint) -> Command:
     try:
-        command = point.load()
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").split(".")[0]
+        command = load_guest(point)
+    except UsageError as error:
+        missing = (getattr(error.__cause__, "name", None) or "").split(".")[0]
         extra = {"torch": "train", "onnx": "train", "matplotlib": "plot", "h5py": "export"}.get(missing)
         if extra is None:
             raise
@@ -147,7 +148,7 @@ def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, 
         try:
             summary = _written_help(commands[name]) or _load(commands[name]).help
         except UsageError as error:
-            summary = f"({error.remedy})"
+            summary = f"({error.message}; {error.remedy})"
         except Exception as error:  # one package's broken command must not hide all the others
             summary = f"(cannot be loaded: {error})"
         print(f"  {name:<10} {summary}")

@@ -14,6 +14,7 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, emit, say
 from pans.runtime.errors import UsageError
+from pans.runtime.guests import load_guest
 from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "sim")
@@ -73,7 +74,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:
     for point in entry_points(group="pans.benches", name=name):
-        found: Callable[[Any], list[dict[str, Any]]] = point.load()
+        found: Callable[[Any], list[dict[str, Any]]] = load_guest(point)
         return found
     return None
 

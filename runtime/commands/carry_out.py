@@ -187,8 +187,8 @@ def _recorded(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
     if job.recording is None:
         result = _watched(job, ready, link, None, recovery, stop)
         return _conclude(job, ready, result, _summary(job, ready, result))
-    limits = job.continuous.limits
-    with open_recorder(job.recording, ready.header, bundle_bytes, limits, force=job.force) as recorder:
+    limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
+    with open_recorder(job.recording, header, bundle_bytes, limits, force=job.force) as recorder:
         result = _watched(job, ready, link, recorder, recovery, stop)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))

@@ -44,7 +44,7 @@ def _run(args: argparse.Namespace) -> int:
         "clicks": len(clicks.start_tick),
         "exposures": clicks.exposures,
         "complete": recording.complete,
-        "simulated": recording.header.get("simulated"),
+        "simulated": recording.simulated,
     }
     banner = "SIMULATED: " if payload["simulated"] else ""
     names = ", ".join(payload["files"])

@@ -104,7 +104,6 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
         "bundle_sha256": bundle_sha256,
         "command": job.command,
         "device_url": job.device,
-        "simulated": job.device.startswith("sim:"),
         "profile": {"name": job.profile.name, "sha256": job.profile.sha256, "toml": job.profile.text},
         "config": {
             "shots": job.shots,

@@ -19,6 +19,7 @@ from pans.runtime.errors import UsageError
 
 from .names import BACKENDS as BACKENDS
 from .names import backend_names, offered_backends
+from .offered import CLICKS_SEED, OfferedDecider
 from .onnx import OnnxDecider as OnnxDecider
 from .onnx import PictureDecider
 from .table import CountTableDecider, fits_count_table
@@ -28,8 +29,6 @@ from .verdict import Verdict as Verdict
 from .verdict import softmax_winner as softmax_winner
 
 MEASURED_CALLS = 200
-OFFERED_CALLS = 64  # enough to meet a wrong shape or range, few enough to cost nothing
-CLICKS_SEED = 20250103
 
 
 def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> Decider:
@@ -40,7 +39,10 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
     or that cannot answer `shots`; DamagedFileError when it contradicts the golden vectors.
     """
     if backend not in BACKENDS and backend not in offered_backends():
-        raise UsageError(f"back end {backend!r}, allowed: {', '.join(backend_names())}")
+        raise UsageError(
+            f"back end {backend!r}, allowed: {', '.join(backend_names())}",
+            remedy="install the package that offers it, if it is none of ours",
+        )
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
     if bundle.picture_shape is not None:
@@ -49,7 +51,9 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
         return PictureDecider(bundle)
     if backend == "auto":
         return _choose(bundle, shots)
-    return _make(bundle, shots, backend) if backend in BACKENDS else _offered(bundle, shots, backend)
+    if backend in BACKENDS:
+        return _make(bundle, shots, backend)
+    return OfferedDecider(offered_backends()[backend], bundle, shots)
 
 
 def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
@@ -67,21 +71,6 @@ def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
         "float64": decide_mlp.ReferenceDecider,
     }
     return makers[backend](bundle)
-
-
-def _offered(bundle: Bundle, shots: int, backend: str) -> Decider:
-    """Make a back end of another package. It need not agree with the head, but it must answer any clicks in range."""
-    decider: Decider = offered_backends()[backend].load()(bundle)
-    wanted = (backend, bundle.n_features, len(bundle.classes))
-    found = (decider.name, decider.n_features, decider.n_classes)
-    if found != wanted:
-        raise UsageError(f"back end {backend!r} says (name, patterns, classes) {found}, must be {wanted}")
-    counts = np.random.default_rng(CLICKS_SEED).integers(0, shots + 1, size=(OFFERED_CALLS, bundle.n_features))
-    for row in counts:
-        label, probability = decider.decide(row, shots)
-        if not (0 <= label < wanted[2] and 0.0 <= probability <= 1.0):
-            raise UsageError(f"back end {backend!r} answers {(label, probability)} to the clicks {row.tolist()}")
-    return decider
 
 
 def _choose(bundle: Bundle, shots: int) -> Decider:

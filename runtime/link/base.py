@@ -6,13 +6,16 @@ by entry point, see docs/how-to/own-device.md); reader.py reads from any of them
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import LinkError, UsageError
+from pans.runtime.guests import load_guest, package_of
 
 from .serial import SerialLink
 from .usb import UsbLink
+
+MEMBERS = ("name", "simulated", "virtual", "read", "write", "now_ns", "close")
 
 
 class Link(Protocol):
@@ -57,7 +60,22 @@ def open_link(url: str) -> Link:
     if scheme not in points:
         known = ", ".join(sorted({"serial", "usb", *points}))
         raise UsageError(f"unknown device scheme {scheme!r} in {url!r}", remedy=f"known: {known}")
-    link: Link = points[scheme].load()(url)
+    return _checked_link(points[scheme], url)
+
+
+def _checked_link(point: EntryPoint, url: str) -> Link:
+    """Open a link of another package; an error that is not one of ours names the package."""
+    opener = load_guest(point)
+    try:
+        link: Link = opener(url)
+    except OSError as error:
+        raise LinkError(f"{url!r} cannot be opened by {package_of(point)}: {error}") from error
+    missing = [name for name in MEMBERS if not hasattr(link, name)]
+    if missing:
+        raise UsageError(
+            f"{package_of(point)} opens {url!r} as {type(link).__name__}, which has no {', '.join(missing)}",
+            remedy="see docs/how-to/own-device.md for the members of a link",
+        )
     return link
 
 

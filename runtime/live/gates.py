@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from pans.runtime.core.decision import Action
 from pans.runtime.errors import DeviceError, LinkError, UsageError
+from pans.runtime.guests import load_guest
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.clock import ClockModel
@@ -218,7 +219,7 @@ def open_actuator(url: str, profile: Profile) -> Actuator | SecondInstrument | N
         return None
     found = {point.name: point for point in entry_points(group=GROUP)}
     if name in found:
-        actuator: Actuator = found[name].load()(rest)
+        actuator: Actuator = load_guest(found[name])(rest)
         return actuator
     links = {*LINKS, *(point.name for point in entry_points(group=DEVICES))}
     if name not in links:

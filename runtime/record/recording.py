@@ -50,6 +50,11 @@ class Recording:
     summary: Mapping[str, Any]  # of END; empty if incomplete
     damage: str  # "" or what is wrong behind end_offset (salvage only)
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the clicks are simulated, as the link said at the start or the device by the end."""
+        return bool(self.header.get("simulated") or self.summary.get("simulated"))
+
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""
         with open_regular(self.path) as file:

@@ -55,7 +55,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList)
         written.append(folder / name)
     about = {
         "recording": recording.path.name,
-        "simulated": recording.header.get("simulated"),
+        "simulated": recording.simulated,
         "complete": recording.complete,
         "exposure_us": plan.exposure_us,
         "tick_us": us,

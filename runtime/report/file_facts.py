@@ -95,7 +95,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "damage": recording.damage,
         "size_bytes": recording.size,
         "readable_bytes": recording.end_offset,
-        "simulated": header.get("simulated"),
+        "simulated": recording.simulated,
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
         "decisions": recording.n_decisions,
         "abstained": len(decisions) - len(decided),

@@ -58,7 +58,7 @@ def recording_page(recording: Recording) -> bytes:
     summary = recording.summary
     bundle = recording.bundle() if recording.bundle_data() else None
     name = bundle.name if bundle is not None else "a bundle that is not in the recording"
-    page = Page(f"Run of {name}", simulated=bool(recording.header.get("simulated")))
+    page = Page(f"Run of {name}", simulated=recording.simulated)
     _verdict(page, recording)
     page.heading("Results")
     if summary:

@@ -70,7 +70,7 @@ def _write(group: Any, tree: dict[str, Any]) -> None:
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
     unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
     channels = plan.n_patterns if plan.mode == "parallel" else 1
-    simulated = bool(recording.header.get("simulated"))
+    simulated = recording.simulated
     profile = recording.header.get("profile", {})
     device = recording.summary.get("device", {})
     described = (

@@ -18,7 +18,7 @@ from pans.runtime.errors import DamagedFileError, LinkError, PansError, TimingEr
 class Point:
     """An entry point that is not installed."""
 
-    value = "lab.package:COMMAND"
+    value, group, dist = "lab.package:COMMAND", "pans.commands", None
 
     def __init__(self, name: str, loaded: object) -> None:
         self.name, self.loaded = name, loaded

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.incident import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.guests import load_guest
 from pans.runtime.images import read_class_folder, to_8_bits
 
 from .generators import GENERATORS
@@ -120,7 +121,7 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
     if name_or_path in GENERATORS:
         return draw_task(name_or_path, data_seed)
     if name_or_path in (offered := _offered_tasks()):
-        return _checked_task(offered[name_or_path].load()(data_seed), name_or_path)
+        return _checked_task(load_guest(offered[name_or_path])(data_seed), name_or_path)
     path = Path(name_or_path)
     if path.is_dir():
         return _load_folder(path)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import fields
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,6 @@ from bundles import made_bundle
 from heads import affine_head
 
 from pans.runtime.bundle.model import Bundle, word_means
-from pans.runtime.decide import names as backend_names_module
 from pans.runtime.decide.backends import TableDecider, make_decider, softmax_winner
 from pans.runtime.decide.kernels import label_words
 from pans.runtime.decide.onnx import OnnxDecider
@@ -289,44 +286,3 @@ def test_the_table_path_needs_neither_numba_nor_onnxruntime(tmp_path: Path) -> N
     path = str(tmp_path / "t.pans")
     done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1 []"
-
-
-LAB = '''
-from pans.runtime.decide.verdict import Verdict
-
-class Fewest:
-    """Decides for the last class when nothing clicked."""
-    def __init__(self, bundle):
-        self.name, self.n_features, self.n_classes = "fewest", bundle.n_features, len(bundle.classes)
-    def decide(self, counts, shots):
-        return Verdict(LABEL if counts.sum() else self.n_classes - 1, 1.0)
-'''
-
-
-@pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """A lab's own package with a back end, offered by an entry point; called with the label that it answers."""
-
-    def offer(label: int) -> None:
-        (tmp_path / f"lab{label}.py").write_text(LAB.replace("LABEL", str(label)))
-        points = [EntryPoint("fewest", f"lab{label}:Fewest", "pans.backends"), EntryPoint("table", "lab:No", "x")]
-        monkeypatch.setattr(backend_names_module, "entry_points", lambda group: points)
-
-    monkeypatch.syspath_prepend(str(tmp_path))
-    return offer
-
-
-def test_a_lab_s_own_back_end_is_found_by_its_entry_point(lab: Callable[[int], None]) -> None:
-    lab(0)
-    made = made_bundle(3, 2, table=np.zeros((8, 2)))
-    decider = make_decider(made, backend="fewest")
-    assert decider.decide(np.zeros(3, np.int64), 1) == (1, 1.0)
-    assert make_decider(made, backend="table").name == "table"  # ours cannot be replaced
-    with pytest.raises(UsageError, match=r"'none', allowed: auto, .*, fewest"):
-        make_decider(made, backend="none")
-
-
-def test_a_lab_s_own_back_end_is_held_to_the_classes(lab: Callable[[int], None]) -> None:
-    lab(7)
-    with pytest.raises(UsageError, match=r"answers \(7, 1.0\) to the clicks"):
-        make_decider(made_bundle(3, 2, table=np.zeros((8, 2))), backend="fewest")

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from tree import ROOT
 
+import pans
 from pans.firmware_sim.ports import usb_backend
 from pans.firmware_sim.ports.inprocess import ThreadedInstrument
 from pans.firmware_sim.ports.protocol_panssim import register
@@ -484,3 +485,29 @@ def test_the_documented_driver_works_by_its_entry_point(tmp_path: Path, monkeypa
         stopped.set()
         thread.join(PATIENCE_S)
         port.close()
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "words"),
+    [
+        ("raise OSError(5, 'no such board')", LinkError, "cannot be opened by .*no such board"),
+        ("return object()", UsageError, "as object, which has no name, simulated"),
+    ],
+)
+def test_a_driver_that_does_not_keep_the_contract_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str, kind: type[Exception], words: str
+) -> None:
+    (tmp_path / f"odd{kind.__name__}.py").write_text(f"def open_odd(url):\n    {body}\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    point = EntryPoint("odd", f"odd{kind.__name__}:open_odd", "pans.devices")
+    monkeypatch.setattr(link_module, "entry_points", lambda group: [point])
+    with pytest.raises(kind, match=words):
+        open_link("odd:1")
+
+
+def test_a_simulated_instrument_behind_another_scheme_is_recorded_as_simulated(tmp_path: Path) -> None:
+    url = "simserial:oled-qcmos?scene=fashion200&pace=fast"
+    result = pans.run("fashion10", url, profile="oled-qcmos", decisions=5, out=tmp_path / "out")
+    assert result.recording is not None
+    recording = pans.load_recording(result.recording)
+    assert recording.header["simulated"] is recording.simulated is result.summary.simulated is True
