@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
@@ -95,7 +96,8 @@ def _use_bundle(path: Path) -> None:
         profile for profile in (load_profile("ideal"), load_profile("oled-qcmos")) if _plannable(profile, bundle)
     ]
     if planned and zlib.crc32(path.read_bytes()) % RUN_EVERY == 0:
-        record_run(path.parent, path, planned[0].name).unlink()
+        with tempfile.TemporaryDirectory() as folder:
+            record_run(Path(folder), path, planned[0].name)
 
 
 def _plannable(profile: Profile, bundle: Bundle) -> bool:
