@@ -118,7 +118,7 @@ def _check_writable(folder: Path) -> None:
 # ---- creating ----
 
 
-def write_file(path: str | Path, data: bytes, *, force: bool = False) -> None:
+def write_file(path: str | Path, data: bytes | memoryview, *, force: bool = False) -> None:
     """Write `data` to `path` whole or not at all, synced; UsageError if that fails, or if `path` exists, unless `force`.
 
     >>> write_file("notes.txt", b"first")
@@ -134,7 +134,7 @@ def write_file(path: str | Path, data: bytes, *, force: bool = False) -> None:
         file.write(data)
 
 
-def replace_file(path: str | Path, data: bytes) -> None:
+def replace_file(path: str | Path, data: bytes | memoryview) -> None:
     """Write a file that this project keeps and rewrites: as `write_file`, in place of the one before."""
     write_file(path, data, force=True)
 

@@ -5,9 +5,10 @@ Owns the resolution and the back end, which needs no screen; what is drawn is th
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
+
+from pans.runtime.outputs import whole_file
 
 DPI = 90
 
@@ -26,10 +27,10 @@ def new_figure(width: float = 10.0, height: float = 4.0, panels: int = 2, rows: 
     return pyplot.subplots(rows, panels, figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path, *, force: bool = True) -> None:
+    """Write `figure` to `path` (PNG), whole or not at all; without `force`, UsageError if `path` exists."""
     from matplotlib import pyplot
 
-    beside = path.with_name(path.name + ".part")
-    figure.savefig(beside, dpi=DPI, format="png")
+    with whole_file(path, force=force) as beside:
+        figure.savefig(beside, dpi=DPI, format="png")
     pyplot.close(figure)
-    os.replace(beside, path)

@@ -13,19 +13,22 @@ from typing import Any
 
 from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.trials import TRIALS, load_trial
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
 from pans.runtime.errors import PansError
+from pans.runtime.outputs import check_outputs, write_file
 
 
 def run_trial(name: str, args: argparse.Namespace) -> int:
     """Run the trial `name` with the options in `args`, print its report and return the exit code."""
     trial = load_trial(name)
+    if isinstance(args.json, Path):
+        check_outputs([args.json], force=args.force)
     try:
         report = trial.run(settings_from(args, trial.settings))
     except RuntimeError as error:  # a process of the trial did not do its part: nothing was measured
         raise PansError(f"{name}: {error}") from error
     if isinstance(args.json, Path):
-        args.json.write_text(json.dumps(report.figures) + "\n")
+        write_file(args.json, (json.dumps(report.figures) + "\n").encode(), force=args.force)
         args.json = False
     emit(args, report.figures, report.words)
     return EXIT_FINE if report.passed else EXIT_ALERT
@@ -43,6 +46,8 @@ class _TrialParser(argparse.ArgumentParser):
         json_words: dict[str, Any] = to_file if trial.json_to_file else {"action": "store_true"}
         where = "to FILE, or on stdout" if trial.json_to_file else "on stdout"
         self.add_argument("--json", default=argparse.SUPPRESS, help=f"write one JSON object {where}", **json_words)
+        if trial.json_to_file:
+            add_force(self)
         self.add_argument(
             "--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error"
         )

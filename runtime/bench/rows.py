@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime import SHIPPED
+from pans.runtime.outputs import whole_file
 from pans.runtime.report.figures import pyplot
 
 Row = dict[str, Any]
@@ -162,7 +163,7 @@ def mark_pareto(rows: list[Row], speed: str, error: str) -> None:
         row["pareto"] = not beaten
 
 
-def write_plot(rows: list[Row], path: Path) -> None:
+def write_plot(rows: list[Row], path: Path, *, force: bool = False) -> None:
     """Draw speed against error of the rows that have both (`ns`, `score_error`), and plain speed of the others."""
     plt = pyplot("--plot")
     points = [row for row in rows if "ns" in row and "score_error" in row]
@@ -176,7 +177,8 @@ def write_plot(rows: list[Row], path: Path) -> None:
     axes[1].barh([row["name"] for row in others], [row["rate"] for row in others])
     axes[1].set(xscale="log", xlabel="items per second")
     axes[1].tick_params(labelsize=7)
-    figure.savefig(path, dpi=120)
+    with whole_file(path, force=force) as beside:
+        figure.savefig(beside, dpi=120, format=path.suffix[1:] or "png")
     plt.close(figure)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.container import canonical_json, parse_json_object, read_file
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import write_file
 
 from .facts import (
     GOLDEN_WORK_MAX,
@@ -196,10 +196,10 @@ def _golden_shots(n_features: int) -> NDArray[np.float32]:
     return np.concatenate(rows)
 
 
-def write_bundle(bundle: Bundle, path: str | Path) -> str:
-    """Write `bundle` beside `path`, sync, rename over it; return the file's SHA-256 as hex."""
+def write_bundle(bundle: Bundle, path: str | Path, *, force: bool = False) -> str:
+    """Write `bundle` to `path` whole or not at all; UsageError if it exists, unless `force`. Return the file's SHA-256 as hex."""
     data = bundle_bytes(bundle)
-    replace_file(path, data)
+    write_file(path, data, force=force)
     return hashlib.sha256(data).hexdigest()
 
 

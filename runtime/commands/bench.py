@@ -12,9 +12,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.cli import EXIT_FINE, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.guests import load_guest
+from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 NAMES = ("decide", "link", "loop", "ingest", "sim")
@@ -47,6 +48,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
     parser.add_argument("--plot", type=Path, help="write a picture of speed against error (plot extra)")
+    add_force(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -55,6 +57,8 @@ def _run(args: argparse.Namespace) -> int:
     if args.seconds <= 0 or args.frames < 0:
         raise UsageError("--seconds must be above 0 and --frames not negative")
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.frames, args.load, args.quick)
+    if args.plot is not None:
+        check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)
     before = machine_facts()
     rows: list[dict[str, Any]] = []
     for name in NAMES if args.what == "all" else (args.what,):
@@ -66,7 +70,7 @@ def _run(args: argparse.Namespace) -> int:
         rows += [{"bench": name, **row} for row in bench(options)]
     machine = before | {"load_1min_after": machine_facts()["load_1min"]}
     if args.plot is not None:
-        write_plot(rows, args.plot)
+        write_plot(rows, args.plot, force=args.force)
     text = "\n".join(f"{key:<16} {value}" for key, value in machine.items())
     emit(args, {"machine": machine, "rows": rows}, f"{text}\n\n{table_text(rows)}")
     return EXIT_FINE

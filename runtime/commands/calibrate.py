@@ -14,12 +14,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
 from .run import profile_of
+from .run_files import files_of_url
 
 FIRST_STAGE_SHARE = 0.1
 PEAK_OFF = 0.2  # of the profile's brightness: beyond it the answer says so
@@ -33,6 +35,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", required=True, type=Path, metavar="FILE", help="calibration file to write (.json)"
     )
+    add_force(parser)
     parser.add_argument("--seconds", type=Range(0.5, 86_400).option, default=10.0, help="instrument time (default 10)")
     parser.add_argument(
         "--seed", type=Range(0, (1 << 63) - 1, whole=True).option, default=1, help="of the random patterns (default 1)"
@@ -40,6 +43,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
+    _check(args)
     from pans.runtime.core.calibration import (
         LADDER,
         TELLING,
@@ -73,7 +77,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     with as_usage_error():
         values = calibration_values(counts_of(core, second, profile), model, second, profile)
     values |= {"command": shlex.join(["pans", *sys.argv[1:]]), "seed": args.seed, "device": facts}
-    sha256 = save_calibration(args.out, values)
+    sha256 = save_calibration(args.out, values, force=args.force)
     payload = {
         "calibration": str(args.out),
         "sha256": sha256,
@@ -82,6 +86,11 @@ def _calibrate(args: argparse.Namespace) -> int:
     emit(args, payload, _words(args.out, values))
     off = abs(values["efficiency"]["relative_to_profile"] - 1.0) > PEAK_OFF
     return EXIT_ALERT if off else EXIT_FINE
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is measured."""
+    check_outputs([args.out], inputs=[args.profile, *files_of_url(args.device)], force=args.force)
 
 
 def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any]]:

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from pans.runtime import __version__
 from pans.runtime.bundle.model import BackEnd, Shown, make_bundle, write_bundle
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, add_force, emit
 from pans.runtime.container import read_file
 from pans.runtime.core.plan import exposure_us
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.outputs import check_outputs
 from pans.runtime.record.parts import is_of_parts
 from pans.runtime.report.file_facts import file_facts
 from pans.runtime.report.verify import FileVerdict, verify_file, verify_parts
@@ -146,9 +147,11 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.pans", help="the file to write")
+    add_force(parser)
 
 
 def _bundle(args: argparse.Namespace) -> int:
+    check_outputs([args.out], inputs=[args.patterns, args.head, args.table, args.profile], force=args.force)
     if args.head is None and args.table is None:
         raise UsageError("neither --head nor --table was given", remedy="give one of them, or both")
     profile = load_profile(args.profile) if args.profile else None
@@ -169,7 +172,7 @@ def _bundle(args: argparse.Namespace) -> int:
         provenance={**provenance, "quantisation": _quantisation_facts(quantised)},
     )
     exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}
-    sha256 = write_bundle(bundle, args.out)
+    sha256 = write_bundle(bundle, args.out, force=args.force)
     facts = {**_quantisation_facts(quantised), **exposure, "levels": levels, "patterns": bundle.n_features}
     emit(args, {"bundle": str(args.out), "sha256": sha256, **facts}, "\n".join(_bundle_lines(args.out, sha256, facts)))
     return EXIT_FINE

@@ -9,7 +9,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
+from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs
 
 if TYPE_CHECKING:  # `pans replay --help` loads no kernels
     from pans.runtime.record import Recording
@@ -29,12 +31,17 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         metavar="SCENE.npz",
         help="compare these pictures with the scene's images (SSIM, squared error)",
     )
+    add_force(parser)
 
 
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.record.parts import is_of_parts
 
+    if args.pictures is not None:
+        check_outputs([args.pictures], inputs=[args.recording, args.bundle, args.truth], force=args.force)
     if is_of_parts(args.recording):
+        if args.pictures or args.truth:
+            raise UsageError("--pictures and --truth take one recording", remedy="name one of its parts")
         return _run_parts(args)
     from pans.runtime.record.pictures import PictureLog
 
@@ -48,7 +55,7 @@ def _run(args: argparse.Namespace) -> int:
         **_figures(found),
     }
     if pictures is not None and args.pictures:
-        pictures.write(args.pictures)
+        pictures.write(args.pictures, force=args.force)
     if pictures is not None and args.truth:
         payload |= pictures.compare(args.truth)
     head = f"{found.decisions} decisions, SHA-256 {found.sha256}: {_agreement_words(recording, found)}"

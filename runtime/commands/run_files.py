@@ -25,7 +25,7 @@ STATE_MAX_BYTES = 1 << 16
 
 def check_run_files(job: Job) -> None:
     """Check every output of `job` before anything is opened; UsageError if one exists, is an input, or cannot be written."""
-    inputs = [*job.inputs, job.bundle_path, job.dark.calibration, *_files_in(job.device)]
+    inputs = [*job.inputs, job.bundle_path, job.dark.calibration, *files_of_url(job.device)]
     outputs = [path for path in (job.recording, job.page, job.trace) if path is not None]
     if job.recording is not None and job.continuous.limits is not None:
         outputs = [index_path(path) if path == job.recording else path for path in outputs]
@@ -94,7 +94,7 @@ def _locks(job: Job) -> set[Path]:
     return recording if job.out is None else {*recording, job.out / ".pans-run.lock"}
 
 
-def _files_in(device: str) -> list[str]:
+def files_of_url(device: str) -> list[str]:
     """Return the files that a device URL names: a scene, a fault plan, a profile."""
     base, _, query = device.partition("?")
     values = [base.partition(":")[2], *(value for _, value in parse_qsl(query))]

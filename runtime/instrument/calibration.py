@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import canonical_json, parse_json_object, read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, number_text
 
 from .click_law import ClickLaw, log_no_click
@@ -98,13 +98,16 @@ class Calibration:
         return replace(profile, projector=projector)
 
 
-def save_calibration(path: str | Path, values: Mapping[str, Any]) -> str:
-    """Write `values` (JSON-able, with all keys of the format but the checksum) whole or not at all; return the file's SHA-256."""
+def save_calibration(path: str | Path, values: Mapping[str, Any], *, force: bool = False) -> str:
+    """Write `values` (JSON-able, with all keys of the format but the checksum) whole or not at all; return the file's SHA-256.
+
+    UsageError if `path` exists, unless `force`.
+    """
     body = {"format": FORMAT, "version": VERSION, **values}
     sealed = {**body, "sha256": hashlib.sha256(canonical_json(body)).hexdigest()}
     data = (json.dumps(sealed, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
     parse_calibration(data, str(path))
-    replace_file(path, data)
+    write_file(path, data, force=force)
     return hashlib.sha256(data).hexdigest()
 
 

@@ -20,7 +20,7 @@ from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
 from pans.runtime.npz_file import read_arrays
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import write_file
 
 TRUTH_MAX_BYTES = 1 << 29  # as a scene file
 
@@ -78,12 +78,12 @@ class PictureLog:
             return np.zeros(0, np.int64), np.zeros((0, *shape), np.float32)
         return np.array(self._objects, np.int64), self._back_end.pictures(np.stack(self._asked), self._shots)
 
-    def write(self, path: Path) -> None:
-        """Write `object` and `pictures` to a .npz, whole or not at all."""
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write `object` and `pictures` to a .npz, whole or not at all; UsageError if it exists, unless `force`."""
         objects, pictures = self.pictures()
         stream = io.BytesIO()
         np.savez_compressed(stream, allow_pickle=False, object=objects, pictures=pictures)
-        replace_file(path, stream.getvalue())
+        write_file(path, stream.getvalue(), force=force)
 
     def compare(self, truth: Path) -> dict[str, Any]:
         """Return SSIM and mean squared error against the scene in `truth` (.npz with `images`), whose objects pass in turn."""

@@ -15,7 +15,7 @@ from typing import Any
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import make_folder, write_file
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList, is_dark
 from pans.runtime.safe_text import csv_cell
@@ -27,14 +27,15 @@ DECISIONS = (
 CLICKS = (
     *("exposure_start_tick", "exposure_start_us", "exposure", "object", "channel", "pattern", "dark_slot", "stream"),
 )
+FILES = ("decisions.csv", "clicks.csv", "timings.csv", "about.json")
 TIMINGS = ("decision", "device_end_ns", "arrival_ns", "decided_ns", "recorded_ns", "end_to_decided_us")
 
 
-def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList) -> list[Path]:
+def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> list[Path]:
     """Write decisions, clicks, timings and about.json into `folder`; return their paths. UsageError where `folder` is a file."""
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     us = 1e6 / int(recording.header["config"]["tick_hz"])
     classes = recording.bundle().classes if recording.bundle_data() else ()
     tables: dict[str, tuple[Sequence[str], Iterable[Sequence[Any]]]] = {
@@ -51,7 +52,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList)
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(head)
         writer.writerows(rows)
-        replace_file(folder / name, text.getvalue().encode())
+        write_file(folder / name, text.getvalue().encode(), force=force)
         written.append(folder / name)
     about = {
         "recording": recording.path.name,
@@ -65,7 +66,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList)
         "header": {key: value for key, value in recording.header.items() if key != "profile"},
         "events": list(recording.events()),
     }
-    replace_file(folder / "about.json", (json.dumps(about, indent=1, sort_keys=True) + "\n").encode())
+    write_file(folder / "about.json", (json.dumps(about, indent=1, sort_keys=True) + "\n").encode(), force=force)
     return [*written, folder / "about.json"]
 
 

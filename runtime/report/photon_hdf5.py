@@ -11,8 +11,7 @@ leaves `/user` to its users.
 from __future__ import annotations
 
 import importlib
-import os
-import secrets
+import io
 import time
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 from pans.runtime import __version__
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import write_file
 from pans.runtime.record import Recording
 from pans.runtime.record.exposures import ClickList
 
@@ -29,8 +29,11 @@ FORMAT_NAME, FORMAT_VERSION = "Photon-HDF5", "0.5"
 FORMAT_URL = "http://photon-hdf5.org/"
 
 
-def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> None:
-    """Write `clicks` of `recording` beside `path`, and rename; UsageError without h5py, or when the device's clock went back."""
+def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> None:
+    """Write `clicks` of `recording` to `path`, whole or not at all.
+
+    UsageError without h5py, when the device's clock went back, and if `path` exists, unless `force`.
+    """
     try:
         h5py: Any = importlib.import_module("h5py")
     except ModuleNotFoundError as error:
@@ -42,17 +45,12 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
             f"{recording.path}: the device's clock went back (it was switched off in between): the format has one clock",
             remedy="export it as csv, which numbers the streams",
         )
-    beside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with h5py.File(beside, "w") as file:
-            file.attrs["format_name"] = np.bytes_(FORMAT_NAME)
-            file.attrs["format_version"] = np.bytes_(FORMAT_VERSION)
-            _write(file, _tree(path, recording, plan, clicks))
-        os.replace(beside, path)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error}") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    image = io.BytesIO()  # h5py tells of a full disk by a traceback of its own, or not at all
+    with h5py.File(image, "w") as file:
+        file.attrs["format_name"] = np.bytes_(FORMAT_NAME)
+        file.attrs["format_version"] = np.bytes_(FORMAT_VERSION)
+        _write(file, _tree(path, recording, plan, clicks))
+    write_file(path, image.getbuffer(), force=force)
 
 
 def _write(group: Any, tree: dict[str, Any]) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pans.runtime.cli import EXIT_FINE, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
 from pans.runtime.errors import PansError, UsageError
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import check_outputs, write_file
 from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.registry import Objects, draw_task, load_task
 
@@ -32,6 +32,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", type=int, metavar="N", help="the first N objects of the part (default: all)")
     parser.add_argument("--part", choices=PARTS, default="test", help="which objects (default: held out, test)")
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of drawn tasks (default 0)")
+    add_force(parser)
     add_data_dir(parser)
 
 
@@ -48,11 +49,12 @@ def _scene(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.out}: a scene's name ends in .npz")
     if args.objects is not None and args.objects < 1:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
+    check_outputs([args.out], inputs=args.names, force=args.force)
     classes, objects = _objects(args.names[0], args)
     part = objects.first(args.objects)
     data = io.BytesIO()
     np.savez_compressed(data, images=part.images, labels=part.labels.astype(np.int16), classes=np.array(classes))
-    replace_file(args.out, data.getvalue())
+    write_file(args.out, data.getvalue(), force=args.force)
     height, width = part.images.shape[1:]
     payload = {"scene": str(args.out), "task": args.names[0], "part": args.part, "objects": len(part)}
     payload |= {"height_px": height, "width_px": width, "classes": list(classes), "bytes": len(data.getvalue())}

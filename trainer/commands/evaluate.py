@@ -12,8 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_FINE, Command, emit
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs
 
 from .arguments import add_data_dir, needing, usage_errors
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
     from pans.trainer.evaluate.held_out import Conditions, HeldOut
+
+
+PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png")
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +44,7 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pictures", type=Path, metavar="DIR", help="draw confusion, a map of the clicks, patterns (extra plot)"
     )
+    add_force(parser)
     parser.add_argument(
         "--data-seed", type=int, metavar="N", help="of a drawn task (default: that of the bundle's training)"
     )
@@ -54,6 +59,9 @@ def _evaluate(args: argparse.Namespace) -> int:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
     if args.shots < 1 or args.seed < 0:
         raise UsageError(f"--shots is {args.shots}, --seed is {args.seed}, allowed: from 1, from 0")
+    if args.pictures is not None:
+        outputs = [args.pictures / name for name in PICTURE_FILES]
+        check_outputs(outputs, inputs=[args.bundle, args.task, args.profile], force=args.force, makes_folders=True)
     bundle, digest = load_bundle(args.bundle)
     if args.exact and bundle.picture_shape is not None:
         raise UsageError("--exact: pictures are compared by trials", remedy="use --trials")
@@ -85,7 +93,9 @@ def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, condition
 
         objects = held_out.objects
         light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
-        written = write_pictures(args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed)
+        written = write_pictures(
+            args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed, force=args.force
+        )
     return [str(path) for path in written]
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs, make_folder
 from pans.trainer.paper import PAGES, Asked, Made, Page, page_of, rewrite_page, write_page
-from pans.trainer.paper.page import Rows, read_rows
+from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
@@ -36,6 +37,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     words = "measure nothing: write the tables of NAME.md in the folder of -o again from NAME.json"
     parser.add_argument("--from-json", action="store_true", help=words)
     parser.add_argument("--collect", action="store_true", help="train nothing: put finished rows together")
+    add_force(parser)
     parser.add_argument("--threads", type=int, default=1, metavar="T", help="of torch (default 1)")
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
 
@@ -49,11 +51,14 @@ def _run(args: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         raise UsageError("training needs the package torch, which is not installed", remedy=NEEDS_TORCH) from error
     names = tuple(PAGES) if args.name == "all" else (args.name,)
+    if args.out is not None:
+        files = [path for name in names for path in page_files(args.out, name, page_of(name))]
+        check_outputs(files, force=args.force, ours=is_page_file, makes_folders=True)
     if args.from_json:
         return _rewrite(names, args)
     torch.set_num_threads(args.threads)
     args.cache = args.cache.expanduser()
-    args.cache.mkdir(parents=True, exist_ok=True)
+    make_folder(args.cache)
     results: dict[str, tuple[Page, Made]] = {}
     try:
         for name in names:

@@ -8,6 +8,7 @@ trial in work and nothing else; the same command goes on, and several may run at
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,12 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs
 from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
 
 from .arguments import add_data_dir, add_threads, needing, torch_with
+
+JOURNAL_LINE_MAX_BYTES = 1 << 20
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -113,7 +117,24 @@ def open_storage(where: str) -> Any:
     path = Path(where)
     if not path.resolve().parent.is_dir():
         raise UsageError(f"{path.parent} is not a folder", remedy="make it first")
+    _check_journal(path)
     return JournalStorage(JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path))))
+
+
+def _check_journal(path: Path) -> None:
+    """Refuse to append to what is no journal of optuna's: a line of JSON with an operation's code each."""
+    if not path.exists():
+        check_outputs([path])
+        return
+    check_outputs([path], force=True)
+    try:
+        with open(path, "rb") as file:
+            line = file.readline(JOURNAL_LINE_MAX_BYTES)
+        is_journal = not line or "op_code" in json.loads(line)
+    except (OSError, ValueError, TypeError, RecursionError):
+        is_journal = False
+    if not is_journal:
+        raise UsageError(f"{path}: is not a journal of a sweep", remedy="name a new file")
 
 
 def _base(args: argparse.Namespace) -> Options:

@@ -15,8 +15,9 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs
 from pans.trainer.options import (
     BUDGETS,
     DEFAULT_ALPHA,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from pans.trainer.train.loop import EpochReport, Trained
 
 DEFAULT_PROFILE = "oled-qcmos"
+HISTORY_FILES = ("history.json", "curves.png", "evolution.png")
 # options that are numbers, with the defaults of Options: name, metavar, help
 NUMBERS = (
     ("input_photons", "N", "mean photoelectrons that reach a passive encoder in one exposure"),
@@ -110,9 +112,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
+    add_force(parser)
 
 
 def _train(args: argparse.Namespace) -> int:
+    checkpoint = args.out.with_name(args.out.name + ".checkpoint")
+    _check_files(args, checkpoint)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.device import computing_on
@@ -120,13 +125,10 @@ def _train(args: argparse.Namespace) -> int:
     from pans.trainer.train.loop import train
 
     profile = load_profile(args.profile)
-    if not args.out.parent.is_dir():
-        raise UsageError(f"{args.out.parent} is not a folder", remedy="make it first")
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     options = _options(args, task)
     check_options(options, profile)
     started = time.perf_counter()
-    checkpoint = args.out.with_name(args.out.name + ".checkpoint")
     history = _history(args, options, checkpoint, task)
     try:
         with usage_errors(), _progress(options) as show, computing_on(args.device):
@@ -145,12 +147,27 @@ def _train(args: argparse.Namespace) -> int:
     checkpoint.unlink(missing_ok=True)
     if history is not None:
         shown = trained.quantised.patterns() if trained.quantised else None
-        for path in history.write(args.history, shown, task.image_shape):
+        for path in history.write(args.history, shown, task.image_shape, force=args.force):
             say(f"wrote {path}")
     seconds = time.perf_counter() - started
     payload = {"bundle": str(args.out), **answer, "seconds": seconds, "simulated": True}
     emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{words}")
     return EXIT_FINE
+
+
+def _check_files(args: argparse.Namespace, checkpoint: Path) -> None:
+    """Refuse, before anything is loaded, what cannot be written in the end; a checkpoint is hours of work too."""
+    inputs = [args.task, args.profile]
+    if checkpoint.exists() and not (args.resume or args.force):
+        raise UsageError(
+            f"{checkpoint}: is here, of a training that was interrupted",
+            remedy="go on with it by --resume, or replace it with --force",
+        )
+    check_outputs([args.out], inputs=inputs, force=args.force)
+    check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
+    if args.history is not None:
+        outputs = [args.history / name for name in HISTORY_FILES]
+        check_outputs(outputs, inputs=inputs, force=args.force, makes_folders=True)
 
 
 def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile) -> tuple[dict[str, Any], str]:
@@ -218,7 +235,9 @@ def _export(args: argparse.Namespace, task: Task, profile: Profile, trained: Tra
         "options": plain_options(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),
     }
-    return export_trained(args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance)
+    return export_trained(
+        args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance, force=args.force
+    )
 
 
 @contextmanager

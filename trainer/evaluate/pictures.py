@@ -14,6 +14,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.image_quality import likeness
+from pans.runtime.outputs import make_folder, write_file
 from pans.runtime.report import figures as page_figures
 from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.tasks.registry import Objects
@@ -26,25 +27,28 @@ SHOWN_PICTURES = 8
 
 
 def write_pictures(
-    folder: Path, bundle: Bundle, light: Light, objects: Objects, *, shots: int, seed: int
+    folder: Path, bundle: Bundle, light: Light, objects: Objects, *, shots: int, seed: int, force: bool = False
 ) -> list[Path]:
     """Write the pictures that this bundle has into `folder` and return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     matrix = np.abs(bundle.analyser.matrix) if bundle.analyser is not None else bundle.patterns()
     unit = "photoelectrons per exposure\nand unit transmission" if bundle.analyser is None else "modulus of W"
     written = [folder / "patterns.png"]
-    written[0].write_bytes(page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit))
+    drawn = page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit)
+    write_file(written[0], drawn, force=force)
     rng = np.random.default_rng(seed)
     counts = rng.binomial(shots, light.probability)
     if bundle.picture_shape is not None:
-        return [*written, _given_back(folder / "pictures.png", bundle, counts, objects.images, shots)]
-    written.append(_confusion(folder / "confusion.png", bundle, counts, objects.labels, shots))
+        return [*written, _given_back(folder / "pictures.png", bundle, counts, objects.images, shots, force)]
+    written.append(_confusion(folder / "confusion.png", bundle, counts, objects.labels, shots, force))
     if len(objects) > 100:
-        written.append(_map(folder / "tsne.png", bundle, light, counts / shots, objects.labels))
+        written.append(_map(folder / "tsne.png", bundle, light, counts / shots, objects.labels, force))
     return written
 
 
-def _confusion(path: Path, bundle: Bundle, counts: NDArray[np.int64], labels: NDArray[np.int64], shots: int) -> Path:
+def _confusion(
+    path: Path, bundle: Bundle, counts: NDArray[np.int64], labels: NDArray[np.int64], shots: int, force: bool
+) -> Path:
     """One sampled decision per object, truth against decision."""
     table = np.zeros((bundle.n_classes, bundle.n_classes), np.int64)
     np.add.at(table, (labels, make_decider(bundle, shots=shots).decide_batch(counts, shots)), 1)
@@ -65,11 +69,13 @@ def _confusion(path: Path, bundle: Bundle, counts: NDArray[np.int64], labels: ND
         xlabel="decision", ylabel="truth", title=f"{bundle.name}: {100 * right:.1f} % right, K = {shots} (SIMULATED)"
     )
     figure.colorbar(shown, ax=axis, label="share of the truth's decisions (numbers: %)", shrink=0.8)
-    save_figure(figure, path)
+    save_figure(figure, path, force=force)
     return path
 
 
-def _map(path: Path, bundle: Bundle, light: Light, means: NDArray[np.float64], labels: NDArray[np.int64]) -> Path:
+def _map(
+    path: Path, bundle: Bundle, light: Light, means: NDArray[np.float64], labels: NDArray[np.int64], force: bool
+) -> Path:
     """t-SNE of what the detector would see on average, and of the clicks that it did see."""
     n = min(MAPPED_OBJECTS, len(labels))
     perplexity = min(30.0, (n - 1) / 4)
@@ -88,11 +94,13 @@ def _map(path: Path, bundle: Bundle, light: Light, means: NDArray[np.float64], l
         axes[1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     said = f"{bundle.name}: t-SNE of {n} objects, {bundle.n_features} features (SIMULATED)"
     figure.suptitle(f"{said}; distances mean no more than near or far", fontsize=9)
-    save_figure(figure, path)
+    save_figure(figure, path, force=force)
     return path
 
 
-def _given_back(path: Path, bundle: Bundle, counts: NDArray[np.int64], images: NDArray[np.uint8], shots: int) -> Path:
+def _given_back(
+    path: Path, bundle: Bundle, counts: NDArray[np.int64], images: NDArray[np.uint8], shots: int, force: bool
+) -> Path:
     """The first objects above, what came back below."""
     chosen = slice(0, min(SHOWN_PICTURES, len(images)))
     pictures = PictureDecider(bundle).pictures(counts[chosen], shots)
@@ -109,5 +117,5 @@ def _given_back(path: Path, bundle: Bundle, counts: NDArray[np.int64], images: N
         for axis in axes[:, column]:
             axis.set_axis_off()
     figure.suptitle(f"{bundle.name}: true above, given back below, K = {shots} (SIMULATED)", fontsize=9)
-    save_figure(figure, path)
+    save_figure(figure, path, force=force)
     return path

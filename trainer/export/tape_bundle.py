@@ -104,6 +104,7 @@ def main() -> None:
     parser.add_argument("--lit-px", type=int, default=2, help="lit pixels in the middle of a bar (default 2)")
     parser.add_argument("--exposure-us", type=float, default=5.0, help="default 5")
     parser.add_argument("-o", "--out", type=Path, required=True, help="the bundle to write")
+    parser.add_argument("--force", action="store_true", help="replace it if it exists")
     args = parser.parse_args()
     bundle, figures = tape_bundle(
         load_profile(args.profile),
@@ -113,7 +114,7 @@ def main() -> None:
         lit_px=args.lit_px,
         exposure_us=args.exposure_us,
     )
-    write_bundle(bundle, args.out)
+    write_bundle(bundle, args.out, force=args.force)
     print(json.dumps({"bundle": str(args.out), **figures}))
 
 

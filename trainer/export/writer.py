@@ -7,7 +7,6 @@ decision of the file differs from the torch model.
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError, as_usage_error
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.outputs import whole_file
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.tasks.registry import Objects, Task
@@ -71,8 +71,12 @@ def export(
     optics: Shown | Analyser,
     about: Description,
     check: Callable[[Bundle], None] = lambda _: None,
+    *,
+    force: bool = False,
 ) -> Exported:
     """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ.
+
+    UsageError if `path` exists, unless `force`. A wrong bundle never stands there.
 
     A head that gives back pictures decides among no classes. `check` may refuse what was read, by PansError.
     """
@@ -91,22 +95,28 @@ def export(
         back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
         provenance={**about.provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
     )
-    unchecked = path.with_name(path.name + ".unchecked")  # a wrong bundle must not stand where a right one may be
-    try:
+    with whole_file(path, force=force) as unchecked:
         write_bundle(bundle, unchecked)
         bundle, digest = load_bundle(unchecked)
         words, difference = compare(bundle, head, click_mean)
         check(bundle)
-        os.replace(unchecked, path)
-    finally:
-        unchecked.unlink(missing_ok=True)
     return Exported(bundle, digest, words, difference, dead)
 
 
 def export_trained(
-    path: Path, trained: Trained, task: Task, profile: Profile, *, name: str, provenance: Mapping[str, Any]
+    path: Path,
+    trained: Trained,
+    task: Task,
+    profile: Profile,
+    *,
+    name: str,
+    provenance: Mapping[str, Any],
+    force: bool = False,
 ) -> Exported:
-    """Write what `train` returned to `path`; `provenance` is added to what the task, profile and training say of themselves."""
+    """Write what `train` returned to `path`; UsageError if it exists, unless `force`.
+
+    `provenance` is added to what the task, profile and training say of themselves.
+    """
     quantised = trained.quantised
     optics: Shown | Analyser
     if quantised is None:
@@ -129,7 +139,7 @@ def export_trained(
     def check(bundle: Bundle) -> None:
         compare_optics(bundle, trained, task, profile)
 
-    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check)
+    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check, force=force)
 
 
 def analyser_of(trained: Trained, task: Task, profile: Profile) -> Analyser:

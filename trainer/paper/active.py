@@ -111,7 +111,9 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
 
     trained = train(task, profile, options, checkpoint=checkpoint, resume=checkpoint.is_file(), report=said)
     provenance = {"task_argument": name, "command": f"pans reproduce {name}", "options": plain_options(options)}
-    exported = export_trained(bundle_path, trained, task, profile, name=f"{name}-{row.features}", provenance=provenance)
+    exported = export_trained(
+        bundle_path, trained, task, profile, name=f"{name}-{row.features}", provenance=provenance, force=True
+    )
     training = clock.save()
     figures = {
         "features": row.features,
@@ -167,7 +169,7 @@ class _Clock:
 
     def save(self) -> float:
         total = self.before + time.process_time() - self.start
-        self.path.write_text(f"{total:.1f}")
+        replace_file(self.path, f"{total:.1f}".encode())
         return total
 
 

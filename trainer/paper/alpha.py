@@ -7,6 +7,7 @@ SIMULATED on the profile `ideal`; FashionMNIST.
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.outputs import replace_file
 from pans.trainer.options import Options, plain_options
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.history import follow
@@ -64,11 +66,11 @@ def course_of(asked: Asked, features: int, alpha: float) -> Row | None:
 
 
 def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None:
-    beside = path.with_suffix(".part.npz")
+    archive = io.BytesIO()
     np.savez_compressed(
-        beside, after=np.array(sorted(patterns)), patterns=np.array([patterns[e] for e in sorted(patterns)])
+        archive, after=np.array(sorted(patterns)), patterns=np.array([patterns[e] for e in sorted(patterns)])
     )
-    beside.replace(path)
+    replace_file(path, archive.getvalue())
 
 
 def alpha_page(asked: Asked) -> Made:

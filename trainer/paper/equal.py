@@ -32,7 +32,7 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
 
-from .page import Asked, Made, Row, Rows, Table, columns, finished, pages
+from .page import Asked, Made, Row, Rows, Table, cached_row, columns, finished, pages
 from .passive import PROFILE, measure
 from .passive_recipes import CELLS_RATE, FIELD_RATES, basis_of
 
@@ -99,7 +99,7 @@ def equal_page(asked: Asked) -> Made:
 def _finished(path: Path, name: str, way: str, photons: float) -> Row | None:
     if way not in DIRECT:
         return finished(path, (recipe if way == "PANS" else light_recipe)(name, photons))
-    found: Row = json.loads(path.read_text()) if path.is_file() else {}
+    found = cached_row(path, "way") or {}
     return found if direct_recipe(name, way).items() <= found.items() else None
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import make_folder, replace_file
 from pans.trainer.options import Options, same_options
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
@@ -186,10 +186,9 @@ def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) 
     `made_with` holds what JSON can; `cpu_seconds` (of this process) is added. With `collect` nothing is made: None.
     """
     plain = json.loads(json.dumps(made_with))
-    if path.is_file():
-        found: Row = json.loads(path.read_text(encoding="utf-8"))
-        if found.get("made_with") == plain:
-            return found
+    found = cached_row(path, "made_with")
+    if found is not None and found.get("made_with") == plain:
+        return found
     if collect:
         return None
     started = time.process_time()
@@ -203,15 +202,45 @@ def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) 
 
 def finished(path: Path, options: Options) -> Row | None:
     """Return the figures in `path` if they are of a training with `options`, or None."""
-    if not path.is_file():
+    found = cached_row(path, "options")
+    return found if found is not None and same_options(found["options"], options) else None
+
+
+def cached_row(path: Path, *keys: str) -> Row | None:
+    """Return what is in a file of the cache, None if it is not there; UsageError for what is no finished row with `keys`: it stays."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
         return None
-    found: Row = json.loads(path.read_text(encoding="utf-8"))
-    return found if same_options(found["options"], options) else None
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not found.keys() >= set(keys):
+        raise UsageError(f"{path}: is no finished row", remedy="remove it, or name another folder with --cache")
+    return found
+
+
+def page_files(folder: Path, name: str, page: Page) -> list[Path]:
+    """Return the files of the page NAME in `folder`."""
+    return [folder / f"{name}{ending}" for ending in (".json", ".md", *(f"{one}.png" for one in page.captions))]
+
+
+def is_page_file(path: Path) -> bool:
+    """Return whether a file is one that `write_page` wrote, and may write again; a picture is where the page's JSON file is."""
+    try:
+        if path.suffix == ".png":
+            return any(is_page_file(one) for one in path.parent.glob("*.json") if path.stem.startswith(one.stem))
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".md":
+            return BEGIN in text and END in text
+        found = json.loads(text)
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(found, dict) and {"rows", "simulated"} <= found.keys()
 
 
 def write_page(folder: Path, name: str, page: Page, made: Made) -> None:
     """Write NAME.json, NAME.md and the page's pictures, each whole or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     text = json.dumps({"rows": made.rows, "simulated": True}, indent=1) + "\n"
     replace_file(folder / f"{name}.json", text.encode())
     _put(folder / f"{name}.md", page, page.block(name, made.rows, made.pictures))

@@ -98,7 +98,9 @@ def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
             "options": plain_options(options),
         }
         title = f"{name}-{row.features}-dark{dark:g}"
-        exported = export_trained(path.with_suffix(".pans"), trained, task, profile, name=title, provenance=provenance)
+        exported = export_trained(
+            path.with_suffix(".pans"), trained, task, profile, name=title, provenance=provenance, force=True
+        )
         figures |= {"sha256": exported.sha256, "score_difference": exported.score_difference}
     asked.report(f"{name} d_f={row.features} dark={dark:g}: {figures['value']:.3f} at {figures['clicks']:.2f} clicks")
     replace_file(path, json.dumps(figures, indent=1).encode())

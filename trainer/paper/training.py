@@ -41,7 +41,7 @@ from pans.trainer.train.head_fit import joint_distribution
 from pans.trainer.train.loop import Run, Trained, train
 
 from .active import recipe
-from .page import Asked, Made, Row, Rows, Table, columns, pages
+from .page import Asked, Made, Row, Rows, Table, cached_row, columns, pages
 from .tables import ACTIVE, CLICKS_TOLERANCE, FIRST_OBJECTS, ActiveRow
 
 TASK = "fashion-mnist"
@@ -162,8 +162,8 @@ class _Fixed:
 
 
 def _kept(path: Path, make: Callable[[], Row], report: Callable[[str], None]) -> Row:
-    if path.is_file():
-        found: Row = json.loads(path.read_text())
+    found = cached_row(path)
+    if found is not None:
         return found
     report(f"measuring {path.stem}")
     made = make()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.outputs import make_folder, whole_file
 
 FASHION_CLASSES = (
     *("T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"),
@@ -141,15 +142,13 @@ def fetch(url: str, path: Path, pinned: PinnedFile) -> bool:
     if path.is_file():
         check_pinned(path, pinned)
         return False
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
+    make_folder(path.parent)
     try:
         with urllib.request.urlopen(url, timeout=60) as answer:
-            beside.write_bytes(answer.read(pinned.n_bytes + 1))
-        check_pinned(beside, pinned)
-        os.replace(beside, path)
+            data = answer.read(pinned.n_bytes + 1)
     except OSError as error:
         raise UsageError(f"{url}: cannot be fetched: {error}", remedy=f"copy the file to {path} by hand") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    with whole_file(path) as beside:
+        beside.write_bytes(data)
+        check_pinned(beside, pinned)
     return True

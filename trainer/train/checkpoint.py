@@ -6,7 +6,7 @@ with `weights_only`: tensors and plain values, nothing that could run code.
 
 from __future__ import annotations
 
-import os
+import io
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.outputs import replace_file
 from pans.trainer.options import Options
 
 
@@ -24,10 +25,9 @@ def _identity(options: Options, data_sha256: str) -> dict[str, Any]:
 
 def write_checkpoint(path: Path, options: Options, data_sha256: str, state: dict[str, Any]) -> None:
     """Write `state` (nested dicts and lists of tensors and plain values) to `path`, whole or not at all."""
-    beside = path.with_name(path.name + ".part")
-    with open(beside, "wb") as file:
-        torch.save({"identity": _identity(options, data_sha256), **state}, file)
-    os.replace(beside, path)
+    file = io.BytesIO()
+    torch.save({"identity": _identity(options, data_sha256), **state}, file)
+    replace_file(path, file.getbuffer())
 
 
 def read_checkpoint(path: Path, options: Options, data_sha256: str) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.outputs import replace_file
+from pans.runtime.outputs import make_folder, write_file
 from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.model.detection import click_probability, sample_clicks
 from pans.trainer.model.encoders import ActiveIllumination
@@ -59,9 +59,11 @@ class History:
             if state["epoch"] == before:
                 self.patterns[before] = _shown(state["encoder"]["weight"].numpy(), self._options.encoder)
 
-    def write(self, folder: Path, last: NDArray[np.floating] | None, image_shape: tuple[int, int]) -> list[Path]:
+    def write(
+        self, folder: Path, last: NDArray[np.floating] | None, image_shape: tuple[int, int], *, force: bool = False
+    ) -> list[Path]:
         """Write history.json, curves.png and evolution.png; `last` (d_f, pixels) are the patterns in the end."""
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         if last is not None:
             self.patterns[self._options.epochs] = np.asarray(last, np.float32)
         facts = {
@@ -69,16 +71,16 @@ class History:
             "epochs": [asdict(epoch) for epoch in self.epochs],
             "patterns_at": sorted(self.patterns),
         }
-        replace_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode())
-        draw_curves(folder / "curves.png", self.epochs)
+        write_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode(), force=force)
+        draw_curves(folder / "curves.png", self.epochs, force=force)
         written = [folder / "history.json", folder / "curves.png"]
         if self.patterns:
-            draw_evolution(folder / "evolution.png", self.patterns, image_shape)
+            draw_evolution(folder / "evolution.png", self.patterns, image_shape, force=force)
             written.append(folder / "evolution.png")
         return written
 
 
-def draw_curves(path: Path, reports: list[EpochReport]) -> None:
+def draw_curves(path: Path, reports: list[EpochReport], *, force: bool = False) -> None:
     """Draw loss, clicks and photons over the epochs, one line per restart."""
     figure, axes = new_figure(width=12.0, height=3.6, panels=len(QUANTITIES))
     for axis, (name, label) in zip(axes, QUANTITIES):
@@ -95,10 +97,12 @@ def draw_curves(path: Path, reports: list[EpochReport]) -> None:
         axes[0].axvline(begin, color="0.7", lw=0.8)
         axes[0].annotate(stage, (begin, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=90, va="top")
     figure.suptitle("SIMULATED, training objects", fontsize=9)
-    save_figure(figure, path)
+    save_figure(figure, path, force=force)
 
 
-def draw_evolution(path: Path, patterns: dict[int, NDArray[np.float32]], image_shape: tuple[int, int]) -> None:
+def draw_evolution(
+    path: Path, patterns: dict[int, NDArray[np.float32]], image_shape: tuple[int, int], *, force: bool = False
+) -> None:
     """Draw the first patterns (rows) after some epochs (columns), each picture up to its own brightest pixel."""
     from matplotlib import pyplot
 
@@ -116,7 +120,7 @@ def draw_evolution(path: Path, patterns: dict[int, NDArray[np.float32]], image_s
             if column == 0:
                 axis.set_ylabel(f"pattern {row}", fontsize=8)
     figure.suptitle("patterns after so many epochs, each up to its own brightest pixel (SIMULATED)", fontsize=9)
-    save_figure(figure, path)
+    save_figure(figure, path, force=force)
 
 
 def _shown(weight: NDArray[np.float32], encoder: str) -> NDArray[np.float32]:

@@ -228,7 +228,7 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(UsageError, match="No space"):
-        write_bundle(small_bundle(d_f=1), path)
+        write_bundle(small_bundle(d_f=1), path, force=True)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["a.pans"]
 

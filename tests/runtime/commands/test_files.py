@@ -244,7 +244,7 @@ def test_a_bundle_from_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     np.testing.assert_array_equal(made.table, np.load(tmp_path / "t.npy").astype(np.float32))
     assert made.provenance["inputs"]["patterns"]["file"] == "p.npy"
     before = out.read_bytes()
-    assert run(capsys, *words, "--levels", "16", "-o", out)[0] == 0
+    assert run(capsys, *words, "--levels", "16", "-o", out, "--force")[0] == 0
     assert out.read_bytes() == before  # the same inputs give the same bytes
     assert run(capsys, "verify", out)[0] == 0
 
@@ -271,7 +271,7 @@ def test_a_bundle_from_a_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     made, _ = load_bundle(out)
     assert made.levels == 124
     np.testing.assert_array_equal(made.table[0b101], [1, 2])
-    words += ["--table", str(tmp_path / "t.npy"), "-o", str(out)]
+    words += ["--table", str(tmp_path / "t.npy"), "-o", str(out), "--force"]
     assert main(words) == 2  # this table is another back end's
     assert "disagree" in capsys.readouterr().err
     assert load_bundle(out)[0].n_features == 3

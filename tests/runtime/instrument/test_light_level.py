@@ -74,7 +74,18 @@ def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[
     words = ["calibrate", "--device", device.format("uniform"), "-o", str(calibration), "--seconds", "5", "--json"]
     assert main(words) == 0
     bundle = ROOT / "runtime" / "shipped" / "fashion10.pans"
-    run = ["run", str(bundle), "--decisions", "50", "--out", str(tmp_path), "--json", "--calibration", str(calibration)]
+    run = [
+        "run",
+        str(bundle),
+        "--decisions",
+        "50",
+        "--out",
+        str(tmp_path),
+        "--force",
+        "--json",
+        "--calibration",
+        str(calibration),
+    ]
     capsys.readouterr()
     assert main([*run, "--device", device.format("fashion200")]) == 0
     summary = json.loads(capsys.readouterr().out)

@@ -1,0 +1,124 @@
+"""Every command that writes: it replaces nothing, never writes into an input, and refuses before it does anything."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pans.runtime import SHIPPED
+from pans.runtime.cli import main
+
+DEVICE = "sim:oled-qcmos?pace=fast&scene=uniform"
+COMMANDS = {  # words, what is there already, what else is read
+    "run": ("run b.pans --device sim:oled-qcmos?pace=fast --decisions 3 --record OUT", "OUT", "b.pans"),
+    "calibrate": (f"calibrate --device {DEVICE} --seconds 0.5 -o OUT", "OUT", None),
+    "bundle": ("bundle --patterns p.npy --table t.npy --classes a,b -o OUT", "OUT", "t.npy"),
+    "export csv": ("export r.pansrec --format csv -o DIR", "DIR/clicks.csv", None),
+    "export hdf5": ("export r.pansrec --format photon-hdf5 -o OUT", "OUT", "r.pansrec"),
+    "report": ("report b.pans -o OUT", "OUT", "b.pans"),
+    "replay": ("replay r.pansrec --pictures OUT", "OUT", "r.pansrec"),
+    "bench": ("bench ingest --quick --plot OUT", "OUT", None),
+    "train": ("train fashion-mnist --features 2 --epochs 1 -o OUT", "OUT", None),
+    "train checkpoint": ("train fashion-mnist --features 2 --epochs 1 -o OUT", "OUT.checkpoint", None),
+    "train history": ("train fashion-mnist --features 2 --epochs 1 -o OUT --history DIR", "DIR/curves.png", None),
+    "evaluate": ("evaluate b.pans --pictures DIR", "DIR/confusion.png", None),
+    "data": ("data scene cells -o OUT.npz --objects 2", "OUT.npz", None),
+    "reproduce json": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.json", None),
+    "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
+    "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
+}
+WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "fuzz"}
+CHECKED_ELSEWHERE = {"demo", "sweep"}  # tests/runtime/commands/test_run_files.py, and below
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recording: Path) -> Path:
+    """A folder with one input of each kind, to work in."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SHIPPED / "fashion10.pans", "b.pans")
+    shutil.copy(recording, "r.pansrec")
+    np.save("p.npy", np.ones((2, 4)))
+    np.save("t.npy", np.zeros((4, 2)))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "r.pansrec"
+    words = ["run", str(SHIPPED / "fashion10.pans"), "--device", "sim:oled-qcmos?pace=fast", "--decisions", "3"]
+    assert main([*words, "--record", str(path)]) == 0
+    return path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder, and every folder in it."""
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))}
+
+
+def refused(words: list[str], folder: Path, why: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Run a command that must be refused for `why`, with a remedy, and leave the folder as it is."""
+    if words[0] in ("train", "reproduce", "evaluate"):
+        pytest.importorskip("torch", reason="needs the train extra")
+    before = contents(folder)
+    capsys.readouterr()
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert why in said
+    assert "remedy: " in said
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_command_replaces_a_file(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words, there, _ = COMMANDS[name]
+    Path(there).parent.mkdir(exist_ok=True)
+    Path(there).write_bytes(b"precious")
+    why = "interrupted" if "checkpoint" in name else "exists already"
+    refused(words.split(), folder, why, capsys)
+
+
+@pytest.mark.parametrize("name", [name for name, (_, _, read) in COMMANDS.items() if read])
+def test_no_command_writes_into_its_input(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words, _, read = COMMANDS[name]
+    assert read is not None
+    Path("OUT").symlink_to(read)
+    refused([*words.split(), "--force"], folder, "is the input", capsys)
+
+
+@pytest.mark.parametrize("name", [name for name, (words, *_) in COMMANDS.items() if "OUT" in words])
+def test_a_file_in_the_way_of_a_folder_is_found_before(
+    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = COMMANDS[name][0].replace("OUT", "b.pans/x").replace("DIR", "new")
+    refused(words.split(), folder, "not a folder", capsys)
+
+
+def test_every_command_is_in_one_of_these_lists() -> None:
+    known = {words.split()[0] for words, *_ in COMMANDS.values()} | WRITES_NO_FILE | CHECKED_ELSEWHERE
+    assert known == {point.name for point in entry_points(group="pans.commands")}
+
+
+def test_a_sweep_appends_to_no_foreign_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("optuna", reason="needs the sweep extra")
+    from pans.runtime.errors import UsageError
+    from pans.trainer.commands.sweep import open_storage
+
+    for text in ("precious\n", "[1]\n", '{"a": 1}\n'):
+        Path("journal").write_text(text)
+        with pytest.raises(UsageError, match="not a journal"):
+            open_storage("journal")
+        assert Path("journal").read_text() == text
+    open_storage("new-journal")
+    open_storage("new-journal")
+
+
+def test_force_replaces(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, there in ((COMMANDS["bundle"][0], "OUT"), (COMMANDS["export csv"][0], "DIR/clicks.csv")):
+        Path(there).parent.mkdir(exist_ok=True)
+        Path(there).write_bytes(b"old")
+        assert main([*words.split(), "--force"]) == 0
+        assert Path(there).read_bytes() != b"old"
