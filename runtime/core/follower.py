@@ -7,6 +7,7 @@ Owns one stream from ARM to its end and what is remembered of it; never decides:
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,8 +27,9 @@ from pans.runtime.wire.messages import (
 )
 from pans.runtime.wire.tracker import StreamTracker
 
-from .decision import BeyondPlan, Output, StreamEndUnknown, joined
+from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
 from .plan import Plan
+from .plausible import Contradiction, PlanRules
 
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
 PART_MARKS = 16  # of them that a part of a recording begins with
@@ -66,7 +68,12 @@ class Follower:
     A run that lost its device and found it again goes on in another stream: `begin` ends the old one and starts the next.
     """
 
-    def __init__(self, plan: Plan, n_cycles: int) -> None:
+    moving = False  # whether objects pass by
+
+    def __init__(self, plan: Plan, n_cycles: int, n_classes: int) -> None:
+        self.contradictions: Counter[str] = (
+            Counter()
+        )  # messages that the plan or others exclude, by what is wrong in them
         self.start_tick = 0
         self.completed = False
         self.tracker = StreamTracker()
@@ -76,6 +83,7 @@ class Follower:
         self.last_tick = 0
         self.jitter_ticks = 0  # most that a block's end differed from the plan
         self._plan = plan
+        self._rules = PlanRules(plan, n_classes, moving=self.moving)
         self._exposure_ticks = plan.exposure_ticks
         self._slots_per_cycle, self._cycles_per_object = plan.slots_per_cycle, plan.cycles_per_object
         self.end_exposure = self._exposures_of(n_cycles)
@@ -184,23 +192,38 @@ class Follower:
         """Take one frame (CLICKS, FRAMES, MARK or STATUS) in the order of arrival."""
         if frame.type == MessageType.STATUS:
             return self._on_status(frame)
+        unexplained = self.tracker.counters.unexplained_drops
         message, gap = self.tracker.accept(frame)
         if message is None:
             return Output([], [], None)
         if isinstance(message, Mark):
-            self._remember(message)
-            return Output([], [], None)
-        events = [] if gap is None else [gap]
+            return self._take_mark(message)
+        events: list[CoreEvent] = [] if gap is None else [gap]
+        if self.tracker.counters.unexplained_drops != unexplained:
+            events.append(self._contradicts(Contradiction("drops", message.exposure_index, message.drops, 0)))
         n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
         if message.exposure_index + n_exposures > self.end_exposure or not self._fits(message):
-            self.tracker.counters.malformed += 1
+            self.contradictions["beyond_plan"] += 1
             return Output([], [*events, BeyondPlan(message.exposure_index)], None)
+        wrong = self._rules.of_block(message, self.start_tick)
+        if wrong is not None:
+            return Output([], [*events, self._contradicts(wrong)], None)
         end_tick = message.tick + (n_exposures - 1) * message.period_ticks + self._exposure_ticks
         self.last_tick = end_tick
         self._check_slot(message.exposure_index + n_exposures - 1, end_tick)
         skipped = self._skip_to(message.exposure_index, message.tick)
         taken = self._take(message, n_exposures, end_tick)
         return joined(Output(skipped.decisions, events, None, skipped.passages, skipped.actions), taken, end_tick)
+
+    def _take_mark(self, mark: Mark) -> Output:
+        wrong = self._rules.of_mark(mark, self.tracker.next_exposure, self.end_exposure)
+        if wrong is None:
+            self._remember(mark)
+        return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
+
+    def _contradicts(self, wrong: Contradiction) -> Contradiction:
+        self.contradictions[wrong.what] += 1
+        return wrong
 
     def _check_slot(self, exposure_index: int, end_tick: int) -> None:
         """Compare when an exposure ended with when the plan says that it should."""
@@ -222,7 +245,10 @@ class Follower:
             return Output([], [], None)
         self._status = status
         if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
-            return Output([], [], None)
+            wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
+            # one that ends a stream otherwise is judged when the stream is closed
+            running = status.state in (DeviceState.ARMED, DeviceState.RUNNING)
+            return Output([], [] if wrong is None or not running else [self._contradicts(wrong)], None)
         missing = min(status.next_exposure, self.end_exposure) > self.tracker.next_exposure
         if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
             self._told_end = status.tick
@@ -230,10 +256,18 @@ class Follower:
         return self._finish(status)
 
     def _finish(self, status: Status) -> Output:
+        """Close the stream; what `status` claims beyond the plan or beyond what is believed is no gap but a contradiction."""
         self.completed = True
+        wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
         end = min(status.next_exposure, self.end_exposure)
+        unexplained = self.tracker.counters.unexplained_drops
         gap = self.tracker.finish(end, status.drops)
-        return joined(Output([], [] if gap is None else [gap], None), self._skip_to(end, status.tick))
+        if wrong is None and self.tracker.counters.unexplained_drops != unexplained:
+            wrong = Contradiction("closing_status", status.next_exposure, status.drops, self.tracker.next_exposure)
+        events: list[CoreEvent] = [] if gap is None else [gap]
+        if wrong is not None:
+            events.append(self._contradicts(wrong))
+        return joined(Output([], events, None), self._skip_to(min(end, self.tracker.next_exposure), status.tick))
 
     def _remember(self, mark: Mark) -> None:
         self.marks.pop(mark.object_index, None)

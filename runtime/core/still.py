@@ -28,7 +28,7 @@ class Core(Follower):
     """Stream tracker, windows and back end joined up, for objects that stand still."""
 
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
-        super().__init__(plan, n_cycles)
+        super().__init__(plan, n_cycles, decider.n_classes)
         self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots

@@ -6,6 +6,7 @@ state, so that the rows are those that Core alone would give. Never waits, recor
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -62,13 +63,18 @@ class StreamCore:
         self._tables = decision_tables(decider, shots)
         windows = self.core.windows
         self._windows = WindowArrays(
-            *windows.arrays(), np.zeros(-(-decider.n_features // 8), np.uint64), np.zeros(decider.n_features, np.int64)
+            *windows.arrays(),
+            np.zeros(-(-decider.n_features // 8), np.uint64),
+            np.zeros(decider.n_features, np.int64),
+            plan.slot_offset_ticks.astype(np.int64),
         )
         self._state = np.zeros(kernels.N_STATE, np.int64)
         self._state[kernels.SESSION] = session
         self._state[kernels.EXPOSURE_TICKS] = plan.exposure_ticks
         self._state[kernels.VISIT_EXPOSURES] = windows.visit_exposures
         self._state[kernels.SHOTS] = shots
+        self._state[kernels.PERIOD_TICKS], self._state[kernels.CYCLE_TICKS] = plan.slot_period_ticks, plan.cycle_ticks
+        self._state[kernels.N_CLASSES] = decider.n_classes
 
     def warm_up(self) -> None:
         """Compile or load every kernel of the path, before arming."""
@@ -157,7 +163,7 @@ class StreamCore:
     def _load(self) -> None:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
         core, state = self.core, self._state
-        state[kernels.N_ROWS] = 0
+        state[kernels.N_ROWS], state[kernels.START_TICK] = 0, core.start_tick
         state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = core.tracker.position
         state[place.MESSAGES] = state[place.EXPOSURES] = 0
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = core.windows.position
@@ -190,6 +196,8 @@ class StreamCore:
         if frame.type != MessageType.MARK or not self.core.marks:
             return
         mark = self.core.marks[next(reversed(self.core.marks))]
+        if (mark.seq, mark.object_index) != struct.unpack_from("<II", frame.payload):
+            return  # it was not taken
         slot = mark.object_index % kernels.MARK_SLOTS
         self._marks.objects[slot], self._marks.truths[slot] = mark.object_index, mark.truth
         self._marks.photons[slot] = mark.photons

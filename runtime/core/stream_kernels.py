@@ -24,7 +24,9 @@ from .window import DARK_CLICKS, DARK_EXPOSURES
 MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, LAST_TICK = range(
     stream.N_PLACE, stream.N_PLACE + 10
 )
-EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, N_STATE = range(LAST_TICK + 1, LAST_TICK + 5)
+EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES, N_STATE = range(
+    LAST_TICK + 1, LAST_TICK + 9
+)
 ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_frames` returns
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
@@ -41,6 +43,7 @@ ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
 class WindowArrays(NamedTuple):
     """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
 
+    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, from plausible.py's rules.
     `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
     """
 
@@ -51,6 +54,7 @@ class WindowArrays(NamedTuple):
     tallies: npt.NDArray[np.int64]
     lanes: npt.NDArray[np.uint64]
     whole: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
 
 
 class DecisionTables(NamedTuple):
@@ -137,7 +141,10 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     """Remember an object's truth; False, and nothing done, when the message is not the next one."""
     if not stream.is_next_mark(buffer, payload, stop, state):
         return False
-    number = np.int64(load4(buffer, payload + _U(4)))
+    number, first = np.int64(load4(buffer, payload + _U(4))), np.int64(load8(buffer, payload + _U(12)))
+    fits = number < _NO_OBJECT and number * state[VISIT_EXPOSURES] == first and first < state[stream.END_EXPOSURE]
+    if not fits or not stream.mark_fits(buffer, payload, state, state[N_CLASSES]):
+        return False
     slot = number % MARK_SLOTS
     marks.objects[slot] = number
     marks.truths[slot] = np.int16(stream.mark_truth(buffer, payload))
@@ -156,6 +163,15 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
     visit = first // state[VISIT_EXPOSURES]
     if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
         return False
+    tick, period = stream.block_times(buffer, payload)
+    number, cycle = np.int64(load4(buffer, payload + _U(32))), first // windows.offsets.size
+    planned = state[START_TICK] + cycle * state[CYCLE_TICKS] + windows.offsets[first - cycle * windows.offsets.size]
+    if (
+        period != state[PERIOD_TICKS]
+        or (number != visit % _NO_OBJECT and number != _NO_OBJECT)
+        or tick < planned - period
+    ):
+        return False
     if visit != state[VISIT]:
         if state[NEXT_WINDOW] != windows.counts.shape[0]:
             return False
@@ -163,8 +179,7 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
         windows.seen[:] = 0
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
-    tick, period = stream.block_times(buffer, payload)
-    state[OBJECT] = np.int64(load4(buffer, payload + _U(32)))
+    state[OBJECT] = number
     state[LAST_TICK] = tick + (count - 1) * period + state[EXPOSURE_TICKS]
     stream.go_on(state, count)
     return True

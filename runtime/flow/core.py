@@ -51,6 +51,8 @@ I64 = npt.NDArray[np.int64]
 class FlowCore(Follower):
     """What cells and tape share: the ring of frames, the verdict on a window, the pulse it asks for."""
 
+    moving = True
+
     def __init__(
         self,
         plan: Plan,
@@ -61,7 +63,7 @@ class FlowCore(Follower):
         shots: int,
         n_cycles: int,
     ) -> None:
-        super().__init__(plan, n_cycles)
+        super().__init__(plan, n_cycles, decider.n_classes)
         if plan.mode != "parallel" or decider.n_features > MAX_CHANNELS:
             raise UsageError(
                 f"a flow needs a parallel plan of up to {MAX_CHANNELS} channels, this one is {plan.mode} with {decider.n_features}"
@@ -205,7 +207,7 @@ class FlowCore(Follower):
         facts[: stream.MESSAGES] = (*self.tracker.position, min(self.end_exposure, 1 << 62))
         facts[walking.START_TICK : walking.MARKS] = (
             self.start_tick, self._exposure_ticks, self._period_ticks, self._max_block, self._plan.cycle_ticks, self._dark_cycle,
-            watch_at,
+            watch_at, self._decider.n_classes,
         )  # fmt: skip
         facts[walking.JITTER_TICKS] = self.jitter_ticks
         buffer, spans = messages

@@ -14,20 +14,22 @@ from numba import njit
 
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.kernels import load4, load8
+from pans.runtime.wire.schema import NO_OBJECT
 
 from .kernels import EMPTY_FRAMES, NEXT, put_frames, scan
 
 # facts, int64 (N_FACTS,): where the stream stands (stream.N_PLACE columns), ...
 # ... what a block must be like, and when it should end, ...
-START_TICK, EXPOSURE_TICKS, PERIOD_TICKS, MAX_BLOCK, CYCLE_TICKS, DARK_CYCLE, WATCH_AT = range(
-    stream.N_PLACE, stream.N_PLACE + 7
+START_TICK, EXPOSURE_TICKS, PERIOD_TICKS, MAX_BLOCK, CYCLE_TICKS, DARK_CYCLE, WATCH_AT, N_CLASSES = range(
+    stream.N_PLACE, stream.N_PLACE + 8
 )
 # ... and what came of the call
-MARKS, PASSAGES, END_TICK, JITTER_TICKS, N_FACTS = range(WATCH_AT + 1, WATCH_AT + 6)
+MARKS, PASSAGES, END_TICK, JITTER_TICKS, N_FACTS = range(N_CLASSES + 1, N_CLASSES + 6)
 # a mark, int64 (N_MARK,); its photons stand beside it in an array of their own
 M_SEQ, M_OBJECT, M_TRUTH, M_EXPOSURE, M_TICK, M_HALF, N_MARK = range(7)
 
 _U = np.uint64
+_NO_OBJECT = np.uint64(NO_OBJECT)
 
 
 class FlowArrays(NamedTuple):
@@ -67,7 +69,7 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
         if buffer[start] == stream.MARK:
             if not stream.is_next_mark(buffer, payload, stop, facts) or facts[MARKS] == marks.photons.size:
                 break
-            if load8(buffer, payload + _U(12)) >= stream.LARGEST or load8(buffer, payload + _U(20)) >= stream.LARGEST:
+            if not stream.mark_fits(buffer, payload, facts, facts[N_CLASSES]):
                 break
             _take_mark(buffer, payload, marks, facts[MARKS])
             facts[MARKS] += 1
@@ -81,7 +83,11 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
         if count == 0 or count > facts[MAX_BLOCK] or 8 * width < dark_channels.size:
             break
         tick, period = stream.block_times(buffer, payload)
-        if period != facts[PERIOD_TICKS]:
+        if period != facts[PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
+            break
+        cycle = first // slot_offsets.size
+        planned = facts[START_TICK] + cycle * facts[CYCLE_TICKS] + slot_offsets[first - cycle * slot_offsets.size]
+        if tick < planned - period:
             break
         frames_at = np.int64(payload) + stream.BLOCK_HEADER
         frames = buffer[frames_at : frames_at + count * width].reshape(count, width)

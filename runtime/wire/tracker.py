@@ -16,6 +16,8 @@ SEQUENCE = 1 << 32
 HALF_SEQUENCE = 1 << 31
 # a number further ahead is nonsense: believing it would mean seconds of empty windows at once
 MAX_GAP_EXPOSURES = 1 << 18
+# no device sends beyond the host's window, which begins at the next sequence number
+RECEIVE_WINDOW = 4096
 
 
 class Gap(NamedTuple):
@@ -43,6 +45,7 @@ class StreamCounters:
     device_drops: int = 0
     repeated: int = 0
     malformed: int = 0
+    unexplained_drops: int = 0  # messages whose drops do not agree with what is missing
 
 
 class StreamTracker:
@@ -67,7 +70,7 @@ class StreamTracker:
         if ahead >= HALF_SEQUENCE or self._finished:  # seen before, or overtaken: a late photon is useless
             self.counters.repeated += 1
             return None, None
-        if not isinstance(message, Mark) and message.exposure_index - self.next_exposure > MAX_GAP_EXPOSURES:
+        if ahead >= RECEIVE_WINDOW or not self._in_reach(message):
             self.counters.malformed += 1
             return None, None
         self._lost_messages += ahead
@@ -77,13 +80,14 @@ class StreamTracker:
         if isinstance(message, Mark):
             return message, None
         n_exposures = len(message.patterns) if isinstance(message, ClickBlock) else len(message.words)
-        if message.exposure_index < self.next_exposure:  # a device that counts backwards: never let it rewrite the past
-            self.counters.malformed += 1
-            return None, None
         gap = self._gap_before(message.exposure_index, message.drops)
         self.next_exposure = message.exposure_index + n_exposures
         self.counters.exposures += n_exposures
         return message, gap
+
+    def _in_reach(self, message: ClickBlock | FrameBlock | Mark) -> bool:
+        """Whether a block lies ahead, and not too far: a device that counts backwards never rewrites the past."""
+        return isinstance(message, Mark) or 0 <= message.exposure_index - self.next_exposure <= MAX_GAP_EXPOSURES
 
     @property
     def open(self) -> bool:
@@ -113,9 +117,10 @@ class StreamTracker:
         What still comes is counted as repeated: it has been reported lost.
         """
         self._finished = True
-        if not 0 < next_exposure - self.next_exposure <= MAX_GAP_EXPOSURES:
+        if not 0 <= next_exposure - self.next_exposure <= MAX_GAP_EXPOSURES:
+            self.counters.unexplained_drops += 1
             return None
-        gap = self._gap_before(next_exposure, drops)
+        gap = self._gap_before(next_exposure, drops, at_end=True)
         self.next_exposure = next_exposure
         return gap
 
@@ -124,10 +129,17 @@ class StreamTracker:
         self.next_seq = self.next_exposure = self._drops = self._lost_messages = 0
         self._finished = False
 
-    def _gap_before(self, exposure_index: int, drops: int) -> Gap | None:
+    def _gap_before(self, exposure_index: int, drops: int, *, at_end: bool = False) -> Gap | None:
+        """Account for what is missing before `exposure_index`: dropped by the device, or lost with messages that it sent.
+
+        At the end it is not known how many messages those are.
+        """
         missing = exposure_index - self.next_exposure
         dropped = (drops - self._drops) % SEQUENCE
         self._drops = drops
+        if dropped > missing or (dropped < missing and not self._lost_messages and not at_end):
+            self.counters.unexplained_drops += 1
+            dropped = min(dropped, missing)
         self.counters.device_drops += dropped
         lost_messages, self._lost_messages = self._lost_messages, 0
         if missing == 0:

@@ -11,6 +11,7 @@ from numba import njit
 
 from .kernels import load4, load8
 from .schema import BLOCK_HEADER_BYTES, HEADER, STRUCTS, MessageType
+from .tracker import MAX_GAP_EXPOSURES
 
 # Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
 # and what the walk has taken.
@@ -61,6 +62,14 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
         and load8(buffer, payload + _U(12)) < LARGEST
         and load8(buffer, payload + _U(20)) < LARGEST
     )
+
+
+@njit(cache=True, nogil=True)
+def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def]
+    """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as core/plausible.py asks."""
+    away = np.int64(load8(buffer, payload + _U(12))) - place[NEXT_EXPOSURE]
+    near = -MAX_GAP_EXPOSURES <= away <= MAX_GAP_EXPOSURES
+    return near and -1 <= mark_truth(buffer, payload) < n_classes
 
 
 @njit(cache=True, nogil=True)

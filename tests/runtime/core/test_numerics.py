@@ -110,22 +110,23 @@ def test_counters_and_ticks_far_beyond_32_bits() -> None:
     """Exposures past 2^44, ticks past 2^61, decisions past 2^33: Core and the streaming core write the same rows."""
     plan, n_features = parallel(10, 8), 10
     decider = make_decider(head_bundle(random_layers([10, 8, 4])))
-    first = plan.slots_per_cycle * 2**41
+    visit = 2**41 - 513  # its object is number 2^32 - 2, the last one that there is
+    first = plan.slots_per_cycle * visit
     rng = np.random.default_rng(2)
     streamed, core = StreamCore(plan, decider, 1, 0, 7), Core(plan, decider, 1, 0)
     for one in (streamed.core, core):
         one.tracker.next_exposure = first
         one.n_decisions = 2**33 - 3
-        one.windows.position = (2**41, 0, 0)
+        one.windows.position = (visit, 0, 0)
         one.windows.tallies[:] = 2**40
     words = rng.integers(0, 4, (9, 2)).astype(np.uint8)
-    data = wire.encode_frames(FrameBlock(0, 0, 2**61, first, 1000, 2**32 - 2, words), 7)
+    data = wire.encode_frames(FrameBlock(0, 0, 2**61, first, 100, 2**32 - 2, words), 7)
     rows = np.concatenate([batch.rows.copy() for batch in streamed.feed(data)])
     expected = core.step(FrameDecoder().feed(data)[0]).decisions
     assert rows.tolist() == np.array([tuple(row) for row in expected], DECISION_DTYPE).tolist()
     assert rows["index"].tolist() == list(range(2**33 - 3, 2**33 + 5))
     assert int(rows["exposure_index"][-1]) == first + 8
-    assert int(rows["tick"][-1]) == 2**61 + 8 * 1000 + plan.exposure_ticks
+    assert int(rows["tick"][-1]) == 2**61 + 8 * 100 + plan.exposure_ticks
     assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
     assert streamed.core.windows.tallies[0] == 2**40 + n_features
 

@@ -126,7 +126,7 @@ def test_another_stream_settles_the_open_visit_and_counts_anew() -> None:
     ended = core.end()
     assert [event.event() for event in ended.events] == [{"kind": "stream_end_unknown", "first_exposure": 12}]
     assert core.cycles_left(6) == 2
-    (given_up,) = core.begin(5000, 2).decisions
+    (given_up,) = core.begin(500, 2).decisions
     assert given_up.flags == DecisionFlag.GAP | DecisionFlag.INCOMPLETE | DecisionFlag.ABSTAINED
     assert given_up.number == 3
     (decision,) = core.step(cycle(0, 0, [0, 1, 1, 0])).decisions
@@ -188,7 +188,7 @@ def test_damaged_frames_change_nothing() -> None:
 def test_marks_are_bounded() -> None:
     core, _ = make()
     for seq in range(MAX_MARKS + 10):
-        core.step(frame(wire.encode_mark(Mark(seq, seq, 0, 0, 0, 0.0), 1)))
+        core.step(frame(wire.encode_mark(Mark(seq, seq, 0, 8 * seq, 0, 0.0), 1)))
     assert len(core.marks) == MAX_MARKS
     assert MAX_MARKS + 9 in core.marks
     assert 0 not in core.marks
@@ -243,4 +243,4 @@ def test_blocks_that_do_not_fit_the_plan_are_counted_not_read() -> None:
         output = core.step(frame(message))
         assert output.events[-1].event()["kind"] == "beyond_plan"
         assert all(d.flags & DecisionFlag.GAP for d in output.decisions)
-    assert core.tracker.counters.malformed == 3
+    assert core.contradictions == {"beyond_plan": 3}

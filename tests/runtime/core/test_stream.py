@@ -160,9 +160,9 @@ def test_what_device_drops_and_sequence_wraps_do() -> None:
     plan, decider = parallel(3, 4), decider_for(3, 1, "table")
     words = np.ones((5, 1), np.uint8)
     blocks = [
-        FrameBlock(0, 0, 0, 0, 10, 0, words),
-        FrameBlock(1, 5, 100, 10, 10, 2, words),
-        FrameBlock(2, 5, 150, 15, 10, 3, words),
+        FrameBlock(0, 0, 0, 0, 100, 0, words),
+        FrameBlock(1, 5, 1000, 10, 100, 2, words),
+        FrameBlock(2, 5, 1500, 15, 100, 3, words),
     ]
     rows = compare(plan, decider, 1, [b"".join(wire.encode_frames(block, SESSION) for block in blocks)])
     assert (rows["flags"] == DecisionFlag.GAP | DecisionFlag.ABSTAINED).tolist() == [False] * 4 + [True] * 4 + [
@@ -171,7 +171,7 @@ def test_what_device_drops_and_sequence_wraps_do() -> None:
     streamed = StreamCore(plan, decider, 1, 0, SESSION)
     streamed.core.tracker.next_seq = 2**32 - 1
     for seq, first in ((2**32 - 1, 0), (0, 5)):
-        block = FrameBlock(seq, 0, 0, first, 10, 0, words)
+        block = FrameBlock(seq, 0, 100 * first, first, 100, first // 5, words)
         assert sum(len(batch.rows) for batch in streamed.feed(wire.encode_frames(block, SESSION))) == 4
     assert streamed.core.tracker.counters.gaps == 0
 
@@ -183,7 +183,7 @@ def test_blocks_beyond_the_plan_and_photons() -> None:
     clean = b"".join(frames(plan, 3, 2, np.random.default_rng(4), 3))
     batches = [(batch.rows.copy(), batch.events, batch.others) for batch in streamed.feed(clean)]
     assert sum(len(rows) for rows, _, _ in batches) == 2
-    assert [event.event()["kind"] for _, events, _ in batches for event in events] == ["beyond_plan"]
+    assert [event.event()["kind"] for _, events, _ in batches for event in events] == ["beyond_plan", "contradiction"]
     assert {frame.type for _, _, others in batches for frame in others} == {MessageType.STATUS}
     photons = streamed.photons_of(np.array([0, 1, 5]))
     assert photons[:2].tolist() == [2.5, 2.5]

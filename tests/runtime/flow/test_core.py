@@ -231,7 +231,7 @@ def test_a_second_stream_goes_on_with_the_numbers() -> None:
     core = make(n_cycles=100)
     feed(core, scene((100, 60, 0), n=400))
     assert core.cycles_left(100) == 80
-    core.begin(5000, 80)
+    core.begin(1000, 80)
     output = feed(core, scene((100, 60, 1), n=400))
     assert [(d.number, d.object, d.label) for d in output.decisions] == [(1, 1, 1)]
     assert core.cycles_left(100) == 60

@@ -132,7 +132,7 @@ def test_a_block_of_another_period_is_refused_by_both() -> None:
     messages[2:3] = strange("period", messages[2])
     one, many = make(), make()
     assert by_many(many, b"".join(messages), []).events == by_one(one, b"".join(messages)).events
-    assert many.tracker.counters.malformed == 1
+    assert many.contradictions == {"beyond_plan": 1}
 
 
 def test_a_block_that_ends_when_the_plan_does_not_is_seen() -> None:
