@@ -276,6 +276,6 @@ def _exit_code(summary: Summary) -> int:
         return EXIT_INTERRUPTED
     if summary.link_lost:
         return EXIT_DEVICE
-    if summary.late or summary.lost:
+    if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions:
         return EXIT_TIMING
     return EXIT_FINE if summary.verdict == "PASS" else EXIT_ALERT

@@ -32,6 +32,7 @@ from .plan import Plan
 from .plausible import Contradiction, PlanRules
 
 MAX_MARKS = 4096  # objects whose truth is remembered; a run may see any number
+ANY_CLASS = 1 << 15  # where nothing is classified, every truth that fits its field is one
 PART_MARKS = 16  # of them that a part of a recording begins with
 
 
@@ -70,7 +71,7 @@ class Follower:
 
     moving = False  # whether objects pass by
 
-    def __init__(self, plan: Plan, n_cycles: int, n_classes: int) -> None:
+    def __init__(self, plan: Plan, n_cycles: int, n_classes: int = ANY_CLASS) -> None:
         self.contradictions: Counter[str] = (
             Counter()
         )  # messages that the plan or others exclude, by what is wrong in them
@@ -241,8 +242,11 @@ class Follower:
             status = decode_status(frame.payload)
         except MalformedMessage:
             return Output([], [], None)
-        if self.completed or status.tick < self.start_tick:  # an earlier run's news
+        if status.tick < self.start_tick:  # an earlier run's news
             return Output([], [], None)
+        if self.completed:
+            wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
+            return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
         self._status = status
         if (status.state, status.reason) != (DeviceState.IDLE, StateReason.COMPLETED):
             wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)

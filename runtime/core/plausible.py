@@ -74,7 +74,9 @@ class PlanRules:
             return Contradiction("truth", first, mark.truth, self._n_classes - 1)
         if first >= end_exposure + MAX_GAP_EXPOSURES or abs(first - next_exposure) > MAX_GAP_EXPOSURES:
             return Contradiction("mark_exposure", first, first, next_exposure)
-        if not self._moving and not mark.half_exposures:
+        if not self._moving and mark.half_exposures:
+            return Contradiction("mark_half", first, mark.half_exposures, 0)
+        if not self._moving:
             visit, within = divmod(first, self._visit)
             if within or mark.object_index not in (visit % NO_OBJECT, NO_OBJECT):
                 return Contradiction("mark_object", first, mark.object_index, visit % NO_OBJECT)

@@ -142,7 +142,10 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     if not stream.is_next_mark(buffer, payload, stop, state):
         return False
     number, first = np.int64(load4(buffer, payload + _U(4))), np.int64(load8(buffer, payload + _U(12)))
-    fits = number < _NO_OBJECT and number * state[VISIT_EXPOSURES] == first and first < state[stream.END_EXPOSURE]
+    fits = load4(buffer, payload + _U(8)) >> _U(16) == _U(0)  # it stands still
+    fits = (
+        fits and number < _NO_OBJECT and number * state[VISIT_EXPOSURES] == first and first < state[stream.END_EXPOSURE]
+    )
     if not fits or not stream.mark_fits(buffer, payload, state, state[N_CLASSES]):
         return False
     slot = number % MARK_SLOTS

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_chunks
-from pans.runtime.errors import DeviceError, LinkError
+from pans.runtime.errors import DeviceError, LinkError, PansError
 from pans.runtime.timing.clock import ClockModel, ClockStep
 from pans.runtime.timing.evidence import Evidence, Stamped
 from pans.runtime.wire.commands import (
@@ -69,9 +69,13 @@ class Connection:
         self.clock_steps: list[ClockStep] = []  # since the last look
         self.evidence: Evidence | None = None  # of what makes work late, once a run wants it
         self.on_sent, self.on_answer = on_sent, on_answer
+        self.delivered = 0  # messages returned by `pump` and `rest`
+        self.answers = 0  # frames that were the session's alone
+        self._failure: PansError | None = None  # met while digesting, kept until all that came with it is delivered
 
     def pump(self, timeout_s: float) -> list[Arrived]:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
+        self._raise_failure()
         self.session.poll(self.link.now_ns())
         asked = self.flush()
         began_ns = self.link.now_ns()
@@ -82,6 +86,8 @@ class Connection:
                 self.evidence.arrived(chunk.arrival_ns)
         stream = self._take(chunks)
         self._take_pongs()
+        if not stream:
+            self._raise_failure()
         return stream
 
     def rest(self) -> list[Arrived]:
@@ -100,10 +106,18 @@ class Connection:
                 self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
         return stream
 
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+
     def _take_pongs(self) -> None:
         """Give the clock what came for it."""
         while self.clock is not None and self.session.pongs:
             pong, arrival_ns = self.session.pongs.popleft()
+            if not self.clock.can_be(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns):
+                self.session.counters.implausible += 1
+                continue
             step = self.clock.add_probe(pong.host_ns, pong.rx_tick, pong.tx_tick, arrival_ns)
             if step is not None:
                 self.clock_steps.append(step)
@@ -124,16 +138,28 @@ class Connection:
                     session.heard_ns = arrival_ns
                     messages = Messages(bulk.buffer, spans[place:stop])
                     stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
+                    self.delivered += stop - place
                 if stop < len(spans):
                     self._sort(bulk.frame(*spans[stop].tolist()), arrival_ns, stream)
                 place = stop + 1
 
     def _sort(self, frame: Frame, arrival_ns: int, stream: list[Arrived]) -> None:
-        """Give a frame to the session, and to the core what is the core's; an answer is on record before it can end the session."""
+        """Give a frame to the session, and to the core what is the core's; an answer is on record before it can end the session.
+
+        What ends the session waits until the frames that came with it are delivered.
+        """
         if self.on_answer is not None and frame.type in ANSWER_TYPES:
             self.on_answer(arrival_ns, pack_body(frame))
-        if self.session.on_frame(frame, arrival_ns):
+        wanted = False
+        try:
+            wanted = self.session.on_frame(frame, arrival_ns)
+        except PansError as error:
+            self._failure = self._failure or error
+        if wanted:
             stream.append(Arrived(arrival_ns, frame))
+            self.delivered += 1
+        else:
+            self.answers += 1
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""

@@ -66,5 +66,8 @@ class RunResult:
     reconnects: int = 0
     late_cause: dict[str, int] = field(default_factory=dict)  # late decisions by who is to blame (blame.CAUSES)
     lost_cause: dict[str, int] = field(default_factory=dict)  # lost exposures
+    contradictions: dict[str, int] = field(
+        default_factory=dict
+    )  # messages that the evidence excludes, by what is wrong
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)

@@ -15,7 +15,7 @@ from pans.runtime.record import AnyRecorder
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
-TROUBLE = ("blame", "gap", "link_lost", "clock_step", "gate_refused", "parts_trouble", "beyond_plan")
+TROUBLE = ("blame", "gap", "link_lost", "clock_step", "gate_refused", "parts_trouble", "beyond_plan", "contradiction")
 
 
 class Journal:

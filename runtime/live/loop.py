@@ -151,6 +151,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         tally=run.tally,
         timing=run.timing,
         dark=found if guard is None else guard.report(found),
+        contradictions=dict(run.core.contradictions + run.contradictions),
         stream={name: getattr(stream, name) for name in stream.__slots__},
         decoder=dict(run.decoded),
         clock={} if fit is None else {"drift_ppm": fit.drift_ppm, "uncertainty_us": fit.uncertainty_ns / 1000},

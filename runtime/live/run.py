@@ -18,16 +18,18 @@ import numpy.typing as npt
 from pans.runtime.core.decision import Output
 from pans.runtime.core.follower import Place
 from pans.runtime.core.plan import Plan
-from pans.runtime.errors import LinkError
+from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record import AnyRecorder, PartedRecorder
 from pans.runtime.record.parted_recorder import repeated_setup
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
+from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, StateReason, pack_body
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
+from .clock_check import future_tick
 from .config import RunConfig
 from .gates import GateQueue
 from .journal import Journal
@@ -56,6 +58,7 @@ class LiveCore(Protocol):
     n_decisions: int
     jitter_ticks: int
     tracker: StreamTracker
+    contradictions: Counter[str]
 
     @property
     def marks(self) -> Mapping[int, Mark]: ...
@@ -105,10 +108,12 @@ class LiveRun:
         self.link_lost = False
         self.reconnects = 0
         self.outage_ns: int | None = None  # since when there has been no block
-        self.decoded: Counter[str] = Counter()  # what the decoders of connections that are gone have counted
+        self.decoded: Counter[str] = Counter()  # what the connections that are gone have counted
+        self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
         self.armed_after_s = 0.0
         self.start_ns = self.last_data_ns = 0
         self._counted: Connection | None = None
+        self._taken_here = 0  # messages of the present connection that the core was given, or came before ARM
         self._recorder = recorder
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self._setup: list[bytes] = []  # what each part of the recording must repeat
@@ -126,8 +131,14 @@ class LiveRun:
         """Start the exposures a little in the future, at an absolute device tick."""
         n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
         self.journal.session(self.connection)
+        self._taken_here = self.connection.delivered
         now_ns = self.now_ns()
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
+        if not 0 <= start_tick <= LARGEST_TICK:
+            raise DeviceError(
+                f"the device's clock says that it is tick {start_tick}, allowed 0 to {LARGEST_TICK}",
+                remedy="restart the device, so that its counter begins anew",
+            )
         self.lateness.attach(self.connection, now_ns + ARM_LEAD_NS)
         self.settle(self.core.begin(start_tick, n_cycles))
         arm = Arm(start_tick, n_cycles, self.config.lease_ms)
@@ -256,11 +267,13 @@ class LiveRun:
                 continue
             decoded_ns = self.now_ns()
             output = self.core.step(what)
+            self._taken_here += 1
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
                 self._recorder.add_message(arrival_ns, pack_body(what))
             self._book(output, arrival_ns, decoded_ns, outputs)
             if what.type == MessageType.STATUS and self.connection.session.status is not None:
+                self._check_tick(self.connection.session.status.tick, arrival_ns)
                 self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
         if self._broken is not None:
             broken, self._broken = self._broken, None
@@ -273,6 +286,7 @@ class LiveRun:
         while place < n:
             decoded_ns = self.now_ns()
             taken, output = self.core.step_messages(messages, place)
+            self._taken_here += taken
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
                 self._recorder.add_messages(arrival_ns, messages, place, taken)
@@ -283,6 +297,7 @@ class LiveRun:
         """Account for what a step brought."""
         self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
         if output.block_end_tick is not None:
+            self._check_tick(output.block_end_tick, arrival_ns)
             self.last_data_ns = arrival_ns
             self.outage_ns = None
             self.lateness.block_came(arrival_ns)
@@ -292,6 +307,12 @@ class LiveRun:
             except LinkError as error:
                 self._broken = error
         outputs.append(output)
+
+    def _check_tick(self, tick: int, arrival_ns: int) -> None:
+        wrong = future_tick(self.connection.known_clock(), tick, arrival_ns)
+        if wrong is not None:
+            self.contradictions[wrong.what] += 1
+            self.journal.take(wrong)
 
     def settle(self, output: Output) -> None:
         """Account for what the core settled without a message."""
@@ -314,6 +335,10 @@ class LiveRun:
         for place, decision in enumerate(output.decisions):
             if output.passages and output.block_end_tick is not None:  # a time of its own, and its number is no mark's
                 end_ns, uncertainty_ns = clock.to_host_ns(output.passages[place].leave_tick)
+            if (
+                end_ns - uncertainty_ns > times_ns[0]
+            ):  # what has arrived has happened: a tick in the future hides no lateness
+                end_ns = times_ns[0]
             mark = None if output.passages else self.core.marks.get(decision.object)
             self.tally.add(decision, float("nan") if mark is None else mark.photons)
             if self._recorder is not None:
@@ -356,3 +381,17 @@ class LiveRun:
             self._counted = self.connection
             counters = self.connection.decoder.counters
             self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+            session = self.connection.session.counters
+            self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
+            self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
+            self._reconcile(counters.frames)
+
+    def _reconcile(self, frames: int) -> None:
+        """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
+        lost = frames - self.connection.answers - self.connection.delivered
+        untaken = self.connection.delivered - self._taken_here if self._taken_here else 0  # it was armed
+        self._taken_here = 0
+        for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
+            if count:
+                self.contradictions[what] += abs(count)
+                self.journal.note("contradiction", what=what, found=count, expected=0)

@@ -40,6 +40,7 @@ class Summary:
     dark: DarkReport
     stream: dict[str, int]
     link: dict[str, int]
+    contradictions: dict[str, int]  # what the evidence excludes, by what is wrong; malformed messages too
     realtime: dict[str, Any]
     device: dict[str, Any]
     armed_after_s: float
@@ -110,6 +111,7 @@ def summarise(
         dark=result.dark,
         stream=result.stream,
         link=result.decoder,
+        contradictions=contradictions_of(result),
         realtime=result.realtime,
         device=_plain_device(result.device),
         armed_after_s=result.armed_after_s,
@@ -143,6 +145,11 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
             f"{stream['lost_exposures']} exposures lost in {stream['gaps']} gaps, "
             f"{stream['device_drops']} of them dropped by the device"
         )
+    if stream["lost_messages"] and not stream["lost_exposures"]:
+        faults.append(f"{stream['lost_messages']} messages lost, which held no exposures: marks of objects")
+    if contradictions := contradictions_of(result):
+        kinds = ", ".join(f"{what} {count}" for what, count in sorted(contradictions.items()))
+        faults.append(f"{sum(contradictions.values())} messages contradict the evidence: {kinds}")
     if result.wrong_patterns:
         faults.append(f"{result.wrong_patterns} exposures showed another pattern than planned")
     if tally.abstained and aborts_are_faults:
@@ -153,6 +160,13 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
         faults.append(result.dark.alarm)
     faults += [event["words"] for event in result.dark.findings if event["level"] == "alarm"]
     return faults
+
+
+def contradictions_of(result: RunResult) -> dict[str, int]:
+    """Return how many messages cannot have been meant or cannot be true, by what is wrong in them; empty when all is well."""
+    malformed = result.stream["malformed"] + result.decoder.get("malformed_answers", 0)
+    found = {"malformed": malformed, "implausible_answers": result.decoder.get("implausible_answers", 0)}
+    return {what: count for what, count in (found | result.contradictions).items() if count}
 
 
 def gate_faults(gates: Mapping[str, int]) -> list[str]:

@@ -30,6 +30,10 @@ STEP_MARGIN_NS = 20_000  # a jump is larger than the published uncertainty by th
 # the scheduler's own jitter. What is slower waited in a queue and says nothing that the quick ones do not.
 QUICK_RATIO, QUICK_MARGIN_NS = 1.5, 20_000.0
 MAX_UNRECORDED = 4096
+MAX_RATE_ERROR = (
+    1e-3  # of a device's clock (docs/reference/protocol.md, section 9); what a fit says beyond it is no rate
+)
+LARGEST_NS = 1 << 62  # 146 years: a tick that claims more is no time, and must still fit the recording's int64
 
 CLOCK_DTYPE = np.dtype([("host_ns", "<i8"), ("tick", "<u8"), ("round_trip_ns", "<i8")])
 
@@ -104,13 +108,19 @@ class ClockModel:
         self.fit = _fit(self.samples[: min(self._kept, HISTORY)], self.tick_hz, (self._kept - 1) % HISTORY)
         return step
 
+    def can_be(self, sent_ns: int, rx_tick: int, tx_tick: int, received_ns: int) -> bool:
+        """Whether the device can have held a probe for as long as it says: no longer than it was away."""
+        away_ns = (received_ns - sent_ns) * (1 + MAX_RATE_ERROR) + 2 * READING_NS
+        return (tx_tick - rx_tick) * NS_PER_S <= away_ns * self.tick_hz
+
     def to_host_ns(self, tick: int) -> tuple[int, int]:
         """Return the host time of `tick` and its uncertainty, both in ns; LinkError before the first probe."""
         fit = self._ready()
         elapsed = tick - fit.reference_tick
         rate = fit.ns_per_tick * fit.rate_uncertainty
         uncertainty = min([bound + abs(elapsed - at) * rate for at, bound in fit.anchors])
-        return fit.reference_host_ns + round(elapsed * fit.ns_per_tick), int(uncertainty) + 1
+        host_ns = fit.reference_host_ns + round(elapsed * fit.ns_per_tick)
+        return max(-LARGEST_NS, min(host_ns, LARGEST_NS)), min(int(uncertainty) + 1, LARGEST_NS)
 
     def to_tick(self, host_ns: int) -> int:
         """Return the device tick at a host time (for commands with absolute ticks)."""
@@ -159,6 +169,7 @@ def _fit(samples: npt.NDArray[np.void], tick_hz: int, newest: int) -> ClockFit:
     mean_t, mean_o = float(weight @ ticks_ns) / total, float(weight @ offset) / total
     precision = float(weight @ (ticks_ns - mean_t) ** 2) + 1.0 / DRIFT_PRIOR**2
     rate = float(weight @ ((ticks_ns - mean_t) * (offset - mean_o))) / precision
+    rate = max(-MAX_RATE_ERROR, min(rate, MAX_RATE_ERROR))
     residual = offset - (mean_o + rate * (ticks_ns - mean_t))
     bounds = trip / 2 + np.abs(residual) + READING_NS + ns_per_tick  # a tick is floored, hence one tick more
     return ClockFit(

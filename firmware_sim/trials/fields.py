@@ -1,0 +1,342 @@
+"""Whole sessions in which a device, or the host, says something else in one field (`pans fuzz --fields N`).
+
+Owns the choice of a mutation from the message dictionary, the link that carries it out with a right checksum, and what must hold after
+every session: errors of the package's own and no others, bounded time, a recording that can be read and replays to the same decisions,
+and no PASS where the evidence contradicts what was said. Host, instrument and recording are the ordinary ones, in virtual time.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import Scene, scene_from_arrays
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import PansError
+from pans.runtime.live import RunConfig, run_live
+from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.report.summary import Summary, summarise
+from pans.runtime.wire import messages
+from pans.runtime.wire.fields import FACTS, MESSAGES, Field, wrong_facts
+from pans.runtime.wire.frame import Frame
+from pans.runtime.wire.framing import FrameDecoder, encode_frame
+from pans.runtime.wire.messages import NO_OBJECT, STRUCTS, DeviceState, MalformedMessage, MessageType, Opcode
+
+OBJECTS = 12
+SHOTS = 1
+MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
+EDGES = (0, 1, 2, 1 << 15, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
+REALS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 3e38, 1e-45)
+STRANGE_FACTS: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0,
+    1 << 63,
+    (1 << 64) - 1,
+    1.5,
+    float("nan"),
+    float("inf"),
+    "",
+    "x" * 257,
+    b"b",
+    [],
+    {"a": [{}]},
+)
+TO_DEVICE = ("HELLO", "PING", "COMMAND", "GRANT", "LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE")
+FROM_DEVICE = ("WELCOME", "PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK")
+
+
+class Mutation(NamedTuple):
+    """In `message`s, from number `first` on and at most `most` of them, `name` becomes `change` of what it was.
+
+    `name` is a field, or a key of WELCOME's map behind "map.". `words` say what the change is.
+    """
+
+    message: str
+    name: str
+    change: Callable[[Any], Any]
+    words: str
+    first: int = 0
+    most: int = 1 << 30
+
+    def __str__(self) -> str:
+        return f"{self.message}.{self.name} {self.words}, from message {self.first} on, {self.most} of them"
+
+
+def to(value: Any) -> tuple[Callable[[Any], Any], str]:
+    """Return the change to `value`, and its words."""
+    return lambda _: value, f"becomes {value!r}"
+
+
+def by(step: int) -> tuple[Callable[[Any], Any], str]:
+    """Return the change by `step`."""
+    return lambda value: value + step, f"moves by {step}"
+
+
+class Evidence(NamedTuple):
+    """What the host knows of a session: the exposures of the plan, the classes, ticks per second."""
+
+    exposures: int
+    n_classes: int
+    tick_hz: int
+
+    def excludes(self, message: str, name: str, old: Any, new: Any) -> bool:
+        """Whether a host that compares all that it was told must find the change from `old` to `new`, each allowed by itself.
+
+        What is not listed is believed: nobody but the device knows it.
+        """
+        known: dict[tuple[str, str], bool] = {
+            ("STATUS", "next_exposure"): new > self.exposures,
+            ("STATUS", "drops"): new > self.exposures,
+            ("MARK", "truth"): new >= self.n_classes,
+            ("MARK", "object_index"): new != NO_OBJECT,
+            ("ACK", "last_id"): new > self.exposures,
+            ("BLOCK", "object_index"): new != NO_OBJECT,
+            ("BLOCK", "tick"): abs(new - old) > self.tick_hz,
+        }
+        always = {
+            **{"MARK": ("seq", "exposure_index", "half_exposures"), "PONG": ("host_ns",)},
+            "BLOCK": ("seq", "drops", "exposure_index", "period_ticks", "count", "word_bytes"),
+        }
+        kind = "BLOCK" if message in ("CLICKS", "FRAMES") else message
+        return known.get((kind, name), name in always.get(kind, ()))
+
+
+class MutatedLink:
+    """An ordinary link around another one; `changed` counts changed messages, `impossible` names those that the evidence excludes."""
+
+    def __init__(self, link: Any, mutations: tuple[Mutation, ...], evidence: Evidence) -> None:
+        self._link, self._mutations, self._evidence = link, mutations, evidence
+        self._armed = False
+        self.impossible: list[str] = []
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.now_ns, self.close = link.now_ns, link.close
+        self._decoders = {"read": FrameDecoder(), "write": FrameDecoder()}
+        self._seen: Counter[tuple[int, int]] = Counter()
+        self.changed = 0
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        return self._passed("read", self._link.read(timeout_s))
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        self._link.write(self._passed("write", data))
+
+    def _passed(self, way: str, data: bytes) -> bytes:
+        return b"".join(self._mutated(frame) for frame in self._decoders[way].feed(data))
+
+    def _mutated(self, frame: Frame) -> bytes:
+        payload = frame.payload
+        self._armed |= _is(frame, "ARM")
+        for place, mutation in enumerate(self._mutations):
+            if not _is(frame, mutation.message):
+                continue
+            number = self._seen[place, 0]
+            self._seen[place, 0] += 1
+            if mutation.first <= number < mutation.first + mutation.most:
+                changed = mutate(payload, mutation)
+                self.changed += changed != payload
+                if (
+                    changed != payload
+                    and frame.type >= MessageType.WELCOME
+                    and self._excludes(mutation, payload, changed)
+                ):
+                    self.impossible.append(str(mutation))
+                payload = changed
+        return encode_frame(frame.type, payload, frame.session, frame.flags)
+
+    def _excludes(self, mutation: Mutation, old: bytes, new: bytes) -> bool:
+        """Whether the changed message cannot be meant, or cannot be true."""
+        decode = getattr(messages, f"decode_{mutation.message.lower()}")
+        try:
+            decoded = decode(new)
+        except MalformedMessage:
+            return True
+        if mutation.message == "WELCOME":
+            return bool(wrong_facts(decoded.facts))
+        if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
+            return False  # of no run, or of one that has not begun
+        place = [one.name for one in MESSAGES[mutation.message]].index(mutation.name)
+        values = [STRUCTS[mutation.message].unpack_from(payload)[place] for payload in (old, new)]
+        return self._evidence.excludes(mutation.message, mutation.name, *values)
+
+
+def _is(frame: Frame, message: str) -> bool:
+    if message in ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE"):
+        return frame.type == MessageType.COMMAND and frame.payload[4] == Opcode[message]
+    return frame.type == MessageType[message]
+
+
+def mutate(payload: bytes, mutation: Mutation) -> bytes:
+    """Return `payload` with one field changed; whatever does not fit the field's bits is cut to them."""
+    if mutation.name.startswith("map."):
+        head, facts = payload[: STRUCTS["WELCOME"].size], msgpack.unpackb(payload[STRUCTS["WELCOME"].size :])
+        key = mutation.name[4:]
+        value = mutation.change(facts.get(key))
+        if value is MISSING:
+            facts.pop(key, None)
+        else:
+            facts[key] = value
+        return head + msgpack.packb(facts)
+    start = STRUCTS["COMMAND"].size if mutation.message in ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE") else 0
+    fields = MESSAGES[mutation.message]
+    place = [one.name for one in fields].index(mutation.name)
+    layout = STRUCTS[mutation.message]
+    values = list(layout.unpack_from(payload, start))
+    values[place] = fitted(fields[place], mutation.change(values[place]))
+    return payload[:start] + layout.pack(*values) + payload[start + layout.size :]
+
+
+MISSING = object()
+
+
+def fitted(field: Field, value: Any) -> Any:
+    """Return `value` as the field's bits hold it."""
+    if field.code == "f":
+        return struct.unpack("<f", struct.pack("<f", value))[0]
+    size = struct.calcsize(field.code)
+    return int.from_bytes((int(value) % (1 << 8 * size)).to_bytes(size, "little"), "little", signed=field.code == "h")
+
+
+def any_mutation(dice: random.Random, mode: str) -> Mutation:
+    """Draw a mutation of a session in `mode`."""
+    block = "FRAMES" if mode == "parallel" else "CLICKS"
+    names = [
+        *(name for name in FROM_DEVICE if name not in ("CLICKS", "FRAMES")),
+        block,
+        block,
+        "MARK",
+        "STATUS",
+        *TO_DEVICE,
+    ]
+    message = dice.choice(names)
+    first, most = dice.choice((0, 0, 1, 3, 10)), dice.choice((1, 1, 3, 1 << 30))
+    if message == "WELCOME" and dice.random() < 0.8:
+        key = dice.choice((*FACTS, "extra"))
+        value = dice.choice((MISSING, *STRANGE_FACTS, "1000000"))
+        return Mutation(
+            message, f"map.{key}", *(to(value) if value is not MISSING else (lambda _: MISSING, "is missing")), first=0
+        )
+    chosen = dice.choice([one for one in MESSAGES[message] if one.name not in ("reserved",)])
+    if chosen.code == "f":
+        change, words = to(dice.choice(REALS))
+    elif dice.random() < 0.3:
+        change, words = by(dice.choice((-1, 1, 100, -100, 10**6, 10**9)))
+    else:
+        change, words = to(dice.choice(EDGES) if dice.random() < 0.7 else dice.getrandbits(dice.randint(1, 64)))
+    return Mutation(message, chosen.name, change, words, first, most)
+
+
+@dataclass(slots=True)
+class Session:
+    """What came of one mutated session; `error` is one of the package's own, `wrong` what must not be."""
+
+    mutations: tuple[Mutation, ...]
+    summary: Summary | None = None
+    error: str = ""
+    changed: int = 0
+    impossible: list[str] = field(default_factory=list)  # changed messages that the evidence excludes
+    wrong: list[str] = field(default_factory=list)
+
+
+class Stage:
+    """What sessions of one mode have in common, made once."""
+
+    def __init__(self, mode: str) -> None:
+        self.mode = mode
+        self.profile, self.bundle, self.plan = small_setup(mode)
+        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+        self.scene: Scene = scene_from_arrays("fields", images, np.arange(6) % 3, ("a", "b", "c"))
+        self.decider = make_decider(self.bundle, shots=SHOTS, backend="table")
+
+    def run(self, folder: Path, seed: int, *mutations: Mutation) -> Session:
+        """Run one session with `mutations` and judge what can be judged of any."""
+        session = Session(mutations)
+        began_s = time.process_time()
+        path = folder / "fields.pansrec"
+        try:
+            self._run(path, seed, session)
+        except PansError as error:
+            session.error = f"{type(error).__name__}: {error.message}"
+        except Exception:
+            session.wrong.append(traceback.format_exc())
+        try:
+            if session.summary is not None:
+                self._check_recording(path, session)
+        except Exception:
+            session.wrong.append(traceback.format_exc())
+        if (took_s := time.process_time() - began_s) > MAX_SESSION_S:
+            session.wrong.append(f"it took {took_s:.1f} s of processor time, allowed {MAX_SESSION_S:g}")
+        if session.summary is not None and session.summary.verdict == "PASS":
+            session.wrong += [f"PASS though {what}" for what in session.impossible[:3]]
+        return session
+
+    def _run(self, path: Path, seed: int, session: Session) -> None:
+        clock = DeviceClock(self.profile.clock.tick_hz)
+        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
+        exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
+        evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
+        link = MutatedLink(VirtualLink(device, clock, "fields"), session.mutations, evidence)
+        config = RunConfig(SHOTS, OBJECTS * self.plan.cycles_per_object, deadline_us=1e5)
+        core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
+        header = {"config": {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": "table"}}
+        with Recorder(path, header, overwrite=True) as recorder:
+            try:
+                result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
+            finally:
+                session.changed, session.impossible = link.changed, link.impossible
+            shots = OBJECTS * self.plan.shots_per_object
+            summary = summarise(result, illumination=1.0, expected_decisions=shots // SHOTS)
+            recorder.close(summary.as_json())
+        session.summary = summary
+
+    def _check_recording(self, path: Path, session: Session) -> None:
+        recording = read_recording(path)
+        again = replay(recording, self.bundle)
+        if (again.decisions, again.sha256) != (recording.n_decisions, recording.decisions_sha256):
+            session.wrong.append(
+                f"a replay gives {again.decisions} decisions of {recording.n_decisions}, or other ones"
+            )
+
+
+def sessions(seed: int, count: int) -> tuple[Counter[str], list[str]]:
+    """Run `count` sessions, one mutation each, or two; return how they ended and what was wrong, with the seed of each."""
+    stages = {mode: Stage(mode) for mode in ("sequential", "parallel")}
+    ended: Counter[str] = Counter()
+    wrong: list[str] = []
+    with TemporaryDirectory() as folder:
+        for number in range(seed, seed + count):
+            dice = random.Random(number)
+            mode = dice.choice(tuple(stages))
+            mutations = tuple(any_mutation(dice, mode) for _ in range(dice.choice((1, 1, 1, 2))))
+            session = stages[mode].run(Path(folder), number, *mutations)
+            ended[_ending(session)] += 1
+            wrong += [f"seed {number}, {mode}: {'; '.join(map(str, mutations))}: {what}" for what in session.wrong]
+    return ended, wrong
+
+
+def _ending(session: Session) -> str:
+    if session.wrong:
+        return "wrong"
+    if session.error:
+        return "refused"
+    assert session.summary is not None
+    return "unchanged" if not session.changed else session.summary.verdict.lower()
