@@ -174,6 +174,8 @@ class MutatedLink:
             return bool(wrong_facts(decoded.facts))
         if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
             return False  # of no run, or of one that has not begun
+        if mutation.message == "PONG" and len(self._mutations) > 1:
+            return False  # with another probe id it answers nothing, and is dropped
         place = [one.name for one in MESSAGES[mutation.message]].index(mutation.name)
         values = [STRUCTS[mutation.message].unpack_from(payload)[place] for payload in (old, new)]
         return self._evidence.excludes(mutation.message, mutation.name, *values)

@@ -2,7 +2,7 @@
 
 Owns the rules and what breaks one; never drops a message (follower.py does) and never reads a clock, so that a replay finds the same. The
 ranges of single fields are wire/fields.py's, the account of sequence numbers and drops is wire/tracker.py's, and what the host's own clock
-says against a tick is live/clock_check.py's.
+says against a tick is timing/clock_check.py's.
 """
 
 from __future__ import annotations

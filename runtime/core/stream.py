@@ -196,7 +196,7 @@ class StreamCore:
         if frame.type != MessageType.MARK or not self.core.marks:
             return
         mark = self.core.marks[next(reversed(self.core.marks))]
-        if (mark.seq, mark.object_index) != struct.unpack_from("<II", frame.payload):
+        if struct.pack("<II", mark.seq, mark.object_index) != frame.payload[:8]:
             return  # it was not taken
         slot = mark.object_index % kernels.MARK_SLOTS
         self._marks.objects[slot], self._marks.truths[slot] = mark.object_index, mark.truth

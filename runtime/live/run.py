@@ -22,6 +22,7 @@ from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record import AnyRecorder, PartedRecorder
 from pans.runtime.record.parted_recorder import repeated_setup
+from pans.runtime.timing.clock_check import future_tick
 from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.fields import LARGEST_TICK
@@ -29,7 +30,6 @@ from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, StateReason, pack_body
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
-from .clock_check import future_tick
 from .config import RunConfig
 from .gates import GateQueue
 from .journal import Journal

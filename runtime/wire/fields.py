@@ -2,7 +2,7 @@
 
 Owns what docs/reference/protocol.md says of single fields; schema.py makes the layouts from it, messages.py the checks of what a device
 sends, walk.py those of the compiled path, and tests/runtime/wire/test_fields.py compares all of them with the document. Never decodes a
-message. What a field must be beside the others, the plan or the clock is not here: core/evidence.py and live/clock_check.py judge that.
+message. What a field must be beside the others, the plan or the clock is not here: core/evidence.py and timing/clock_check.py judge that.
 
 The largest numbers of the whole path:
 

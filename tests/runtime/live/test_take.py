@@ -28,7 +28,7 @@ def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeyp
     run.core = SimpleNamespace(step_messages=step_messages)  # type: ignore[assignment]
     run.lateness = SimpleNamespace(stepped=lambda begin, end: None)  # type: ignore[assignment]
     run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7))  # type: ignore[assignment]
-    run._recorder, run._broken = None, None
+    run._recorder, run._broken, run._taken_here = None, None, 0
     monkeypatch.setattr(LiveRun, "_act", act)
     monkeypatch.setattr(LiveRun, "_account", lambda self, output, times_ns: None)
     messages = Messages(np.zeros(8, np.uint8), np.zeros((3, 2), np.int64))

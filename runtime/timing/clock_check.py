@@ -1,13 +1,14 @@
 """Ticks against the host's clock: what has arrived has happened, so that no tick may lie in the future.
 
-Owns that comparison; never changes a message or a decision. The bound is the clock model's own (timing/clock.py), which holds whatever the
+Owns that comparison; never changes a message or a decision. The bound is the clock model's own (clock.py), which holds whatever the
 link does. Costs a block two multiplications.
 """
 
 from __future__ import annotations
 
 from pans.runtime.core.plausible import Contradiction
-from pans.runtime.timing.clock import STEP_MARGIN_NS, ClockModel
+
+from .clock import STEP_MARGIN_NS, ClockModel
 
 
 def future_tick(clock: ClockModel, tick: int, arrival_ns: int) -> Contradiction | None:
