@@ -24,8 +24,8 @@ from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.instrument.dark_rate import DarkMonitor
-from pans.runtime.live.state_file import resources_used
 from pans.runtime.record import Recorder
+from pans.runtime.watch import resources_used
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, FrameBlock, Mark, encode_frames, encode_mark

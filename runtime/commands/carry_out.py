@@ -9,10 +9,10 @@ import argparse
 import threading
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
 from pans.runtime.link.base import open_link
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.record import AnyRecorder
     from pans.runtime.report.summary import Summary
+    from pans.runtime.watch import Watchdog
 
 T = TypeVar("T")
 
@@ -76,18 +77,33 @@ def carry_out(args: argparse.Namespace, job: Job) -> int:
     """Run the job, say how it went and return the exit code."""
     from pans.runtime.report.words import closing_words
 
-    done = run_job(job, process_start_ns())
+    done = run_job(job, process_start_ns(), ends_process=True)
     files = {"recording": str(done.recording), "report": str(done.report)}
     payload = {**done.summary.as_json(), **files, "shots": job.shots, "seed": job.seed}
     emit(args, payload, closing_words(done.summary, **files))
     return _exit_code(done.summary)
 
 
-def run_job(job: Job, started_ns: int = 0) -> Outcome:
-    """Run the job and leave its files; `started_ns` (time.perf_counter_ns) is when it was asked for, 0: now."""
+def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Outcome:
+    """Run the job and leave its files; `started_ns` (time.perf_counter_ns) is when it was asked for, 0: now.
+
+    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py).
+    """
     check_run_files(job)
-    with stop_signals(continuous=not (job.seconds or job.decisions)) as stop:
-        return _run_job(job, started_ns or time.perf_counter_ns(), stop)
+    continuous, watchdog = not (job.seconds or job.decisions), None
+    with stop_signals(continuous=continuous) as stop, ExitStack() as watched:
+        if ends_process:
+            from pans.runtime.watch import Watchdog
+
+            watchdog = watched.enter_context(Watchdog(continuous=continuous))
+        return _run_job(job, started_ns or time.perf_counter_ns(), _Ending(stop, watchdog))
+
+
+class _Ending(NamedTuple):
+    """How a run may be ended from outside: asked to, or by force."""
+
+    stop: Stop
+    watchdog: Watchdog | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +161,7 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, n_objects * job.trials)
 
 
-def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
+def _run_job(job: Job, started_ns: int, ending: _Ending) -> Outcome:
     opening = _Background(lambda: open_link(job.device))
     try:
         ready = _prepare(job, started_ns)
@@ -157,27 +173,27 @@ def _run_job(job: Job, started_ns: int, stop: Stop) -> Outcome:
     link = opening.result()
     try:
         with claimed(job) as job:
-            return _traced(job, ready, link, stop)
+            return _traced(job, ready, link, ending)
     finally:
         link.close()
 
 
-def _traced(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
+def _traced(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
     """Run with a trace, if one is wanted; one that could not be written to its end is told, and ends nothing."""
     from pans.runtime.link.trace import TracedLink
 
     if job.trace is None:
-        return _recorded(job, ready, link, stop)
+        return _recorded(job, ready, link, ending)
     traced = TracedLink(link, job.trace, job.device, force=job.force)
     try:
-        return _recorded(job, ready, traced, stop)
+        return _recorded(job, ready, traced, ending)
     finally:
         traced.close()
         if traced.trouble:
             say(f"pans: {job.trace}: the trace is not whole: {traced.trouble}")
 
 
-def _recorded(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
+def _recorded(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
     from pans.runtime.container import read_file
     from pans.runtime.live import Recovery
     from pans.runtime.live.continuous import open_recorder
@@ -185,26 +201,26 @@ def _recorded(job: Job, ready: _Prepared, link: Link, stop: Stop) -> Outcome:
     bundle_bytes = read_file(job.bundle_path)
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
     if job.recording is None:
-        result = _watched(job, ready, link, None, recovery, stop)
+        result = _watched(job, ready, link, None, recovery, ending)
         return _conclude(job, ready, result, _summary(job, ready, result))
     limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
     with open_recorder(job.recording, header, bundle_bytes, limits, force=job.force) as recorder:
-        result = _watched(job, ready, link, recorder, recovery, stop)
+        result = _watched(job, ready, link, recorder, recovery, ending)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
     return _conclude(job, ready, result, summary)
 
 
 def _watched(
-    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, stop: Stop
+    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, ending: _Ending
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
     from pans.runtime.live import LiveRun, Observers, run_live
-    from pans.runtime.live.continuous import Attendants
     from pans.runtime.live.view import live_view
+    from pans.runtime.watch import Attendants
 
-    bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder)
+    bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder, ending.watchdog)
     title = f"{bundle.name} on {job.profile.name}"
     show = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
     with seen, show if job.shows else nullcontext() as watch:
@@ -220,7 +236,7 @@ def _watched(
             if watch is not None:
                 watch(run, output)
 
-        observers = Observers(look, prepared, stop)
+        observers = Observers(look, prepared, ending.stop)
         return run_live(link, dark.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers)
 
 

@@ -1,8 +1,7 @@
-"""Running for days: recordings in parts, a state file, metrics, and how a signal ends the run.
+"""Running for days: what may be asked for, recordings in parts, and how a signal ends the run.
 
-Owns what lives as long as a run does, and the handlers of signals while it does. `Attendants` are started before the loop asks for
-real-time privileges, so that none of their threads inherits them. A signal becomes a word that the loop reads at the end of its turn, so
-that nothing is cut in its middle; while the loop does not look (setting up, waiting for a lost device, the second time) the signal
+Owns the handlers of signals while a run lives; who watches it is watch's. A signal becomes a word that the loop reads at the end of its
+turn, so that nothing is cut in its middle; while the loop does not look (setting up, waiting for a lost device, the second time) the signal
 interrupts as Ctrl-C does.
 """
 
@@ -10,19 +9,16 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the options must not load what a run needs
     from pans.runtime.record import AnyRecorder
     from pans.runtime.record.part_keeper import PartLimits
-
-    from .run import LiveRun
 
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"
@@ -46,46 +42,6 @@ def open_recorder(
     if limits is None:
         return Recorder(path, header, bundle=bundle, overwrite=force)
     return PartedRecorder(path, header, limits, bundle=bundle, overwrite=force)
-
-
-class Attendants:
-    """State file and metrics of one run; enter before it, `prepared` when it is there."""
-
-    def __init__(self, wanted: Continuous, recorder: AnyRecorder | None) -> None:
-        self._wanted, self._recorder = wanted, recorder
-        self._run: LiveRun | None = None
-        self._started_s = time.monotonic()
-        self._open = ExitStack()
-        self.metrics_url = ""
-
-    def __enter__(self) -> Self:
-        from .metrics import MetricsServer
-        from .state_file import StateFile
-
-        with ExitStack() as opening:
-            if self._wanted.metrics:
-                server = MetricsServer(self._wanted.metrics, self.look)
-                opening.callback(server.close)
-                self.metrics_url = f"http://{server.host}:{server.port}/metrics"
-            if self._wanted.state is not None:
-                opening.callback(StateFile(self._wanted.state, self.look).close)
-            self._open = opening.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.close()
-
-    def prepared(self, run: LiveRun) -> None:
-        """Show `run` from here on."""
-        self._run = run
-
-    def look(self) -> dict[str, Any]:
-        """Return the picture as it is now."""
-        from .state_file import picture_of
-
-        return picture_of(self._run, self._recorder, self._started_s)
 
 
 class Stop:

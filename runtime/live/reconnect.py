@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.base import Link, open_link
@@ -90,8 +90,13 @@ def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: C
     run.journal.note("link_lost", reason=error.message)
     run.journal.clock(run.connection)
     run.count_decoded()
+
+    def pause(seconds: float) -> None:
+        run.turned_s = time.monotonic()
+        recovery.pause(seconds)
+
     try:
-        run.connection, attempts = reconnect(recovery, run.connection, run.outage_ns, prepare)
+        run.connection, attempts = reconnect(replace(recovery, pause=pause), run.connection, run.outage_ns, prepare)
     except LinkError as failure:
         run.lose_link(failure)
         return

@@ -107,6 +107,8 @@ class LiveRun:
         self.ended = ""
         self.link_lost = False
         self.reconnects = 0
+        self.turned_s = time.monotonic()  # the loop's heartbeat: when it turned last
+        self.stops = False  # the device is being told to go dark
         self.outage_ns: int | None = None  # since when there has been no block
         self.decoded: Counter[str] = Counter()  # what the connections that are gone have counted
         self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
@@ -158,6 +160,7 @@ class LiveRun:
         give_up_ns = self.now_ns() + (0 if self.link_lost else STOP_GIVE_UP_NS)
         try:
             session.submit(Opcode.STOP)
+            self.stops = True
             while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
                 self.take(self.connection.pump(POLL_S))
         except LinkError as error:
@@ -207,6 +210,7 @@ class LiveRun:
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
+        self.turned_s = time.monotonic()
         looked_ns = self.now_ns()
         outputs = self.take(self.connection.pump(self.lateness.poll_s(looked_ns)))
         now_ns = self.now_ns()

@@ -19,10 +19,11 @@ from pans.runtime.container import canonical_json
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.record import PartedRecorder
 
-if TYPE_CHECKING:
-    from pans.runtime.record import AnyRecorder
+from .heartbeat import is_stalled, loop_age_s
 
-    from .run import LiveRun
+if TYPE_CHECKING:
+    from pans.runtime.live import LiveRun
+    from pans.runtime.record import AnyRecorder
 
 FORMAT = "pans-state 1"
 EVERY_S = 1.0
@@ -48,7 +49,8 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
     incidents, trouble = run.lateness.incidents, run.journal.trouble
     return picture | {
-        "state": "stopped" if run.ended else "running" if run.outage_ns is None else "device lost",
+        "state": _state_of(run),
+        "loop_age_s": round(loop_age_s(run), 3),
         "ended": run.ended,
         "decisions": run.core.n_decisions,
         "late": timing.late,
@@ -64,6 +66,14 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
         "reconnects": run.reconnects,
         "last_error": "" if trouble is None else f"{trouble.get('kind')}: {_reason(trouble)}",
     }
+
+
+def _state_of(run: LiveRun) -> str:
+    if run.ended:
+        return "stopped"
+    if is_stalled(run):
+        return "stalled"
+    return "running" if run.outage_ns is None else "device lost"
 
 
 def _reason(event: dict[str, Any]) -> str:
@@ -89,6 +99,7 @@ class StateFile:
         self.trouble = ""
         self._look, self._beside = look, path.with_name(f".{path.name}.{os.getpid()}.partial")
         self._ending = threading.Event()
+        self._left: dict[str, Any] = {}
         self._write()
         self._thread = threading.Thread(target=self._keep, name="pans-state", daemon=True)
         self._thread.start()
@@ -99,13 +110,18 @@ class StateFile:
         self._thread.join(GOODBYE_S)
         self._write()
 
+    def leave(self, facts: dict[str, Any]) -> None:
+        """Write once more, with `facts` in place of what the run says of itself; they stay."""
+        self._left = facts
+        self._write()
+
     def _keep(self) -> None:
         while not self._ending.wait(EVERY_S):
             self._write()
 
     def _write(self) -> None:
         try:
-            self._beside.write_bytes(canonical_json(self._look()) + b"\n")
+            self._beside.write_bytes(canonical_json(self._look() | self._left) + b"\n")
             os.replace(self._beside, self.path)
         except OSError as error:  # a run does not end because nobody can watch it
             self.trouble = str(error)

@@ -19,11 +19,11 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
-from pans.runtime.live.metrics import FIGURES, MetricsServer, parse_address
-from pans.runtime.live.state_file import FORMAT, StateFile, picture_of
 from pans.runtime.record import read_recording
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
+from pans.runtime.watch.metrics import FIGURES, MetricsServer, parse_address
+from pans.runtime.watch.state_file import FORMAT, StateFile, picture_of
 
 
 def test_the_state_file_is_always_whole(tmp_path: Path) -> None:

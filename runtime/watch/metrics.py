@@ -27,6 +27,7 @@ FIGURES = {
     "rss_bytes": ("pans_resident_memory_bytes", False, "Resident memory"),
     "handles": ("pans_open_handles", False, "Open file handles"),
     "threads": ("pans_threads", False, "Threads"),
+    "loop_age_s": ("pans_loop_age_seconds", False, "Since the loop turned last"),
     "uptime_s": ("pans_uptime_seconds", False, "Since the start of the command"),
     "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
 }
@@ -64,7 +65,7 @@ class Collector:
             for cause, count in picture.get(key, {}).items():
                 family.add_metric([cause], count)
             yield family
-        running = GaugeMetricFamily("pans_running", "1 while the device measures")
+        running = GaugeMetricFamily("pans_running", "1 while the device measures and the loop turns")
         running.add_metric([], float(picture.get("state") == "running"))
         yield running
 

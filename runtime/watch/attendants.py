@@ -1,0 +1,80 @@
+"""What lives as long as a run does: state file, metrics, systemd's messages, and the watchdog's knowledge of the run.
+
+Owns their beginning and end. They are started before the loop asks for real-time privileges, so that none of their threads inherits them.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from pans.runtime.live import LiveRun
+    from pans.runtime.live.continuous import Continuous
+    from pans.runtime.record import AnyRecorder
+
+    from .state_file import StateFile
+    from .systemd import Notifier
+    from .watchdog import Watchdog
+
+
+class Attendants:
+    """State file, metrics and messages of one run; enter before it, `prepared` when it is there."""
+
+    def __init__(self, wanted: Continuous, recorder: AnyRecorder | None, watchdog: Watchdog | None = None) -> None:
+        self._wanted, self._recorder, self._watchdog = wanted, recorder, watchdog
+        self._run: LiveRun | None = None
+        self._state: StateFile | None = None
+        self._notifier: Notifier | None = None
+        self._started_s = time.monotonic()
+        self._open = ExitStack()
+        self.metrics_url = ""
+
+    def __enter__(self) -> Self:
+        from .metrics import MetricsServer
+        from .state_file import StateFile
+        from .systemd import Notifier
+
+        with ExitStack() as opening:
+            if self._wanted.metrics:
+                server = MetricsServer(self._wanted.metrics, self.look)
+                opening.callback(server.close)
+                self.metrics_url = f"http://{server.host}:{server.port}/metrics"
+            if self._wanted.state is not None:
+                self._state = StateFile(self._wanted.state, self.look)
+                opening.callback(self._state.close)
+            self._notifier = Notifier.of_environment()
+            if self._notifier is not None:
+                opening.callback(self._notifier.close)
+            self._open = opening.pop_all()
+        if self._watchdog is not None:
+            self._watchdog.watch(self._recorder, self._told)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._watchdog is not None:
+            self._watchdog.closes()
+        self._open.close()
+
+    def prepared(self, run: LiveRun) -> None:
+        """Show `run` from here on."""
+        self._run = run
+        if self._watchdog is not None:
+            self._watchdog.run = run
+        if self._notifier is not None:
+            self._notifier.begin(run)
+
+    def look(self) -> dict[str, Any]:
+        """Return the picture as it is now."""
+        from .state_file import picture_of
+
+        return picture_of(self._run, self._recorder, self._started_s)
+
+    def _told(self, why: str) -> None:
+        """The watchdog ends the process: leave word."""
+        if self._state is not None:
+            self._state.leave({"state": "stalled", "ended": why})

@@ -1,0 +1,109 @@
+"""A run that hangs: it says so within two seconds, its light goes off, and SIGTERM ends it within five, with a word about where it was."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from host_process import HANGS, lit_instrument, start_host, until
+
+from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_TIMING
+from pans.runtime.record import read_recording, replay
+from pans.runtime.report.verify import verify_file
+from pans.runtime.watch.heartbeat import is_stalled
+from pans.runtime.watch.systemd import Notifier
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forkserver, signals and /proc")
+STALLED_S, ENDED_S = 2.0, 5.0  # the bars
+SLACK_S = 0.5  # two processors, many tests
+LEASE_MS = {
+    "python": 20_000,
+    "native": 500,
+    "file": 500,
+}  # the first is so long that the watchdog's STOP comes before it
+
+
+def hang_and_end(folder: Path, how: str) -> dict[str, Any]:
+    """Let a run hang, ask it to end, and return when what happened, in s."""
+    folder.mkdir()
+    limits = ["--seconds", "600"] if how == "native" else []
+    with lit_instrument() as lit:
+        host = start_host(folder, lit.url, LEASE_MS[how], limits, hang=how)
+        try:
+            hung_s = until((folder / "hung").exists)
+            until(lambda: host.state().get("state") == "stalled")
+            stalled_s = time.perf_counter() - hung_s
+            until(lambda: how == "python" or not lit.device.projector_lit)
+            lit_s = lit.dark_s() - hung_s
+            asked_s = time.perf_counter()
+            host.signal(signal.SIGTERM)
+            code = host.code()
+            ended_s = time.perf_counter() - asked_s
+            if how == "python":
+                until(lambda: not lit.device.projector_lit)
+                lit_s = lit.dark_s() - asked_s
+            return {
+                **{"stalled_s": stalled_s, "lit_s": lit_s, "ended_s": ended_s, "code": code, "errors": host.errors()},
+                **{"state": host.state(), "recording": host.recording},
+            }
+        finally:
+            host.process.kill()
+
+
+def test_a_run_that_hangs_says_so_goes_dark_and_can_be_ended(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(3) as pool:
+        found = dict(zip(HANGS, pool.map(lambda how: hang_and_end(tmp_path / how, how), HANGS)))
+    for how, one in found.items():
+        print(how, one)
+        assert one["stalled_s"] < STALLED_S + SLACK_S, how
+        assert one["ended_s"] < ENDED_S + SLACK_S, how
+        assert one["code"] == (EXIT_INTERRUPTED if how == "native" else EXIT_TIMING), how
+        assert one["state"]["state"] == "stalled"
+        assert "the run did not end by itself; it was in _hang" in one["state"]["ended"], how
+        assert "it was in _hang" in one["errors"]
+        # lit until the lease runs out, or until the watchdog says STOP
+        assert one["lit_s"] < (2.5 if how == "python" else LEASE_MS[how] / 1000) + SLACK_S, how
+        recording = read_recording(one["recording"])
+        assert not recording.complete
+        assert not verify_file(one["recording"]).damaged
+        if how == "file":
+            assert replay(recording, recording.bundle()).as_recorded
+        else:
+            assert recording.n_decisions >= 20, "what was buffered is on record"
+
+
+def test_the_loop_alone_is_spoken_for_to_systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(address))
+        monkeypatch.setenv("WATCHDOG_USEC", "30000")
+        notifier = Notifier.of_environment()
+        assert notifier is not None
+        run: Any = SimpleNamespace(turned_s=time.monotonic(), outage_ns=None, ended="")
+        notifier.begin(run)
+        assert [manager.recv(99) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"WATCHDOG=1"]
+        run.turned_s -= 10
+        assert is_stalled(run)
+        time.sleep(0.05)
+        manager.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            while True:
+                manager.recv(99)
+        time.sleep(0.1)
+        with pytest.raises(BlockingIOError):
+            manager.recv(99)
+        notifier.close()
+        assert manager.recv(99) == b"STOPPING=1"
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    assert Notifier.of_environment() is None
+    assert os.environ["WATCHDOG_USEC"]
