@@ -7,6 +7,7 @@ and no PASS where the evidence contradicts what was said. Host, instrument and r
 
 from __future__ import annotations
 
+import os
 import random
 import struct
 import time
@@ -40,6 +41,7 @@ from pans.runtime.wire.messages import NO_OBJECT, STRUCTS, DeviceState, Malforme
 
 OBJECTS = 12
 SHOTS = 1
+MAX_MEMORY_MIB = 400  # of the process, after any number of sessions
 MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
 EDGES = (0, 1, 2, 1 << 15, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 REALS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 3e38, 1e-45)
@@ -172,10 +174,10 @@ class MutatedLink:
             return True
         if mutation.message == "WELCOME":
             return bool(wrong_facts(decoded.facts))
+        if len(self._mutations) > 1:
+            return False  # the other one may make it a message that is dropped: of another probe, or of an earlier run
         if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
             return False  # of no run, or of one that has not begun
-        if mutation.message == "PONG" and len(self._mutations) > 1:
-            return False  # with another probe id it answers nothing, and is dropped
         place = [one.name for one in MESSAGES[mutation.message]].index(mutation.name)
         values = [STRUCTS[mutation.message].unpack_from(payload)[place] for payload in (old, new)]
         return self._evidence.excludes(mutation.message, mutation.name, *values)
@@ -342,3 +344,11 @@ def _ending(session: Session) -> str:
         return "refused"
     assert session.summary is not None
     return "unchanged" if not session.changed else session.summary.verdict.lower()
+
+
+def resident_mib() -> int:
+    """Return the resident memory of this process in MiB; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
+    except (OSError, ValueError):
+        return 0

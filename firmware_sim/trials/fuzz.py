@@ -35,6 +35,7 @@ from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
 from . import Report, Trial, figures_text
+from .fields import MAX_MEMORY_MIB, resident_mib, sessions
 
 BATCH_BYTES = 1 << 16
 BATCH_FRAMES = 200
@@ -344,6 +345,7 @@ class Settings:
     bytes: int = option(100_000_000, "random bytes (default 100 million)")
     frames: int = option(1_000_000, "structured frames (default one million)")
     files: int = option(0, "instead of those: changed files with right checksums, verified and used")
+    fields: int = option(0, "instead of those: whole sessions in which a field says something else")
     seed: int = option(1, "the first seed (default 1)")
     parts: int = option(20, "seeds that the work is divided over (default 20)")
 
@@ -352,6 +354,8 @@ def run(settings: Settings) -> Report:
     """Send it, seed by seed, until something is found."""
     if settings.files:
         return _run_files(settings)
+    if settings.fields:
+        return _run_sessions(settings)
     started = time.perf_counter()
     total: dict[str, float] = {}
     parts = settings.parts
@@ -380,6 +384,18 @@ def _run_files(settings: Settings) -> Report:
             return Report({**figures, "failed_seed": seed}, False, "")
     told = {**figures, "failed_seed": None, "seconds": time.perf_counter() - started}
     return Report(told, True, figures_text(told))
+
+
+def _run_sessions(settings: Settings) -> Report:
+    started = time.perf_counter()
+    ended, wrong = sessions(settings.seed, settings.fields)
+    for one in wrong:
+        say(one)
+    figures: dict[str, Any] = {"sessions": ended.total(), **{f"sessions_{how}": n for how, n in sorted(ended.items())}}
+    figures |= {"memory_mib": resident_mib(), "seconds": time.perf_counter() - started}
+    failed = next((int(one.split()[1].rstrip(",")) for one in wrong), None)
+    passed = not wrong and figures["memory_mib"] < MAX_MEMORY_MIB
+    return Report({**figures, "failed_seed": failed}, passed, figures_text({**figures, "failed_seed": failed}))
 
 
 TRIAL = Trial(Settings, run)

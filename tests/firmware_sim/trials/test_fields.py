@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 
 from pans.firmware_sim.trials.fields import Mutation, Session, Stage, by, sessions, to
+from pans.runtime.cli import main
 from pans.runtime.commands.carry_out import _exit_code
 
 ALL = 1 << 30
@@ -90,3 +92,9 @@ def test_any_field_of_any_message_is_taken_or_refused_without_a_traceback() -> N
     seed = secrets.randbelow(1 << 40)
     _, wrong = sessions(seed, 30)
     assert wrong == [], f"sessions({seed}, 30)"
+
+
+def test_the_command_reports_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fuzz", "--fields", "8", "--seed", str(secrets.randbelow(1 << 40)), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["sessions"], figures["failed_seed"]) == (8, None)
