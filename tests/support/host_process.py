@@ -1,7 +1,7 @@
 """The process simulator: `pans run` in a process of its own against an instrument in this one, stopped, killed or hung at any stage.
 
 Owns the child, the stages of a run at which it can be met, and the instrument's log of its light. The child is the ordinary command; at a
-stage it says so on a pipe and lingers for a moment, so that a signal that is sent then meets it there.
+stage it says so on a pipe and waits to be let go, so that a signal meets it there.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from typing import Any
 
+import pytest
 from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
@@ -32,8 +34,7 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.decide import Verdict
 from pans.runtime.instrument.profile import load_profile
 
-LINGER_S = 0.05
-# stage -> where the child is met: module, class or "" and name; the call before which it lingers
+# stage -> where the child is met: module, class or "" and name; the call before which it waits
 STAGES = {
     "opening": ("pans.runtime.commands.carry_out", "", "open_link", 1),
     "handshake": ("pans.runtime.link.connection", "Connection", "handshake", 1),
@@ -123,8 +124,8 @@ def _hang(how: str) -> None:
         os.read(os.pipe()[0], 1)
 
 
-def _meet(stage: str, said: int) -> None:
-    """Have this process linger where `stage` begins."""
+def _meet(stage: str, said: int, go: int) -> None:
+    """Have this process wait where `stage` begins."""
     module, owner, name, wanted = STAGES[stage]
     place: Any = importlib.import_module(module)
     place = getattr(place, owner) if owner else place
@@ -134,13 +135,13 @@ def _meet(stage: str, said: int) -> None:
         calls[0] += 1
         if calls[0] == wanted:
             os.write(said, b"x")
-            time.sleep(LINGER_S)
+            os.read(go, 1)
         return original(*args, **options)
 
     setattr(place, name, met)
 
 
-def _child(words: list[str], stage: str, said: Any, folder: str, environment: dict[str, str]) -> None:
+def _child(words: list[str], stage: str, pipes: Any, folder: str, environment: dict[str, str]) -> None:
     out = os.open(f"{folder}/stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     errors = os.open(f"{folder}/stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(out, 1)
@@ -152,7 +153,7 @@ def _child(words: list[str], stage: str, said: Any, folder: str, environment: di
     if environment.get("HANG") == "file":
         _hang_in_writes()
     if stage:
-        _meet(stage, said.fileno())
+        _meet(stage, *(pipe.fileno() for pipe in pipes))
     code = main(words)
     sys.stdout.flush()
     os._exit(code)
@@ -179,6 +180,7 @@ class Host:
     folder: Path
     process: Any
     said: Any
+    goes: Any
     facts: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -194,13 +196,19 @@ class Host:
             return {}
 
     def wait_for_stage(self) -> None:
-        """Wait until it lingers at its stage."""
+        """Wait until it waits at its stage."""
         assert self.said.poll(60), self.errors()
         os.read(self.said.fileno(), 1)
 
+    def let_go(self) -> None:
+        """Let it go on from its stage."""
+        with suppress(BrokenPipeError):
+            os.write(self.goes.fileno(), b"x")
+
     def signal(self, signum: int) -> None:
-        """Send it a signal."""
-        os.kill(self.process.pid, signum)
+        """Send it a signal, if it is still there."""
+        with suppress(ProcessLookupError):
+            os.kill(self.process.pid, signum)
 
     def code(self, patience_s: float = 60.0) -> int:
         """Wait for its end and return its exit code."""
@@ -214,7 +222,7 @@ class Host:
 
 
 def start_host(folder: Path, url: str, lease_ms: int, words: list[str], *, stage: str = "", hang: str = "") -> Host:
-    """Start `pans run` on the instrument at `url` with `words`; it lingers at `stage`, hangs as `hang` says."""
+    """Start `pans run` on the instrument at `url` with `words`; it waits at `stage`, hangs as `hang` says."""
     bundle, profile = write_inputs(folder, lease_ms)
     offer_backend(folder / "packages")
     fixed = ["run", str(bundle), "--device", url, "--profile", str(profile), "--no-realtime", "--json"]
@@ -223,12 +231,26 @@ def start_host(folder: Path, url: str, lease_ms: int, words: list[str], *, stage
         places += ["--backend", "hanging"]
     environment = {"HANG": hang, "HUNG": str(folder / "hung"), "OMP_NUM_THREADS": "1"}
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pans.firmware_sim.trials.kills"])
-    hears, tells = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=([*fixed, *places, *words], stage, tells, str(folder), environment))
-    process.start()
+    (hears, tells), (waits, goes) = context.Pipe(duplex=False), context.Pipe(duplex=False)
+    parts = ([*fixed, *places, *words], stage, (tells, waits), str(folder), environment)
+    process = context.Process(target=_child, args=parts)
+    with _SERVER:
+        _start_server(context)
+        process.start()
     tells.close()
-    return Host(folder, process, hears)
+    waits.close()
+    return Host(folder, process, hears, goes)
+
+
+_SERVER = threading.Lock()
+
+
+def _start_server(context: Any) -> None:
+    """Start the server of the hosts, unless it is there; it finds `warm_host` by PYTHONPATH alone."""
+    context.set_forkserver_preload(["warm_host"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        ensure_running()
 
 
 def until(condition: Callable[[], object], patience_s: float = 60.0) -> float:
