@@ -76,20 +76,34 @@ def locked(path: Path) -> Iterator[None]:
             if not _is_still(path, handle):  # the holder before removed it between our two calls
                 os.close(handle)
                 handle = -1
-        os.ftruncate(handle, 0)
-        os.write(handle, f"{os.getpid()}\n".encode())
+        _sign(path, handle)
     except OSError as error:
-        if handle >= 0:
-            os.close(handle)
+        _close(handle)
         raise UsageError(f"{path}: cannot be locked: {error.strerror or error}") from error
     except UsageError:
-        os.close(handle)
+        _close(handle)
         raise
     try:
         yield
     finally:
         with suppress(OSError):
             os.unlink(path)
+        os.close(handle)
+
+
+def _sign(path: Path, handle: int) -> None:
+    """Write whose lock it is; where that fails the file goes."""
+    try:
+        os.ftruncate(handle, 0)
+        os.write(handle, f"{os.getpid()}\n".encode())
+    except OSError:
+        with suppress(OSError):
+            os.unlink(path)
+        raise
+
+
+def _close(handle: int) -> None:
+    if handle >= 0:
         os.close(handle)
 
 

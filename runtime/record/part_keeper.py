@@ -16,6 +16,7 @@ import shutil
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -142,8 +143,9 @@ class PartKeeper:
             self._thread.join(LONGEST_END_S)
         while not self.ready.empty():
             unused = self.ready.get()
-            unused.__exit__(None, None, None)
-            unused.path.unlink(missing_ok=True)
+            with suppress(OSError, PansError):  # the disk is gone: it keeps its hidden name
+                unused.__exit__(None, None, None)
+                unused.path.unlink(missing_ok=True)
 
     def _keep(self) -> None:
         while True:
