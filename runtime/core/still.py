@@ -17,7 +17,7 @@ from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, Fra
 
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
-from .follower import Follower
+from .follower import ANY_CLASS, Follower
 from .plan import Plan
 from .window import DecisionWindows, Window
 
@@ -28,7 +28,7 @@ class Core(Follower):
     """Stream tracker, windows and back end joined up, for objects that stand still."""
 
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
-        super().__init__(plan, n_cycles, decider.n_classes)
+        super().__init__(plan, n_cycles, decider.n_classes or ANY_CLASS)  # 0: pictures
         self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots
