@@ -9,6 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from pans.runtime.cli import say
 from pans.runtime.errors import UsageError
 from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
 from pans.runtime.instrument.calibration import MAX_AGE_H
@@ -124,6 +125,9 @@ def add_continuous_options(parser: argparse.ArgumentParser) -> None:
         metavar="HOST:PORT",
         help="serve figures for Prometheus; a port alone: this machine only",
     )
+    group.add_argument(
+        "--metrics-public", action="store_true", help="let other machines read the figures; there is no password"
+    )
 
 
 def continuous_of(args: argparse.Namespace) -> Continuous:
@@ -141,4 +145,17 @@ def continuous_of(args: argparse.Namespace) -> Continuous:
     from pans.runtime.record.part_keeper import PartLimits
 
     limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None
-    return Continuous(limits, getattr(args, "state", None), getattr(args, "metrics", ""))
+    return Continuous(limits, getattr(args, "state", None), _metrics_of(args))
+
+
+def _metrics_of(args: argparse.Namespace) -> str:
+    """Return the address for metrics, checked; one that others can reach is said aloud."""
+    address = str(getattr(args, "metrics", ""))
+    if not address:
+        return ""
+    from pans.runtime.watch.metrics import check_address, is_public
+
+    check_address(address, public=args.metrics_public)
+    if is_public(address):
+        say(f"pans: warning: other machines can read the figures at {address}; there is no password")
+    return address

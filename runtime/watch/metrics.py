@@ -1,15 +1,18 @@
 """The run's figures for Prometheus: a small HTTP server that answers with the same picture as the state file.
 
-Owns names, types and the address; the figures are state_file.py's. On this machine only, unless another address is given: there is no
-password. Needs the extra `metrics`; its server runs in a thread of its own, and an answer costs the loop what that thread's Python does.
+Owns names, types and the address; the figures are state_file.py's, the server http.py's. On this machine only, unless it is said twice that
+others may read: there is no password. Needs the extra `metrics`; an answer costs the loop what one thread's Python does, within limits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from ipaddress import ip_address
 from typing import Any
 
 from pans.runtime.errors import UsageError
+
+from .http import PageServer
 
 LOOPBACK = "127.0.0.1"
 # picture key -> (metric, counts up, help)
@@ -46,6 +49,29 @@ def parse_address(text: str) -> tuple[str, int]:
     return host or LOOPBACK, int(port)
 
 
+def check_address(text: str, *, public: bool) -> str:
+    """Return `text`; UsageError if it is no address, or one that other machines can reach without `public`."""
+    host, _ = parse_address(text)
+    if not (public or _is_loopback(host)):
+        raise UsageError(
+            f"--metrics {text}: other machines could read the figures there, and there is no password",
+            remedy="use 127.0.0.1, or say --metrics-public if that is meant",
+        )
+    return text
+
+
+def is_public(text: str) -> bool:
+    """Whether other machines can reach this address."""
+    return not _is_loopback(parse_address(text)[0])
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 class Collector:
     """What prometheus_client asks for figures, at each scrape."""
 
@@ -76,7 +102,7 @@ class MetricsServer:
     def __init__(self, address: str, look: Callable[[], dict[str, Any]]) -> None:
         host, port = parse_address(address)
         try:
-            from prometheus_client import CollectorRegistry, start_http_server
+            from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
         except ImportError as error:
             raise UsageError(
                 "--metrics needs prometheus-client, which is not installed",
@@ -85,15 +111,13 @@ class MetricsServer:
         registry = CollectorRegistry(auto_describe=False)
         registry.register(Collector(look))
         try:
-            self._server, self._thread = start_http_server(port, addr=host, registry=registry)
+            self._server = PageServer(host, port, CONTENT_TYPE_LATEST, lambda: generate_latest(registry))
         except OSError as error:
             raise UsageError(
                 f"--metrics {address}: cannot listen there: {error.strerror or error}", remedy="choose another port"
             ) from error
-        self.host, self.port = host, int(self._server.server_port)
+        self.host, self.port = host, self._server.port
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._server.close()

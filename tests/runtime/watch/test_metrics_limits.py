@@ -1,0 +1,119 @@
+"""The metrics' server under clients that mean no good: bounded threads, connections, time and processor, and scrapes still answered."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+
+from pans.runtime.errors import UsageError
+from pans.runtime.watch.http import HEADER_MAX_BYTES, MAX_CLIENTS, REQUEST_S, PageServer
+from pans.runtime.watch.metrics import check_address, is_public
+
+HALF_OPEN = 300
+
+
+@pytest.fixture
+def server() -> Iterator[PageServer]:
+    one = PageServer("127.0.0.1", 0, "text/plain", lambda: b"figures\n" * 2000)
+    yield one
+    one.close()
+
+
+def dial(server: PageServer, words: bytes = b"") -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", server.port), timeout=10)
+    client.sendall(words)
+    return client
+
+
+def scrape(server: PageServer, path: str = "/metrics") -> bytes:
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}{path}", timeout=10) as answer:
+        return bytes(answer.read())
+
+
+def all_of(client: socket.socket) -> bytes:
+    data = b""
+    try:
+        while piece := client.recv(1 << 16):
+            data += piece
+    except ConnectionResetError:
+        pass
+    return data
+
+
+def test_half_open_connections_cost_nothing_and_shut_nobody_out(server: PageServer) -> None:
+    threads = threading.active_count()
+    held, began_s = [dial(server, b"GET /metrics HTTP/1.1\r\nX: ")], time.monotonic()
+    processor_s = time.process_time()
+    for number in range(HALF_OPEN - 1):
+        held.append(dial(server, b"GET" if number % 2 else b""))
+        assert len(server._clients) <= MAX_CLIENTS
+        if number % 100 == 50:
+            assert len(scrape(server)) == 16_000
+    assert threading.active_count() == threads
+    print(f"{time.process_time() - processor_s:.3f} s of processor in {time.monotonic() - began_s:.3f} s")
+    assert len(scrape(server)) == 16_000
+    time.sleep(REQUEST_S + 1)
+    assert server._clients == {}
+    before_s = time.process_time()
+    time.sleep(0.5)
+    assert time.process_time() - before_s < 0.1, "an idle server sleeps"
+    assert all(all_of(client) == b"" for client in held)
+    for client in held:
+        client.close()
+
+
+def test_an_endless_header_and_a_slow_reader_are_cut_off(server: PageServer) -> None:
+    with dial(server, b"GET / HTTP/1.1\r\nX: " + b"x" * (HEADER_MAX_BYTES + 1000)) as client:
+        assert all_of(client).startswith(b"HTTP/1.1 431")
+    began_s = time.monotonic()
+    with dial(server, b"GET / HTTP/1.1\r\n") as client:
+        assert all_of(client) == b""
+    assert REQUEST_S <= time.monotonic() - began_s < REQUEST_S + 2
+    assert len(scrape(server)) == 16_000
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        (b"POST / HTTP/1.1", b"405"),
+        (b"GET /secret HTTP/1.1", b"404"),
+        (b"GET /", b"400"),
+        (b"\0\xff", b"400"),
+        (b"HEAD /metrics?x=1 HTTP/1.0", b"200"),
+    ],
+)
+def test_requests(server: PageServer, words: bytes, status: bytes) -> None:
+    with dial(server, words + b"\r\n\r\n") as client:
+        answer = all_of(client)
+    assert answer.startswith(b"HTTP/1.1 " + status)
+    assert answer.endswith(b"\r\n\r\n")
+
+
+def test_a_page_that_cannot_be_made_ends_nothing() -> None:
+    pages = iter([b"one"])
+    server = PageServer("127.0.0.1", 0, "text/plain", lambda: next(pages))
+    try:
+        assert scrape(server) == b"one"
+        time.sleep(0.3)
+        with pytest.raises(urllib.error.HTTPError, match="500"):
+            scrape(server)
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            scrape(server, "/other")
+    finally:
+        server.close()
+
+
+def test_only_this_machine_unless_it_is_said() -> None:
+    for text in ("9464", "127.0.0.1:1", "[::1]:1", "localhost:1", "127.8.8.8:1"):
+        assert check_address(text, public=False) == text
+        assert not is_public(text)
+    for text in ("0.0.0.0:1", "[::]:1", "192.168.1.2:1", "lab.example:1"):
+        with pytest.raises(UsageError, match="no password"):
+            check_address(text, public=False)
+        assert check_address(text, public=True) == text
