@@ -10,10 +10,12 @@ from __future__ import annotations
 import os
 import random
 import struct
+import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,12 +26,14 @@ import numpy as np
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import Scene, scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
+from pans.runtime.link.base import Link, open_link
 from pans.runtime.live import RunConfig, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
@@ -262,10 +266,10 @@ class Session:
 
 
 class Stage:
-    """What sessions of one mode have in common, made once."""
+    """What sessions of one mode have in common, made once; `over` is virtual, or tcp: a socket to a thread, in real time."""
 
-    def __init__(self, mode: str) -> None:
-        self.mode = mode
+    def __init__(self, mode: str, over: str = "virtual") -> None:
+        self.mode, self._over = mode, over
         self.profile, self.bundle, self.plan = small_setup(mode)
         images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
         self.scene: Scene = scene_from_arrays("fields", images, np.arange(6) % 3, ("a", "b", "c"))
@@ -295,10 +299,14 @@ class Stage:
 
     def _run(self, path: Path, seed: int, session: Session) -> None:
         clock = DeviceClock(self.profile.clock.tick_hz)
-        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
+        start_ns = START_NS if self._over == "virtual" else time.perf_counter_ns()
+        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(start_ns))
         exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
         evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
-        link = MutatedLink(VirtualLink(device, clock, "fields"), session.mutations, evidence)
+        with virtual_link(device, clock) if self._over == "virtual" else tcp_link(device, clock) as way:
+            self._drive(MutatedLink(way, session.mutations, evidence), path, session)
+
+    def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         config = RunConfig(SHOTS, OBJECTS * self.plan.cycles_per_object, deadline_us=1e5)
         core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
         header = {"config": {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": "table"}}
@@ -321,9 +329,29 @@ class Stage:
             )
 
 
-def sessions(seed: int, count: int) -> tuple[Counter[str], list[str]]:
+@contextmanager
+def virtual_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
+    """A link to `device` whose time passes while the host waits."""
+    yield VirtualLink(device, clock, "fields")
+
+
+@contextmanager
+def tcp_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
+    """A socket to `device`, which a thread serves in real time."""
+    port, stopped = TcpPort("127.0.0.1", 0), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    try:
+        yield open_link(port.url)
+    finally:
+        stopped.set()
+        thread.join(2.0)
+        port.close()
+
+
+def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str], list[str]]:
     """Run `count` sessions, one mutation each, or two; return how they ended and what was wrong, with the seed of each."""
-    stages = {mode: Stage(mode) for mode in ("sequential", "parallel")}
+    stages = {mode: Stage(mode, over) for mode in ("sequential", "parallel")}
     ended: Counter[str] = Counter()
     wrong: list[str] = []
     with TemporaryDirectory() as folder:

@@ -346,6 +346,7 @@ class Settings:
     frames: int = option(1_000_000, "structured frames (default one million)")
     files: int = option(0, "instead of those: changed files with right checksums, verified and used")
     fields: int = option(0, "instead of those: whole sessions in which a field says something else")
+    over: str = option("virtual", "the link of --fields: virtual, or tcp in real time", choices=("virtual", "tcp"))
     seed: int = option(1, "the first seed (default 1)")
     parts: int = option(20, "seeds that the work is divided over (default 20)")
 
@@ -388,7 +389,7 @@ def _run_files(settings: Settings) -> Report:
 
 def _run_sessions(settings: Settings) -> Report:
     started = time.perf_counter()
-    ended, wrong = sessions(settings.seed, settings.fields)
+    ended, wrong = sessions(settings.seed, settings.fields, settings.over)
     for one in wrong:
         say(one)
     figures: dict[str, Any] = {"sessions": ended.total(), **{f"sessions_{how}": n for how, n in sorted(ended.items())}}

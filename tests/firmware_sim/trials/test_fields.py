@@ -98,3 +98,9 @@ def test_the_command_reports_as_json(capsys: pytest.CaptureFixture[str]) -> None
     assert main(["fuzz", "--fields", "8", "--seed", str(secrets.randbelow(1 << 40)), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert (figures["sessions"], figures["failed_seed"]) == (8, None)
+
+
+def test_over_a_socket_in_real_time_the_host_finds_the_same(tmp_path: Path) -> None:
+    stage = Stage("sequential", "tcp")
+    session = stage.run(tmp_path, 1, Mutation("CLICKS", "object_index", *by(17), most=1))
+    assert "object" in ended(session).contradictions
