@@ -29,7 +29,7 @@ from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import plots
-from .page import Asked, Made, Row, Rows, Table, columns, finished, kept, pages
+from .page import Asked, Made, Row, Rows, Table, check_cached_bundle, columns, finished, kept, pages
 from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
 
 PROFILE = "ideal"
@@ -96,6 +96,7 @@ def make_row(asked: Asked, row: ActiveRow, seed: int = 0) -> Row:
 
     name = asked.name
     bundle_path, figures_path = row_files(asked.cache, name, row.features, seed)
+    check_cached_bundle(bundle_path)
     task, profile = load_task(name, asked.data_dir), load_profile(PROFILE)
     options = replace(recipe(name, row), seed=seed)
     checkpoint = bundle_path.with_suffix(".checkpoint")

@@ -18,9 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import say
-from pans.runtime.errors import UsageError
-from pans.runtime.outputs import make_folder, replace_file
+from pans.runtime.errors import PansError, UsageError
+from pans.runtime.outputs import check_outputs, make_folder, replace_file
 from pans.trainer.options import Options, same_options
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
@@ -217,6 +218,18 @@ def cached_row(path: Path, *keys: str) -> Row | None:
     if not isinstance(found, dict) or not found.keys() >= set(keys):
         raise UsageError(f"{path}: is no finished row", remedy="remove it, or name another folder with --cache")
     return found
+
+
+def check_cached_bundle(path: Path) -> None:
+    """Refuse to replace a bundle in the cache that was not made for a page: UsageError, before a row is trained."""
+
+    def ours(found: Path) -> bool:
+        try:
+            return str(load_bundle(found)[0].provenance.get("command", "")).startswith("pans reproduce ")
+        except PansError:
+            return False
+
+    check_outputs([path], ours=ours)
 
 
 def page_files(folder: Path, name: str, page: Page) -> list[Path]:

@@ -36,7 +36,7 @@ from pans.trainer.train.data import CHUNK, encoder_input
 from pans.trainer.train.loop import Trained, train
 
 from . import images, plots
-from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, finished, pages
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, check_cached_bundle, columns, finished, pages
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
 from .tables import PASSIVE, UNPRINTED, PassiveRow, table_of
 
@@ -70,6 +70,7 @@ def make_cell(asked: Asked, row: PassiveRow, dark: float) -> Row:
     name, data_seed = asked.name, asked.data_seed
     options = recipe(name, row, dark)
     path = _path(asked.cache, name, row.features, dark, data_seed)
+    check_cached_bundle(path.with_suffix(".pans"))
     task, profile = load(name, asked.data_dir, data_seed), load_profile(PROFILE)
     started = time.process_time()
     trained = _trained(name, task, profile, options)

@@ -10,9 +10,21 @@ from tree import ROOT
 
 pytest.importorskip("torch", reason="needs the train extra")
 
+from pans.runtime.errors import UsageError
 from pans.trainer.evaluate.picture_samples import SAMPLES, Samples
 from pans.trainer.paper import PAGES, Made, Page, images, page_of, tables, write_page
-from pans.trainer.paper.page import BEGIN, END, Column, Table, columns, generated
+from pans.trainer.paper.page import (
+    BEGIN,
+    END,
+    Column,
+    Table,
+    cached_row,
+    check_cached_bundle,
+    columns,
+    generated,
+    is_page_file,
+    page_files,
+)
 
 RESULTS = ROOT / "docs" / "results"
 COLUMNS = (Column("d_f", "{features}"), Column("all", "{all.accuracy:.2f %}"), Column("clicks", "{clicks:.1f}"))
@@ -102,3 +114,19 @@ def test_every_model_adds_its_rows_to_the_figure(tmp_path):
         images.samples(tmp_path / "a.png", "task", [(f"model {i}", dataclasses.replace(samples)) for i in range(n)])
         heights.append(image.imread(tmp_path / "a.png").shape[0])
     assert heights[1] / heights[0] == pytest.approx((2 + 2 * SAMPLES) / (2 + SAMPLES), rel=0.1)
+
+
+def test_pages_and_rows_that_are_not_ours_are_left_alone(tmp_path):
+    assert not any(is_page_file(path) for path in page_files(tmp_path, "name", PAGE))
+    write_page(tmp_path, "name", PAGE, Made([ROW], {"-x": lambda path: path.write_bytes(b"png")}))
+    assert all(is_page_file(path) for path in page_files(tmp_path, "name", PAGE))
+    for text in ("notes", "[1]", '{"rows": 1}'):
+        (tmp_path / "name.json").write_text(text)
+        (tmp_path / "name.md").write_text(text)
+        assert not any(is_page_file(path) for path in page_files(tmp_path, "name", PAGE))
+        with pytest.raises(UsageError, match="no finished row"):
+            cached_row(tmp_path / "name.json", "made_with")
+    (tmp_path / "row.pans").write_bytes(b"somebody's")
+    with pytest.raises(UsageError, match="exists already"):
+        check_cached_bundle(tmp_path / "row.pans")
+    check_cached_bundle(tmp_path / "none.pans")
