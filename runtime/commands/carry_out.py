@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
+from pans.runtime.errors import PansError
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 
@@ -96,7 +97,14 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
             from pans.runtime.watch import Watchdog
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
-        return _run_job(job, started_ns or time.perf_counter_ns(), _Ending(stop, watchdog))
+        try:
+            return _run_job(job, started_ns or time.perf_counter_ns(), _Ending(stop, watchdog))
+        except PansError:
+            raise
+        except Exception as error:
+            if stop.raised:  # a library that was being loaded makes an ImportError of the interrupt
+                raise KeyboardInterrupt(stop.word) from error
+            raise
 
 
 class _Ending(NamedTuple):

@@ -50,6 +50,7 @@ class Stop:
     def __init__(self, *, continuous: bool = False) -> None:
         self.word = ""
         self.polled = False
+        self.raised = False  # KeyboardInterrupt, wherever the main thread was
         self._continuous = continuous
 
     def ask(self, signum: int, frame: FrameType | None) -> None:
@@ -57,6 +58,7 @@ class Stop:
         second = bool(self.word)
         self.word = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED
         if second or not self.polled:
+            self.raised = True
             raise KeyboardInterrupt(self.word)
 
 

@@ -7,6 +7,7 @@ stage it says so on a pipe and waits to be let go, so that a signal meets it the
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import importlib
 import json
 import multiprocessing
@@ -146,6 +147,7 @@ def _child(words: list[str], stage: str, pipes: Any, folder: str, environment: d
     errors = os.open(f"{folder}/stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(out, 1)
     os.dup2(errors, 2)
+    faulthandler.enable()
     os.environ.update(environment)
     sys.path.insert(0, f"{folder}/packages")
     from pans.runtime.cli import main

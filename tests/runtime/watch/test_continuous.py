@@ -160,3 +160,17 @@ def _wait_for(condition: Any) -> None:
 def test_what_cannot_be_meant(bundle_file: Path, tmp_path: Path, options: list[str]) -> None:
     words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path)]
     assert main([*words, "--decisions", "4", *options]) == 2
+
+
+def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_stays_an_interrupt(
+    bundle_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def loading(*_: Any) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as interrupt:
+            raise ImportError("initialization failed") from interrupt
+
+    monkeypatch.setattr("pans.runtime.commands.carry_out._prepare", loading)
+    words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path / "out")]
+    assert main([*words, "--decisions", "4"]) == 130
