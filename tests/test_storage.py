@@ -52,7 +52,7 @@ RUN = f"run b.pans --device {DEVICE} --decisions 40 --no-realtime --trace TRACE"
 CASES = {
     "run": Case(f"{RUN} --out out/new", ("out/new/run.pansrec", "out/new/summary.md")),
     "run in parts": Case(
-        f"{RUN} --decisions 150 --rotate-mb 0.05 --out out", ("out/run-0002.pansrec", "out/run.parts.json")
+        f"{RUN} --decisions 150 --rotate-mb 0.05 --out out", ("out/run-0001.pansrec", "out/run.parts.json")
     ),
     "run --force": Case(f"{RUN} --record old.pansrec --force", ("old.pansrec", "old.summary.md")),
     "calibrate": Case(f"calibrate --device {DEVICE}&scene=uniform --seconds 0.5 -o c.json", ("c.json",)),

@@ -92,6 +92,8 @@ class PartKeeper:
         self._deleted = {"parts": 0, "bytes": 0, "decisions": 0}
         self._news: deque[dict[str, Any]] = deque(maxlen=100)
         self.ready: queue.SimpleQueue[Recorder] = queue.SimpleQueue()
+        self.trouble = ""  # why a full part has no END
+        self.index_trouble = ""  # why the index is not the latest
         self._unmade = 0  # the part that could not be made, and is tried again
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._clear(overwrite)
@@ -111,19 +113,17 @@ class PartKeeper:
         """Have a part closed that is full; `following` is the next one."""
         self._tasks.put(lambda: self._finish(full, facts, following))
 
-    def take(self, number: int) -> Recorder:
-        """Return the part that is ready, under its own name; RecordingError if that cannot be."""
-        made, path = self.ready.get_nowait(), part_path(self._path, number)
+    def name(self, made: Recorder, number: int) -> None:
+        """Give a part its own name, now that it says where it begins; RecordingError if that cannot be."""
+        path = part_path(self._path, number)
         try:
             place_new(made.path, path)
         except OSError as error:
-            made.__exit__(None, None, None)
             reason = f"{path} exists" if isinstance(error, FileExistsError) else error.strerror or error
             raise RecordingError(
-                f"{path}: the next part cannot be begun: {reason}", remedy="the parts before it are readable"
+                f"{path}: the part cannot be begun: {reason}", remedy="the parts before it are readable"
             ) from error
         made.path = path
-        return made
 
     def settle(self, facts: PartFacts) -> None:
         """Have a part indexed that is closed, and the oldest ones deleted above the cap."""
@@ -165,7 +165,7 @@ class PartKeeper:
         path = part_path(self._path, number)
         header = {**self._header, "part": {"number": number, "run": self._run, "file": path.name}}
         # under a hidden name until it is begun: a part that nobody wrote to is none
-        return Recorder(path if number == 1 else path.with_name(f".{path.name}.next"), header, bundle=self._bundle)
+        return Recorder(path.with_name(f".{path.name}.next"), header, bundle=self._bundle)
 
     def _prepare(self, number: int) -> None:
         self._make_room()
@@ -178,7 +178,11 @@ class PartKeeper:
             self._unmade = number
 
     def _finish(self, full: Recorder, facts: PartFacts, following: Path) -> None:
-        full.close({"part_ended": "full", "next": following.name})
+        try:
+            full.close({"part_ended": "full", "next": following.name})
+        except PansError as error:
+            self.trouble = error.message
+            raise
         self._settle(replace(facts, bytes=full.size_bytes))
 
     def _settle(self, facts: PartFacts) -> None:
@@ -217,7 +221,12 @@ class PartKeeper:
             "parts": [asdict(part) for part in self._closed],
             "deleted": dict(self._deleted),
         }
-        replace_file(index_path(self._path), canonical_json(index) + b"\n")
+        try:
+            replace_file(index_path(self._path), canonical_json(index) + b"\n")
+            self.index_trouble = ""
+        except UsageError as error:
+            self.index_trouble = error.message
+            raise
 
     def _clear(self, overwrite: bool) -> None:
         there = files_of_parts(self._path)

@@ -7,6 +7,7 @@ in the stream at which a part may begin is the core's (`follower.part`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_chunks
+from pans.runtime.errors import PansError, RecordingError
 from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Opcode, encode_command
@@ -52,7 +54,14 @@ class PartedRecorder:
         self._first_decision, self._chain = 0, ""
         self.keeper = PartKeeper(self.path, header, limits, bundle, overwrite)
         self.open_part = self.keeper.start()
-        self._begin({"decisions": 0}, ())
+        try:
+            self._begin({"decisions": 0}, ())
+            self.keeper.name(self.open_part, 1)
+        except PansError:
+            with suppress(OSError, PansError):
+                self.__exit__(None, None, None)
+                self.open_part.path.unlink()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -114,6 +123,10 @@ class PartedRecorder:
         facts = self._facts(self.open_part, self.open_part.close(summary))
         self.keeper.settle(facts)
         self.keeper.close()
+        if trouble := self.keeper.trouble or self.keeper.index_trouble:
+            raise RecordingError(
+                f"the run has ended, and its recording is not whole: {trouble}", remedy="verify the folder of parts"
+            )
         return facts.chain_sha256
 
     # -- parts ---------------------------------------------------------------------------------------------------------
@@ -132,11 +145,12 @@ class PartedRecorder:
         """Go on in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
         full = self.open_part
         full.flush()
-        made = self.keeper.take(self.parts + 1)
+        made = self.keeper.ready.get_nowait()
         facts = self._facts(full, full.written[1])
         self._first_decision, self._chain = facts.first_decision + facts.decisions, facts.chain_sha256
         self.open_part = made
         self._begin(place, commands, host_ns, facts)
+        self.keeper.name(made, self.parts)
         full.watch_write = None  # from here on it is written by the keeper, which delays nobody
         self.keeper.finish(full, facts, self.open_path)
 
