@@ -7,6 +7,7 @@ interrupts as Ctrl-C does.
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Iterator, Mapping
@@ -22,6 +23,8 @@ if TYPE_CHECKING:  # the options must not load what a run needs
 
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"
+LOADERS = frozenset(("numba", "llvmlite", "importlib", "_frozen_importlib"))  # top-level modules
+AGAIN_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +55,33 @@ class Stop:
         self.polled = False
         self.raised = False  # KeyboardInterrupt, wherever the main thread was
         self._continuous = continuous
+        self._waits = False  # a signal that came while libraries were loaded comes again
 
     def ask(self, signum: int, frame: FrameType | None) -> None:
         """Take a signal; a run without an end of its own ends well when SIGTERM asks for it."""
-        second = bool(self.word)
+        second = bool(self.word) and not self._waits
+        self._waits = False
         self.word = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED
-        if second or not self.polled:
+        if (second or not self.polled) and _is_loading(frame):
+            self._waits = True
+            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signum))
+            again.daemon = True
+            again.start()
+        elif second or not self.polled:
             self.raised = True
             raise KeyboardInterrupt(self.word)
+
+
+def _is_loading(frame: FrameType | None) -> bool:
+    """Whether one of ours is waiting for a library that is imported or compiled: interrupted there, it may crash the process."""
+    while frame is not None:
+        module = str(frame.f_globals.get("__name__", ""))
+        if module.startswith("pans."):
+            return False
+        if module.partition(".")[0] in LOADERS:
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager

@@ -34,7 +34,7 @@ from .log import LogEncoder
 from .parts import place_of
 from .pictures import PictureLog
 from .recording import Recording
-from .sent_plan import TICK_HZ, sent_plan
+from .sent_plan import TICK_HZ, never_armed, sent_plan
 
 SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
@@ -62,18 +62,13 @@ class Replayed(NamedTuple):
 
 def replay(recording: Recording, bundle: Bundle, pictures: PictureLog | None = None) -> Replayed:
     """Decide `recording` again with `bundle`; `pictures` collects those given back."""
-    if _was_cut_before_messages(recording):
+    if never_armed(recording):
         return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True)
     core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
     sha256 = log.sha256()
     same = sha256 if recording.complete else log.sha256_as_far
     return Replayed(log.decisions, sha256, passages, recording.n_decisions, same == recording.decisions_sha256)
-
-
-def _was_cut_before_messages(recording: Recording) -> bool:
-    """Whether the run was cut off before anything could be decided: while the device was set up."""
-    return not (recording.complete or recording.n_decisions or Kind.MESSAGES in recording.kinds)
 
 
 class _Log:
@@ -151,7 +146,7 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
 
     Nothing is said of a recording that holds no commands or no messages: it does not claim that it can be.
     """
-    if not {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
+    if not {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys() or never_armed(recording):
         return []
     try:
         _, arms = _rebuilt(recording, bundle, None)

@@ -17,6 +17,18 @@ from .recording import Recording
 TICK_HZ = Range(1000, 10_000_000_000, whole=True)
 
 
+def never_armed(recording: Recording) -> bool:
+    """Whether the run ended before it armed the device, so that there was nothing to decide."""
+    if recording.n_decisions:
+        return False
+    decoder = FrameDecoder()
+    return not any(
+        frame.type == MessageType.COMMAND and decode_command(frame.payload).opcode == Opcode.ARM
+        for _, data in recording.commands()
+        for frame in decoder.feed(data)
+    )
+
+
 def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Arm]]]:
     """Return the plan and the ARM commands with their sessions, as they were sent to the device (repetitions left out)."""
     decoder = FrameDecoder()

@@ -18,7 +18,7 @@ from pans.runtime.record import Recorder, Recording, read_recording, replay
 from pans.runtime.record.format import Kind
 
 CYCLES = 400
-ALL_FAULTS = "loss:0.01,duplicate:0.01,flip:0.01,disconnect:50ms/400ms"
+ALL_FAULTS = "loss:0.01,duplicate:0.01,flip:0.01,stall:300ms/700ms"
 
 
 def record(path: Path, faults: str = "", seed: int = 1) -> Path:

@@ -174,3 +174,13 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_stays_an_int
     monkeypatch.setattr("pans.runtime.commands.carry_out._prepare", loading)
     words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path / "out")]
     assert main([*words, "--decisions", "4"]) == 130
+
+
+def test_a_signal_waits_until_a_library_is_loaded() -> None:
+    """Interrupted in its middle, a compiled kernel that is loaded aborts the process."""
+    space: dict[str, Any] = {"__name__": "llvmlite.binding", "signal": signal, "time": time, "done": []}
+    exec("def load():\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(0.1)\n    done.append(1)", space)
+    with stop_signals(continuous=True), pytest.raises(KeyboardInterrupt, match=ASKED_TO_STOP):
+        space["load"]()
+        time.sleep(10)
+    assert space["done"] == [1]
