@@ -137,6 +137,7 @@ class Fuzzer:
         self._session = HostSession(NONCE)
         self._session.start(0)
         _, bundle, plan = small_setup("sequential")
+        self._host_plan = plan
         self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
         self._core.begin(0, 0)
         self._host_decoder = wire.FrameDecoder()
@@ -200,7 +201,7 @@ class Fuzzer:
 
     def _strange_bytes(self, size: int) -> bytes:
         dice = self._dice
-        kind = dice.randrange(4)
+        kind = dice.randrange(4) if self.counts.bytes else 3  # a short run meets damaged frames too
         if kind == 0:
             return dice.randbytes(size)
         if kind == 1:  # mostly delimiters and codes at their edges
@@ -293,6 +294,10 @@ class Fuzzer:
             seq = tracker.next_seq if good else self._number(32)
             first = tracker.next_exposure + dice.choice((0, 0, 0, 1, 50)) if good else self._number(64)
             head = (seq, self._number(32), self._number(63), first, self._number(32), self._number(32))
+            if good and dice.random() < 0.7:  # as the plan has it, so that some get as far as the windows
+                cycle, slot = divmod(first, self._host_plan.slots_per_cycle)
+                tick = cycle * self._host_plan.cycle_ticks + int(self._host_plan.slot_offset_ticks[slot])
+                head = (seq, 0, tick, first, self._host_plan.slot_period_ticks, wire.NO_OBJECT)
             if kind == MessageType.CLICKS:
                 patterns = np.array([dice.choice((0, 1, 2, 3, 0xFFFF)) for _ in range(count)], np.uint16)
                 return wire.encode_clicks(wire.ClickBlock(*head, patterns, np.ones(count, np.uint8)), session)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
-from pans.runtime.errors import UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
@@ -54,8 +53,6 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
 
-    if args.seconds <= 0 or args.frames < 0:
-        raise UsageError("--seconds must be above 0 and --frames not negative")
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.frames, args.load, args.quick)
     if args.plot is not None:
         check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)

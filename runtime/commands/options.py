@@ -29,7 +29,7 @@ RANGES = {
     "reconnect_s": Range(0, 1e6),
     "gate_delay_us": Range(0, 1e6),
     "pool": Range(1, 64, whole=True),
-    "calibration_max_age_h": Range(1e-3, 1e6),
+    "calibration_max_age_h": Range(1e-9, 1e6),
     "rotate_mb": Range(0, 1e6),
     "keep_mb": Range(0, 1e9),
     "seed": Range(0, (1 << 63) - 1, whole=True),

@@ -73,8 +73,8 @@ def test_drops_that_the_host_does_not_know_of_are_found(monkeypatch: pytest.Monk
     monkeypatch.setattr("pans.firmware_sim.device.instrument.BUFFER_MESSAGES", 4)
     original = StreamTracker._gap_before
 
-    def silent(self: StreamTracker, exposure_index: int, drops: int) -> Any:
-        return original(self, exposure_index, 0)
+    def silent(self: StreamTracker, exposure_index: int, drops: int, **end: bool) -> Any:
+        return original(self, exposure_index, 0, **end)
 
     assert violations("none") == ""
     monkeypatch.setattr(StreamTracker, "_gap_before", silent)

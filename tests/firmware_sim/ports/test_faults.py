@@ -264,8 +264,8 @@ def found(case: str, text: str, faults_text: str | None = None) -> bool:
 def test_a_gap_that_is_not_reported_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     original = StreamTracker._gap_before
 
-    def silent(self: StreamTracker, exposure_index: int, drops: int) -> None:
-        original(self, exposure_index, drops)
+    def silent(self: StreamTracker, exposure_index: int, drops: int, **end: bool) -> None:
+        original(self, exposure_index, drops, **end)
 
     monkeypatch.setattr(StreamTracker, "_gap_before", silent)
     assert found("loss", "skipped in silence")
@@ -274,8 +274,8 @@ def test_a_gap_that_is_not_reported_is_found(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_gap_that_is_too_long_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     original = StreamTracker._gap_before
 
-    def generous(self: StreamTracker, exposure_index: int, drops: int) -> Any:
-        gap = original(self, exposure_index, drops)
+    def generous(self: StreamTracker, exposure_index: int, drops: int, **end: bool) -> Any:
+        gap = original(self, exposure_index, drops, **end)
         return None if gap is None else gap._replace(exposures=gap.exposures + 1)
 
     monkeypatch.setattr(StreamTracker, "_gap_before", generous)
