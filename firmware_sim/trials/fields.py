@@ -45,7 +45,7 @@ from pans.runtime.wire.messages import NO_OBJECT, STRUCTS, DeviceState, Malforme
 
 OBJECTS = 12
 SHOTS = 1
-MAX_MEMORY_MIB = 400  # of the process, after any number of sessions
+MAX_GROWTH_MIB = 300  # of the process, during any number of sessions: below 400 with the 100 that it starts with
 MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
 EDGES = (0, 1, 2, 1 << 15, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 REALS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 3e38, 1e-45)
