@@ -27,7 +27,17 @@ from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import DeviceState, Frame, Mark, MessageType, Opcode, StateReason, pack_body
+from pans.runtime.wire.messages import (
+    DeviceState,
+    Frame,
+    MalformedMessage,
+    Mark,
+    MessageType,
+    Opcode,
+    StateReason,
+    decode_status,
+    pack_body,
+)
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
 from .config import RunConfig
@@ -276,8 +286,11 @@ class LiveRun:
             if self._recorder is not None:
                 self._recorder.add_message(arrival_ns, pack_body(what))
             self._book(output, arrival_ns, decoded_ns, outputs)
-            if what.type == MessageType.STATUS and self.connection.session.status is not None:
-                self._check_tick(self.connection.session.status.tick, arrival_ns)
+            if (
+                what.type == MessageType.STATUS
+            ):  # this one: the session may know a later one, behind a host that was held up
+                with suppress(MalformedMessage):  # counted where it was taken
+                    self._check_tick(decode_status(what.payload).tick, arrival_ns)
                 self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
         if self._broken is not None:
             broken, self._broken = self._broken, None
