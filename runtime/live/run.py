@@ -30,7 +30,6 @@ from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import (
     DeviceState,
     Frame,
-    MalformedMessage,
     Mark,
     MessageType,
     Opcode,
@@ -38,6 +37,7 @@ from pans.runtime.wire.messages import (
     decode_status,
     pack_body,
 )
+from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap, StreamTracker
 
 from .config import RunConfig
