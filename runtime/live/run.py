@@ -286,11 +286,11 @@ class LiveRun:
             if self._recorder is not None:
                 self._recorder.add_message(arrival_ns, pack_body(what))
             self._book(output, arrival_ns, decoded_ns, outputs)
-            if what.type == MessageType.STATUS and self.connection.session.status is not None:
+            if what.type == MessageType.STATUS:
                 with suppress(MalformedMessage):  # counted where it was taken
-                    # this one: the session may know a later one, where the host was held up
-                    self._check_tick(decode_status(what.payload).tick, arrival_ns)
-                self.lateness.status_came(self.connection, self.connection.session.status, arrival_ns)
+                    status = decode_status(what.payload)  # the session may know a later one, where the host was held up
+                    self._check_tick(status.tick, arrival_ns)
+                    self.lateness.status_came(self.connection, status, arrival_ns)
         if self._broken is not None:
             broken, self._broken = self._broken, None
             raise broken
