@@ -59,6 +59,12 @@ WHOLE = Range(-(1 << 63), (1 << 63) - 1, whole=True)
 FINITE = Range(-1e300, 1e300)
 
 
+def demand(holds: bool, message: str) -> None:
+    """Raise ValueError with `message` unless `holds`."""
+    if not holds:
+        raise ValueError(message)
+
+
 def number_text(value: Any) -> str:
     """Return what was found where a number should be, never longer than a line."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 64:

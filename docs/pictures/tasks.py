@@ -13,7 +13,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.incident import incident_intensity
+from pans.runtime.bundle.optics import incident_intensity
 from pans.trainer.tasks.generators import GENERATORS
 from pans.trainer.tasks.registry import draw_task, load_task
 

@@ -15,14 +15,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.ranges import Range
+from pans.runtime.ranges import Range, demand
 
+from .automaton import Automaton
 from .head import HEAD_MAX_BYTES
 from .int8 import STEP_MAX, WEIGHT_MAX, Int8Head
 from .onnx_check import check_head
 from .optics import LIGHT_RANGE, Analyser, check_analyser
+from .walks import check_expected, greatest_light, log_scores, walk_difference
 
-ENCODERS = ("active", "coherent", "incoherent")  # the last two are passive: nothing is shown
+ENCODERS = ("active", "coherent", "incoherent", "automaton")  # coherent and incoherent are passive: nothing is shown
+PATTERNS_MAX = 65_535  # of an automaton
+PATTERN_CELLS_MAX = (
+    1 << 26
+)  # patterns times pixels of an automaton: its file may hold them as single bits, memory does not
 FEATURES_MAX = 4096
 PIXELS_MAX = 1 << 22
 LEVELS_MAX = 65536
@@ -60,10 +66,18 @@ class Bundle:
     int8_onnx: bytes | None = None  # the same as a quantised ONNX model
     analyser: Analyser | None = None  # the optics of a passive sensor
     picture_shape: tuple[int, int] | None = None  # height and width of the picture that the head gives back
+    automaton: Automaton | None = None  # decides by itself: no head and no table beside it
+    golden_walks: NDArray[np.uint32] | None = None  # (g, n_slots + 1) nodes that each golden click word passes
+    expected: Mapping[str, Any] | None = None  # of an automaton: its exact expectation, walks.EXPECTED_KEYS
 
     @property
     def n_features(self) -> int:
-        """Number of patterns, or of detectors behind passive optics: d_f."""
+        """Length of a click word, d_f: patterns, detectors behind passive optics, or slots (times channels) of an automaton."""
+        return self.n_patterns if self.automaton is None else self.automaton.n_bits
+
+    @property
+    def n_patterns(self) -> int:
+        """Number of rows of `pattern_levels`: patterns, or detectors behind passive optics."""
         return int(self.pattern_levels.shape[0])
 
     @property
@@ -84,15 +98,27 @@ class Bundle:
     @property
     def n_shown(self) -> int:
         """Number of patterns that the instrument must hold: none in passive sensing."""
-        return 0 if self.analyser is not None else self.n_features
+        return 0 if self.analyser is not None else self.n_patterns
 
     def patterns(self) -> NDArray[np.float64]:
         """Return the patterns (d_f, pixels), float64, in photoelectrons per exposure per unit transmission."""
         return self.pattern_levels.astype(np.float64) * self.photons_per_level
 
     def illumination(self) -> float:
-        """Return the sum of all pattern intensities of one shot, in photoelectrons per unit transmission."""
+        """Return the sum of all pattern intensities of one shot, in photoelectrons per unit transmission.
+
+        Of an automaton: of the walk that takes most; what it takes on average depends on the objects (`expected`).
+        """
+        if self.automaton is not None:
+            return greatest_light(self.automaton, self.state_light())
         return int(self.pattern_levels.sum(dtype=np.uint64)) * self.photons_per_level
+
+    def state_light(self) -> NDArray[np.float64]:
+        """Return what each state of the automaton shows, float64 (states,): photoelectrons per unit transmission, dwell included."""
+        if self.automaton is None:
+            raise ValueError(f"{self.name} has no automaton")
+        whole = self.pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64) * self.photons_per_level
+        return whole[self.automaton.pattern] * (self.automaton.dwell / self.automaton.dwell_steps)
 
 
 def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:
@@ -132,11 +158,6 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def demand(holds: bool, message: str) -> None:
-    if not holds:
-        raise ValueError(message)
-
-
 def _check_text(text: Any, what: str) -> None:
     fine = isinstance(text, str) and 0 < len(text) <= TEXT_MAX_CHARACTERS and text.isprintable()
     demand(fine, f"{what} is {ascii(text)[:80]}, allowed: 1 to {TEXT_MAX_CHARACTERS} printable characters")
@@ -153,9 +174,10 @@ def _check_facts(bundle: Bundle) -> None:
     _check_text(bundle.task, "task")
     demand(bundle.encoder in ENCODERS, f"encoder is {ascii(bundle.encoder)[:80]}, allowed: {', '.join(ENCODERS)}")
     _check_outputs(bundle)
-    demand(
-        (bundle.encoder == "active") == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none"
-    )
+    shown = bundle.encoder in ("active", "automaton")
+    demand(shown == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none")
+    decides_by_itself = bundle.automaton is not None
+    demand((bundle.encoder == "automaton") == decides_by_itself, f"encoder {bundle.encoder}, and an automaton or none")
     if bundle.analyser is not None:
         demand(
             bundle.levels == 0 and bundle.photons_per_level == 0,
@@ -186,7 +208,7 @@ def _check_outputs(bundle: Bundle) -> None:
 def check_bundle(bundle: Bundle) -> None:
     """Raise ValueError at the first thing that is impossible in itself or does not fit the rest."""
     _check_facts(bundle)
-    d_f, pixels = bundle.pattern_levels.shape
+    d_f, pixels = bundle.n_features, bundle.n_pixels
     height, width = bundle.image_shape
     if bundle.analyser is not None:
         demand(pixels == 0, f"{bundle.encoder} optics show no patterns, found {pixels} pixels of them")
@@ -194,12 +216,25 @@ def check_bundle(bundle: Bundle) -> None:
         demand(bundle.analyser.kind == bundle.encoder, f"encoder {bundle.encoder}, analyser {bundle.analyser.kind}")
         seen, pixels = bundle.analyser.matrix.shape
         demand(seen == d_f, f"the matrix has {seen} rows for {d_f} detectors")
-    demand(1 <= d_f <= FEATURES_MAX, f"{d_f} patterns, allowed: 1 to {FEATURES_MAX}")
+    clicks = "patterns" if bundle.automaton is None else "clicks of a walk"
+    demand(1 <= d_f <= FEATURES_MAX, f"{d_f} {clicks}, allowed: 1 to {FEATURES_MAX}")
     demand(1 <= pixels <= PIXELS_MAX, f"{pixels} pixels, allowed: 1 to {PIXELS_MAX}")
     fits = height > 0 and width > 0 and height * width == pixels
     demand(fits, f"image_shape is {height}x{width}, but a pattern has {pixels} pixels")
     top = int(bundle.pattern_levels.max()) if bundle.analyser is None else -1
     demand(top < bundle.levels, f"a pattern level is {top}, allowed: 0 to {bundle.levels - 1}")
+    _check_back_ends(bundle)
+    _check_golden(bundle)
+
+
+def _check_back_ends(bundle: Bundle) -> None:
+    d_f = bundle.n_features
+    if bundle.automaton is not None:
+        _check_automaton(bundle, bundle.automaton)
+        return
+    demand(
+        bundle.golden_walks is None and bundle.expected is None, "golden walks or expected figures, and no automaton"
+    )
     demand(
         bundle.head_onnx is not None or bundle.table is not None, "neither a head nor a table, allowed: either or both"
     )
@@ -216,7 +251,34 @@ def check_bundle(bundle: Bundle) -> None:
     if bundle.table is not None:
         check_table_shape(bundle.table.shape, d_f, bundle.n_outputs)
         demand(_finite(bundle.table), "the table holds scores that are not finite")
-    _check_golden(bundle)
+
+
+def _check_automaton(bundle: Bundle, automaton: Automaton) -> None:
+    """What binds an automaton to its patterns, its classes and its golden walks."""
+    others = (bundle.head_onnx, bundle.table, bundle.int8_head, bundle.int8_onnx, bundle.picture_shape)
+    demand(all(part is None for part in others), "an automaton beside a head, a table or a picture, allowed: either")
+    patterns, pixels = bundle.pattern_levels.shape
+    demand(patterns <= PATTERNS_MAX, f"{patterns} patterns of an automaton, allowed: 1 to {PATTERNS_MAX}")
+    cells = patterns * pixels
+    demand(cells <= PATTERN_CELLS_MAX, f"{patterns} patterns of {pixels} pixels, allowed: {PATTERN_CELLS_MAX} in all")
+    top = int(automaton.pattern.max())
+    demand(top < patterns, f"a state shows pattern {top}, allowed: 0 to {patterns - 1}")
+    classes = automaton.n_classes
+    demand(classes == bundle.n_classes, f"posteriors of {classes} classes, the bundle has {bundle.n_classes}")
+    if bundle.expected is not None:
+        check_expected(bundle.expected, automaton)
+
+
+def _check_golden_walks(automaton: Automaton, bundle: Bundle) -> None:
+    words, walks = bundle.golden_means, bundle.golden_walks
+    demand(bool(((words == 0) | (words == 1)).all()), "golden words hold other numbers than 0 and 1")
+    if walks is None:
+        raise ValueError("an automaton without golden walks")
+    difference = walk_difference(automaton, words, walks)
+    demand(not difference, difference)
+    same = log_scores(automaton.posteriors[walks[:, -1]])
+    difference = golden_violation(same, bundle.golden_scores)
+    demand(not difference, f"the leaves do not answer the golden words: {difference}")
 
 
 def _check_cost(model: bytes, what: str, bundle: Bundle) -> None:
@@ -260,6 +322,8 @@ def _check_golden(bundle: Bundle) -> None:
     demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
     demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
     demand(_finite(scores), "the golden scores are not finite (does the head answer NaN?)")
+    if bundle.automaton is not None:
+        _check_golden_walks(bundle.automaton, bundle)
     if bundle.table is not None:
         binary = ((means == 0) | (means == 1)).all(axis=1)
         found = bundle.table[row_index(means[binary])]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.ranges import demand
 
-from .facts import LEVELS_MAX, Bundle, check_bundle, demand, frozen
+from .facts import LEVELS_MAX, Bundle, check_bundle, frozen
 from .int8 import Int8Head
 from .optics import Analyser
 
@@ -43,6 +44,8 @@ _REMEDY = "take the file from its source again, or export it again with `pans tr
 
 def bundle_bytes(bundle: Bundle) -> bytes:
     """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 256 MiB."""
+    if bundle.automaton is not None:
+        raise UsageError("automata are not written yet")
     parts: list[tuple[str, NDArray[Any]]] = [_optics_part(bundle)]
     if bundle.head_onnx is not None:
         parts.append(("head_onnx", np.frombuffer(bundle.head_onnx, dtype=np.uint8)))

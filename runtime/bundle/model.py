@@ -10,17 +10,19 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.container import canonical_json, parse_json_object, read_file
-from pans.runtime.errors import UsageError
+from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import write_file
+from pans.runtime.ranges import demand
 
+from .automaton import Automaton
 from .facts import (
     GOLDEN_WORK_MAX,
     LEVELS_MAX,
@@ -35,6 +37,7 @@ from .format import bundle_bytes, parse_bundle
 from .head import OnnxHead, open_head
 from .int8 import Int8Head
 from .optics import Analyser
+from .walks import check_expected, golden_nodes, log_scores, walk_nodes, words_to
 
 __all__ = [
     "BackEnd",
@@ -45,6 +48,7 @@ __all__ = [
     "load_bundle",
     "make_bundle",
     "parse_bundle",
+    "with_expected",
     "word_means",
     "write_bundle",
 ]
@@ -81,14 +85,16 @@ def make_bundle(
     classes: Sequence[str] = (),
     image_shape: tuple[int, int],
     optics: Shown | Analyser,
-    back_end: BackEnd,
     provenance: Mapping[str, Any],
+    back_end: BackEnd | None = None,
     picture_shape: tuple[int, int] | None = None,
+    automaton: Automaton | None = None,
 ) -> Bundle:
     """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where d_f <= 12.
 
     `optics` are the patterns of an active sensor or the analyser of a passive one. The head decides among `classes`, or gives back a
-    picture of `picture_shape`. UsageError says what does not fit, DamagedFileError what is wrong with the head.
+    picture of `picture_shape`; an `automaton` decides by itself (no `back_end`) and brings golden walks. UsageError
+    says what does not fit, DamagedFileError what is wrong with the head.
 
     >>> shown = Shown(levels=2, pattern_levels=[[1, 0], [0, 1]], photons_per_level=3.0)
     >>> table = BackEnd(table=[[0, 0], [1, 0], [0, 1], [1, 1]])
@@ -104,29 +110,31 @@ def make_bundle(
         shown = optics if isinstance(optics, Shown) else Shown(0, np.zeros((len(optics.matrix), 0), np.uint16), 0.0)
         quantised = _as_levels(shown) if analyser is None else np.asarray(shown.pattern_levels)
         n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
-            given = None if back_end.table is None else np.array(back_end.table, dtype=np.float32)
-        means, scores, given = _evaluate_back_end(
-            back_end.head_onnx, given, len(quantised), n_outputs, decides=picture_shape is None
-        )
+        decided = BackEnd() if back_end is None else back_end
+        if automaton is None:
+            golden = _evaluate_back_end(decided, len(quantised), n_outputs, decides=picture_shape is None)
+        else:
+            golden = _golden_of(automaton, decided)
         bundle = Bundle(
             name=name,
             task=task,
             classes=tuple(classes),
-            encoder="active" if analyser is None else analyser.kind,
+            encoder=_encoder(analyser, automaton),
             image_shape=(int(image_shape[0]), int(image_shape[1])),
             levels=int(shown.levels),
             pattern_levels=frozen(quantised),
             photons_per_level=float(shown.photons_per_level),
-            head_onnx=None if back_end.head_onnx is None else bytes(back_end.head_onnx),
-            table=None if given is None else frozen(given),
-            golden_means=frozen(means),
-            golden_scores=frozen(scores),
+            head_onnx=None if decided.head_onnx is None else bytes(decided.head_onnx),
+            table=None if golden.table is None else frozen(golden.table),
+            golden_means=frozen(golden.means),
+            golden_scores=frozen(golden.scores),
             provenance=parse_json_object(canonical_json(dict(provenance)), "provenance"),
-            int8_head=back_end.int8_head,
-            int8_onnx=None if back_end.int8_onnx is None else bytes(back_end.int8_onnx),
+            int8_head=decided.int8_head,
+            int8_onnx=None if decided.int8_onnx is None else bytes(decided.int8_onnx),
             analyser=analyser,
             picture_shape=picture_shape,
+            automaton=automaton,
+            golden_walks=None if golden.walks is None else frozen(golden.walks),
         )
         check_bundle(bundle)
     except (ValueError, TypeError) as error:
@@ -134,10 +142,28 @@ def make_bundle(
     return bundle
 
 
+def with_expected(bundle: Bundle, expected: Mapping[str, Any]) -> Bundle:
+    """Return an automaton's `bundle` with what it is expected to achieve, of the keys `EXPECTED_KEYS`; UsageError for what cannot be.
+
+    `profile`, `task` and `split` say under what conditions; the other figures are exact means per decision over `objects`.
+    """
+    with as_usage_error():
+        if bundle.automaton is None:
+            raise ValueError(f"{bundle.name} has no automaton, expected figures belong to one")
+        check_expected(expected, bundle.automaton)
+    return replace(bundle, expected=parse_json_object(canonical_json(dict(expected)), "expected"))
+
+
 def word_means(words: ArrayLike, n_features: int) -> NDArray[np.float32]:
     """Return click words (n,) as the head's input (n, d_f), float32: bit i becomes feature i; d_f <= 63."""
     bits = np.asarray(words, dtype=np.int64)[:, None] >> np.arange(n_features, dtype=np.int64)
     return (bits & 1).astype(np.float32)
+
+
+def _encoder(analyser: Analyser | None, automaton: Automaton | None) -> str:
+    if automaton is not None:
+        return "automaton"
+    return "active" if analyser is None else analyser.kind
 
 
 def _as_levels(shown: Shown) -> NDArray[np.uint16]:
@@ -152,25 +178,41 @@ def _as_levels(shown: Shown) -> NDArray[np.uint16]:
     return values.astype(np.uint16)
 
 
-def _evaluate_back_end(
-    head_onnx: bytes | None, table: NDArray[np.float32] | None, n_features: int, n_outputs: int, *, decides: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return (golden means, golden scores, table or None); the head answers where there is one, else the table."""
+class _Golden(NamedTuple):
+    means: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    table: NDArray[np.float32] | None
+    walks: NDArray[np.uint32] | None = None
+
+
+def _evaluate_back_end(back_end: BackEnd, n_features: int, n_outputs: int, *, decides: bool) -> _Golden:
+    """Return the golden vectors and the table, if any; the head answers where there is one, else the table."""
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused later
+        table = None if back_end.table is None else np.array(back_end.table, dtype=np.float32)
     if table is not None:
         check_table_shape(table.shape, n_features, n_outputs)
-    if head_onnx is None:
+    if back_end.head_onnx is None:
         if table is None:
             raise ValueError("neither a head nor a table was given, allowed: either or both")
         means = _golden_words(n_features)
-        return means, table[row_index(means)], table
-    head = open_head(head_onnx, n_features, n_outputs, "head")
+        return _Golden(means, table[row_index(means)], table)
+    head = open_head(back_end.head_onnx, n_features, n_outputs, "head")
     means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
     affordable = head.cost.operations << min(n_features, TABLE_BUILD_FEATURES_MAX) <= GOLDEN_WORK_MAX
     if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX and affordable:
         table = head.scores(word_means(np.arange(1 << n_features), n_features))
     elif table is not None:
         _demand_agreement(head, table, n_features)
-    return means, head.scores(means), table
+    return _Golden(means, head.scores(means), table)
+
+
+def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
+    """Words as for any bundle, and words that lead to nodes that few random words would reach."""
+    parts = (beside.head_onnx, beside.table, beside.int8_head, beside.int8_onnx)
+    demand(all(part is None for part in parts), "an automaton beside a head or a table, allowed: either")
+    words = np.concatenate([_golden_words(automaton.n_bits), words_to(automaton, golden_nodes(automaton))])
+    walks = walk_nodes(automaton, words)
+    return _Golden(words, log_scores(automaton.posteriors[walks[:, -1]]), None, walks)
 
 
 def _demand_agreement(head: OnnxHead, table: NDArray[np.float32], n_features: int) -> None:

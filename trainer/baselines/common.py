@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.incident import incident_intensity
+from pans.runtime.bundle.optics import incident_intensity
 from pans.trainer.evaluate.accuracy import Measured
 from pans.trainer.tasks.registry import Task
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-from pans.runtime.bundle.incident import incident_field
+from pans.runtime.bundle.optics import incident_field
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.outputs import replace_file
 from pans.trainer.baselines.bayes import bayes

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pans.runtime.bundle.incident import incident_field
+from pans.runtime.bundle.optics import incident_field
 from pans.trainer.model.field_basis import discriminant_basis
 from pans.trainer.options import EXACT_FEATURES_MAX, Options
 from pans.trainer.tasks import mmf as task_mmf

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.incident import Light
+from pans.runtime.bundle.optics import Light
 
 from . import barcode, cells, fiber, nebula, tissue, transient
 from .draw import Labels

@@ -4,7 +4,7 @@ Owns what the fibre does to an image; never reads MNIST (see registry.py). The s
 at the entrance; the fibre mixes the modes; a passive encoder sees the speckle at its end and must name the digit, or give
 back the image.
 
-The fibre itself (`scatter`, `phase_mask`) is in `pans.runtime.bundle.incident`: the simulated instrument looks through the same one.
+The fibre itself (`scatter`, `phase_mask`) is in `pans.runtime.bundle.optics`: the simulated instrument looks through the same one.
 Masks of other generators are statistically alike; figures move by about the spread over seeds.
 
 Two inputs for the encoder:
@@ -26,8 +26,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.incident import FIBRE_SIDE_PX as SIDE_PX
-from pans.runtime.bundle.incident import MASK_SEED, phase_mask, scatter
+from pans.runtime.bundle.optics import FIBRE_SIDE_PX as SIDE_PX
+from pans.runtime.bundle.optics import MASK_SEED, phase_mask, scatter
 
 RELEASE_BATCH = 128
 

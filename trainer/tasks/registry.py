@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.incident import Light, Optics
+from pans.runtime.bundle.optics import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.images import read_class_folder, to_8_bits

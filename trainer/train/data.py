@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from pans.runtime.bundle.incident import incident_field, incident_intensity
+from pans.runtime.bundle.optics import incident_field, incident_intensity
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here

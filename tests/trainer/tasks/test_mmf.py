@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pans.runtime.bundle.incident import incident_field, incident_intensity
+from pans.runtime.bundle.optics import incident_field, incident_intensity
 from pans.runtime.errors import UsageError
 from pans.trainer.tasks import mmf as task_mmf
 from pans.trainer.tasks.registry import FIBRE_TASKS, load_task

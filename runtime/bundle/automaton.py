@@ -1,0 +1,223 @@
+"""An automaton: which pattern the next exposure shows, from the clicks so far, and what every node knows by then.
+
+Owns the facts, the checks that need nothing else (ranges, order, depth, reach) and stopping by confidence. Never shows a pattern and never
+decides. All checks are linear in the size, whatever the arrays hold; they raise ValueError with what, found and allowed.
+
+A *node* is a state or a leaf: state s is node s, leaf l is node `n_states` + l. A *walk* begins in state 0; one exposure per state, until a
+leaf is reached. With c channels an exposure has 2**c outcomes: bit k of the outcome is the click of channel k.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pans.runtime.ranges import Range, demand
+
+STATES_MAX = 65_533  # a state number is stamped into a u16 beside 0xFFFE (adaptive slot) and 0xFFFF (dark)
+LEAVES_MAX = 1 << 20
+SLOTS_MAX = 1024
+CHANNELS_MAX = 8
+POSTERIOR_SUM_TOLERANCE = 1e-5
+DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
+CONFIDENCE_RANGE = Range(1e-6, 1.0)
+_UNREACHED = 0xFFFF  # as a depth: above SLOTS_MAX
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Automaton:
+    """States are numbered so that every successor is higher than its state; the walk begins in state 0.
+
+    A successor s >= n_states is the leaf s - n_states. Any integer or float arrays are taken; they are kept read-only in the types below.
+    A state is reached after one number of exposures only, its `depth`: the slot in which it is shown. ValueError says what is impossible.
+
+    >>> flip = Automaton(
+    ...     pattern=[0, 1], dwell=[1, 1], dwell_steps=1, successors=[[1, 2], [2, 3]],
+    ...     posteriors=[[0.5, 0.5], [0.5, 0.5], [0.9, 0.1], [0.2, 0.8]],
+    ... )
+    >>> flip.n_states, flip.n_leaves, flip.n_slots, flip.depth.tolist()
+    (2, 2, 2, [0, 1])
+    """
+
+    pattern: NDArray[np.uint16]  # (states,) row of Bundle.pattern_levels that the state shows; states may share one
+    dwell: NDArray[np.uint16]  # (states,) the light is on for dwell / dwell_steps of the exposure, 1..dwell_steps
+    dwell_steps: int  # 1: one time for all
+    successors: NDArray[
+        np.uint32
+    ]  # (states, outcomes): outcome 0 no click, 1 click; 2**c outcomes of c channels at once
+    posteriors: NDArray[np.float32]  # (states + leaves, classes) class probabilities in each node; rows sum to 1
+    depth: NDArray[np.uint16] = field(init=False)  # (states,) exposures before the state
+    n_slots: int = field(init=False)  # T: exposures of the longest walk
+
+    def __post_init__(self) -> None:
+        DWELL_STEPS_RANGE.checked(self.dwell_steps, "dwell_steps")
+        for name, dtype, axes in (("pattern", np.uint16, 1), ("dwell", np.uint16, 1), ("successors", np.uint32, 2)):
+            object.__setattr__(self, name, _whole_numbers(getattr(self, name), np.dtype(dtype), axes, name))
+        object.__setattr__(self, "posteriors", _read_only(np.asarray(self.posteriors), np.dtype(np.float32)))
+        _check_sizes(self)
+        _check_posteriors(self.posteriors)
+        depth, unreached = _explored(self.successors, self.n_leaves)
+        _demand_reached(unreached, self.n_states)
+        object.__setattr__(self, "depth", _read_only(depth, np.dtype(np.uint16)))
+        object.__setattr__(self, "n_slots", int(depth.max()) + 1)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return len(self.successors)
+
+    @property
+    def n_leaves(self) -> int:
+        """Number of leaves."""
+        return len(self.posteriors) - len(self.successors)
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes."""
+        return int(self.posteriors.shape[1])
+
+    @property
+    def n_outcomes(self) -> int:
+        """Number of outcomes of one exposure, 2**c."""
+        return int(self.successors.shape[1])
+
+    @property
+    def channels(self) -> int:
+        """Number of channels that are read at once, c."""
+        return self.n_outcomes.bit_length() - 1
+
+    @property
+    def n_bits(self) -> int:
+        """Bits of a click word: `channels` per slot; bit t * channels + k is channel k in slot t."""
+        return self.n_slots * self.channels
+
+
+def reachable_automaton(
+    pattern: ArrayLike, dwell: ArrayLike, dwell_steps: int, successors: ArrayLike, posteriors: ArrayLike
+) -> Automaton:
+    """Return the automaton of these arrays without the states and leaves that no walk reaches; ValueError as `Automaton`."""
+    states, nodes = np.asarray(successors), np.asarray(posteriors)
+    n_states, n_nodes = len(states), len(nodes)
+    demand(states.ndim == 2 and nodes.ndim == 2, "successors and posteriors must have two axes")
+    _check_order(states, n_states, n_nodes)
+    _, unreached = _explored(states, n_nodes - n_states)
+    kept = np.flatnonzero(~unreached)
+    number = np.zeros(n_nodes, np.int64)
+    number[kept] = np.arange(len(kept))
+    shown = kept[kept < n_states]
+    return Automaton(
+        np.asarray(pattern)[shown], np.asarray(dwell)[shown], dwell_steps, number[states[shown]], nodes[kept]
+    )
+
+
+def stopped(automaton: Automaton, confidence: float) -> Automaton:
+    """Return the automaton that decides as soon as a state is sure: an edge into one whose largest posterior is at least `confidence`
+    leads to a leaf with that state's posterior. State 0 is always shown. What is no longer reached is left out; ValueError beyond (0, 1].
+    """
+    CONFIDENCE_RANGE.checked(confidence, "confidence")
+    n_states, n_nodes = automaton.n_states, len(automaton.posteriors)
+    sure = automaton.posteriors[:n_states].max(axis=1) >= np.float32(confidence)
+    sure[0] = False
+    leads_to = np.arange(n_nodes)
+    leads_to[:n_states][sure] = n_nodes + np.arange(np.count_nonzero(sure))
+    return reachable_automaton(
+        automaton.pattern,
+        automaton.dwell,
+        automaton.dwell_steps,
+        leads_to[automaton.successors],
+        np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]]),
+    )
+
+
+def _read_only(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """A read-only array in C order; copied where the caller could still write to it."""
+    if array.dtype == dtype and array.flags.c_contiguous and not array.flags.writeable:
+        return array
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes inf, and is refused later
+        own = np.array(array, dtype=dtype, order="C")
+    own.flags.writeable = False
+    return own
+
+
+def _whole_numbers(values: Any, dtype: np.dtype[Any], axes: int, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    fits = array.ndim == axes and array.dtype.kind in "iu" and array.size > 0
+    wanted = "(states,)" if axes == 1 else "(states, outcomes)"
+    demand(fits, f"{name} is {array.dtype} {array.shape}, allowed: integers {wanted}")
+    low, high, top = int(array.min()), int(array.max()), int(np.iinfo(dtype).max)
+    demand(low >= 0 and high <= top, f"{name} runs from {low} to {high}, allowed: 0 to {top}")
+    return _read_only(array, dtype)
+
+
+def _check_sizes(automaton: Automaton) -> None:
+    states, outcomes = automaton.successors.shape
+    demand(1 <= states <= STATES_MAX, f"{states} states, allowed: 1 to {STATES_MAX}")
+    fits = outcomes == 1 << automaton.channels and 1 <= automaton.channels <= CHANNELS_MAX
+    demand(fits, f"{outcomes} outcomes per exposure, allowed: 2**c of c channels, c from 1 to {CHANNELS_MAX}")
+    for name in ("pattern", "dwell"):
+        shape = getattr(automaton, name).shape
+        demand(shape == (states,), f"{name} has shape {shape} for {states} states")
+    low, high = int(automaton.dwell.min()), int(automaton.dwell.max())
+    steps = automaton.dwell_steps
+    demand(low >= 1 and high <= steps, f"dwell runs from {low} to {high}, allowed: 1 to dwell_steps = {steps}")
+    posteriors = automaton.posteriors
+    demand(posteriors.ndim == 2, f"posteriors have shape {posteriors.shape}, allowed: (states + leaves, classes)")
+    leaves = len(posteriors) - states
+    demand(1 <= leaves <= LEAVES_MAX, f"{leaves} leaves, allowed: 1 to {LEAVES_MAX}")
+    demand(posteriors.shape[1] >= 2, f"posteriors of {posteriors.shape[1]} classes, allowed: 2 or more")
+    _check_order(automaton.successors, states, len(posteriors))
+
+
+def _check_order(successors: NDArray[Any], n_states: int, n_nodes: int) -> None:
+    demand(0 < n_states < n_nodes, f"{n_states} states and {n_nodes} nodes, allowed: at least one state and one leaf")
+    high = int(successors.max())
+    demand(high < n_nodes, f"a successor is {high}, allowed: 0 to {n_nodes - 1} (states, then leaves)")
+    lowest = successors.min(axis=1)
+    state = int((lowest <= np.arange(n_states)).argmax())
+    demand(
+        bool(lowest[state] > state),
+        f"state {state} has the successors {successors[state].tolist()}, allowed: above {state}",
+    )
+
+
+def _check_posteriors(posteriors: NDArray[np.float32]) -> None:
+    low, high = float(posteriors.min()), float(posteriors.max())  # a NaN is minimum and maximum
+    demand(low >= 0 and high <= 1, f"posteriors run from {low:g} to {high:g}, allowed: 0 to 1")
+    error = np.abs(posteriors.sum(axis=1, dtype=np.float64) - 1.0)
+    node = int(error.argmax())
+    message = f"the posterior of node {node} sums to 1 within {error[node]:.3g}, allowed: {POSTERIOR_SUM_TOLERANCE:g}"
+    demand(bool(error[node] <= POSTERIOR_SUM_TOLERANCE), message)
+
+
+def _explored(successors: NDArray[Any], n_leaves: int) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Return the depth of every state and which nodes (states, then leaves) no walk reaches; ValueError for two depths of one state.
+
+    Level by level. Each state is gone through once, as none may come back at another depth.
+    """
+    n_states = len(successors)
+    depth = np.full(n_states, _UNREACHED, np.uint16)
+    unreached = np.ones(n_states + n_leaves, np.bool_)
+    frontier, level = np.zeros(1, np.int64), 0
+    while frontier.size:
+        demand(level < SLOTS_MAX, f"walks of more than {SLOTS_MAX} exposures, allowed: at most {SLOTS_MAX}")
+        before = depth[frontier]
+        if (before != _UNREACHED).any():
+            state = int(frontier[(before != _UNREACHED).argmax()])
+            raise ValueError(f"state {state} is reached after {depth[state]} and after {level} exposures, allowed: one")
+        depth[frontier] = level
+        unreached[frontier] = False
+        after = successors[frontier].reshape(-1)
+        unreached[after] = False
+        frontier = np.unique(after[after < n_states]).astype(np.int64)
+        level += 1
+    return depth, unreached
+
+
+def _demand_reached(unreached: NDArray[np.bool_], n_states: int) -> None:
+    if unreached.any():
+        node = int(unreached.argmax())
+        name = f"state {node}" if node < n_states else f"leaf {node - n_states}"
+        raise ValueError(f"no walk reaches {name} ({int(unreached.sum())} such nodes), allowed: every node is reached")

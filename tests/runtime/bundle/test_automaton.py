@@ -1,0 +1,183 @@
+"""Automata: what is impossible is refused, walks are those of the definition, and stopping changes only what is sure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from automata import automaton_bundle, diamond, early_leaf, random_automaton
+
+from pans.runtime.bundle import Automaton, reachable_automaton, stopped, with_expected
+from pans.runtime.bundle.automaton import SLOTS_MAX
+from pans.runtime.bundle.walks import golden_nodes, greatest_light, walk_nodes, words_to
+from pans.runtime.errors import UsageError
+
+HALF = [0.5, 0.5]
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "pattern": [0, 1],
+        "dwell": [1, 2],
+        "dwell_steps": 2,
+        "successors": [[1, 2], [3, 2]],
+        "posteriors": [HALF, HALF, HALF, HALF],
+    }
+    return facts | changes
+
+
+IMPOSSIBLE = [
+    ({"pattern": [0]}, "pattern has shape"),
+    ({"pattern": [0, 65536]}, "pattern runs from 0 to 65536"),
+    ({"pattern": [0.0, 1.0]}, "allowed: integers"),
+    ({"dwell": [0, 1]}, "dwell runs from 0"),
+    ({"dwell": [1, 3]}, "to 3, allowed: 1 to dwell_steps = 2"),
+    ({"dwell_steps": 0}, "dwell_steps is 0"),
+    ({"dwell_steps": True}, "dwell_steps is True"),
+    ({"successors": [[1, 2], [1, 3]]}, "state 1 has the successors"),
+    ({"successors": [[0, 2], [3, 2]]}, "state 0 has the successors"),
+    ({"successors": [[1, 2], [3, 4]]}, "a successor is 4"),
+    ({"successors": [[1, 2, 2], [3, 2, 2]]}, "3 outcomes"),
+    ({"successors": [[1], [2]]}, "1 outcomes"),
+    ({"successors": [[2, 2], [3, 2]]}, "no walk reaches state 1"),
+    ({"successors": [[1, 2], [2, 2]]}, "no walk reaches leaf 1"),
+    ({"posteriors": [HALF, HALF]}, "0 leaves"),
+    ({"posteriors": [[1.0]] * 4}, "posteriors of 1 classes"),
+    ({"posteriors": [HALF, HALF, HALF, [0.5, 0.50003]]}, "the posterior of node 3"),
+    ({"posteriors": [HALF, [np.nan, 1.0], HALF, HALF]}, "posteriors run from nan"),
+    ({"posteriors": [HALF, [-0.5, 1.5], HALF, HALF]}, "posteriors run from -0.5 to 1.5"),
+    ({"posteriors": [HALF, [1e300, 0.0], HALF, HALF]}, "to inf"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), IMPOSSIBLE, ids=lambda one: one if isinstance(one, str) else "")
+def test_the_impossible_is_named(change: dict[str, Any], words: str) -> None:
+    Automaton(**arrays())
+    with pytest.raises(ValueError, match=words):
+        Automaton(**arrays(**change))
+
+
+def test_a_state_stands_in_one_slot() -> None:
+    with pytest.raises(ValueError, match="state 2 is reached after 1 and after 2 exposures"):
+        Automaton([0, 0, 0], [1, 1, 1], 1, [[1, 2], [2, 3], [3, 3]], [HALF] * 4)
+
+
+def test_a_walk_has_an_end() -> None:
+    n = SLOTS_MAX
+    chain = np.stack([np.arange(1, n + 1)] * 2, axis=1)
+    longest = Automaton(np.zeros(n, int), np.ones(n, int), 1, chain, [HALF] * (n + 1))
+    assert longest.n_slots == SLOTS_MAX
+    longer = np.stack([np.arange(1, n + 2)] * 2, axis=1)
+    with pytest.raises(ValueError, match="more than 1024 exposures"):
+        Automaton(np.zeros(n + 1, int), np.ones(n + 1, int), 1, longer, [HALF] * (n + 2))
+
+
+def test_arrays_are_the_automatons_own() -> None:
+    given = np.array([0, 1], np.uint16)
+    automaton = Automaton(**arrays(pattern=given))
+    given[0] = 7
+    assert automaton.pattern.tolist() == [0, 1]
+    for array in (automaton.pattern, automaton.dwell, automaton.successors, automaton.posteriors, automaton.depth):
+        assert not array.flags.writeable
+
+
+def walk_by_hand(automaton: Automaton, word: np.ndarray) -> list[int]:
+    node, passed = 0, [0]
+    for slot in range(automaton.n_slots):
+        if node < automaton.n_states:
+            bits = word[slot * automaton.channels : (slot + 1) * automaton.channels]
+            node = int(automaton.successors[node, sum(int(bit) << k for k, bit in enumerate(bits))])
+        passed.append(node)
+    return passed
+
+
+@pytest.mark.parametrize("automaton", [early_leaf(), diamond(), random_automaton(1), random_automaton(2, channels=2)])
+def test_walks_are_those_of_the_definition(automaton: Automaton) -> None:
+    words = np.random.default_rng(3).integers(0, 2, (200, automaton.n_bits))
+    walks = walk_nodes(automaton, words)
+    assert walks.tolist() == [walk_by_hand(automaton, word) for word in words]
+    states = walks < automaton.n_states
+    slots = np.broadcast_to(np.arange(walks.shape[1]), walks.shape)
+    assert (automaton.depth[walks[states]] == slots[states]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_word_leads_to_every_node(seed: int) -> None:
+    automaton = random_automaton(seed, slots=9, channels=1 + seed % 2)
+    nodes = np.arange(len(automaton.posteriors))
+    walks = walk_nodes(automaton, words_to(automaton, nodes))
+    assert all(node in walk for node, walk in zip(nodes, walks))
+    assert len(automaton.posteriors) - 1 in golden_nodes(automaton)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_stopping_ends_walks_where_a_state_is_sure(seed: int) -> None:
+    automaton = random_automaton(seed, slots=7)
+    sooner = stopped(automaton, 0.8)
+    words = np.random.default_rng(seed).integers(0, 2, (300, automaton.n_slots))
+    walks = walk_nodes(automaton, words)
+    for word, walk in zip(words, walks):
+        ends = next((node for node in walk[1:] if automaton.posteriors[node].max() >= np.float32(0.8)), int(walk[-1]))
+        leaf = walk_nodes(sooner, word[None, : sooner.n_slots])[0, -1]
+        assert leaf >= sooner.n_states
+        assert sooner.posteriors[leaf].tolist() == automaton.posteriors[ends].tolist()
+
+
+def test_stopping_refuses_what_is_no_confidence() -> None:
+    for confidence in (0.0, -1.0, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="confidence is"):
+            stopped(diamond(), confidence)
+    assert stopped(diamond(), 1.0).n_states == diamond().n_states
+
+
+def test_what_no_walk_reaches_is_left_out() -> None:
+    whole = reachable_automaton([0, 1, 2], [1, 1, 1], 1, [[2, 3], [3, 4], [4, 5]], [HALF] * 6)
+    assert (whole.n_states, whole.n_leaves, whole.pattern.tolist()) == (2, 3, [0, 2])
+    assert whole.successors.tolist() == [[1, 2], [3, 4]]
+
+
+def test_the_greatest_light_is_that_of_a_walk() -> None:
+    automaton = random_automaton(4, slots=8)
+    light = np.random.default_rng(1).random(automaton.n_states)
+    words = (np.arange(1 << automaton.n_slots)[:, None] >> np.arange(automaton.n_slots)) & 1
+    walks = walk_nodes(automaton, words)[:, :-1].astype(np.int64)
+    of_walk = np.where(walks < automaton.n_states, np.append(light, 0.0)[np.minimum(walks, automaton.n_states)], 0.0)
+    assert greatest_light(automaton, light) == pytest.approx(of_walk.sum(axis=1).max(), rel=1e-12)
+
+
+def test_a_bundle_counts_slots_and_patterns_apart() -> None:
+    bundle = automaton_bundle(diamond())
+    assert (bundle.n_features, bundle.n_patterns, bundle.n_shown, bundle.encoder) == (3, 3, 3, "automaton")
+    two_channels = automaton_bundle(random_automaton(2, slots=4, channels=2))
+    assert two_channels.n_features == 8
+    whole = bundle.pattern_levels.sum(axis=1) * 0.2
+    of_states = [whole[p] * d / 2 for p, d in zip(diamond().pattern, diamond().dwell)]
+    assert bundle.state_light() == pytest.approx(of_states)
+
+
+REFUSED = [
+    ({"pattern_levels": np.ones((2, 4), int)}, "a state shows pattern 2"),
+    ({"classes": ("a", "b")}, "posteriors of 3 classes, the bundle has 2"),
+    ({"table": np.zeros((8, 3))}, "an automaton beside a head"),
+]
+
+
+@pytest.mark.parametrize(("facts", "words"), REFUSED, ids=lambda one: one if isinstance(one, str) else "")
+def test_a_bundle_that_does_not_fit_is_refused(facts: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        automaton_bundle(diamond(), **facts)
+
+
+EXPECTED: dict[str, Any] = {
+    **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},
+    **{"accuracy": 0.5, "clicks": 1.2, "photons": 3.0, "illumination": 9.0, "exposures": 2.5},
+}
+
+
+def test_expected_figures_are_kept_and_checked() -> None:
+    bundle = with_expected(automaton_bundle(), EXPECTED)
+    assert bundle.expected == EXPECTED
+    for change in ({"accuracy": 1.5}, {"clicks": 2.6}, {"exposures": 3.5}, {"objects": 0}, {"split": ""}, {"more": 1}):
+        with pytest.raises(UsageError, match=rf"expected.*{next(iter(change))}|expected has the keys"):
+            with_expected(automaton_bundle(), EXPECTED | change)
