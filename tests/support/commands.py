@@ -1,8 +1,10 @@
-"""A command as a test calls it: words in, the JSON object that it printed out."""
+"""A command as a test calls it: words in, the JSON object that it printed out; and the report page of a file, and its words."""
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,3 +19,13 @@ def json_of(capsys: pytest.CaptureFixture[str], command: str, *words: str | Path
     assert main([*command.split(), *map(str, words), "--json"]) == code
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
+
+
+def page_of(path: Path, tmp_path: Path) -> str:
+    assert main(["report", str(path), "-o", str(tmp_path / "page.html")]) == 0
+    assert [entry.name for entry in tmp_path.iterdir() if "html" in entry.name] == ["page.html"]
+    return (tmp_path / "page.html").read_text()
+
+
+def words_of(page: str) -> str:
+    return html.unescape(re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]+"', "", page)))

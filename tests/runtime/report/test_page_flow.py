@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pages import page_of, words_of
+from commands import page_of, words_of
 
 from pans.runtime.cli import main
 from pans.runtime.record import read_recording
