@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-NO_LABEL = 0xFFFF  # the label of a decision that abstained
+from pans.runtime.decide.verdict import NO_LABEL as NO_LABEL
 
 
 class DecisionFlag(IntFlag):

@@ -31,11 +31,12 @@ from .verdict import softmax_winner as softmax_winner
 MEASURED_CALLS = 200
 
 
-def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> Decider:
+def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto", confidence: float = 0.0) -> Decider:
     """Return a warmed-up back end that has answered the golden vectors of `bundle`.
 
     `auto` takes the table for single shots where there is one, and else the one whose median time for a decision is the least here, among
-    those that answer as the float head does (`choice` says what was measured). UsageError for a back end that the bundle does not have
+    those that answer as the float head does (`choice` says what was measured). An automaton decides by itself; with a `confidence` above 0
+    it stops as soon as a class is that sure, and abstains at a leaf below it. UsageError for a back end that the bundle does not have
     or that cannot answer `shots`; DamagedFileError when it contradicts the golden vectors.
     """
     if backend not in BACKENDS and backend not in offered_backends():
@@ -45,6 +46,13 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
         )
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
+    if bundle.automaton is not None and backend in BACKENDS:
+        return _automaton_decider(bundle, shots, backend, confidence)
+    if confidence:
+        raise UsageError(
+            f"confidence is {confidence:g}, but {bundle.name} shows all its patterns before it decides",
+            remedy="leave it out, or use the bundle of an automaton and its own back end",
+        )
     if bundle.picture_shape is not None:
         if backend not in ("auto", PictureDecider.name):
             raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
@@ -56,11 +64,25 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto") -> De
     return OfferedDecider(offered_backends()[backend], bundle, shots)
 
 
+def _automaton_decider(bundle: Bundle, shots: int, backend: str, confidence: float) -> Decider:
+    from .automaton import AutomatonDecider, demand_one_shot
+
+    if backend not in ("auto", AutomatonDecider.name):
+        raise UsageError(
+            f"back end {backend!r}: {bundle.name} has neither head nor table, its automaton decides",
+            remedy="use the back end auto",
+        )
+    demand_one_shot(shots)
+    return AutomatonDecider(bundle, confidence)
+
+
 def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
     if backend == "table":
         return _table_decider(bundle, shots)
     if backend == "count-table":
         return CountTableDecider(bundle, shots)
+    if backend == "automaton":
+        raise UsageError(f"{bundle.name} has no automaton", remedy="use the back end auto")
     if backend in ("onnx", "int8-onnx"):
         return OnnxDecider(bundle, int8=backend == "int8-onnx")
     from . import mlp as decide_mlp

@@ -16,11 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from pans.runtime.bundle.model import Bundle, golden_violation
 from pans.runtime.errors import DamagedFileError
 
+NO_LABEL = 0xFFFF  # the label of a decision that abstained
 _CHUNK_ROWS = 65536
 
 
 class Verdict(NamedTuple):
-    """A label and the softmax probability of its class; probability 0.0 says that the scores were not finite."""
+    """A label and the probability of its class; probability 0.0 says that the scores were not finite.
+
+    The label `NO_LABEL` says that no class was as sure as was asked for; the probability is that of the surest.
+    """
 
     label: int
     probability: float

@@ -1,0 +1,134 @@
+"""What an automaton does on given objects, exactly: no trials, no sampling error.
+
+Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
+edges into s', in float64: every state is at one depth, so that alpha is whole when its slot comes. Never draws anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
+
+LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB
+_NUMBERS_AT_ONCE = 1 << 22
+_PATTERNS_AT_ONCE = 2048
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedWalk:
+    """Expected sums per decision of each object, float64 (n,), and the chance of each leaf, float64 (n, leaves).
+
+    `photons` are photoelectrons of the light, dark counts not among them; `illumination` the intensities of the patterns that are shown.
+    """
+
+    clicks: F64
+    photons: F64
+    illumination: F64
+    exposures: F64
+    leaves: F64
+
+
+def expected_walk(
+    automaton: Automaton,
+    patterns: NDArray[Any],
+    transmission: NDArray[np.floating[Any]],
+    law: ClickLaw,
+    photons_per_level: float = 1.0,
+) -> ExpectedWalk:
+    """Return what `automaton` does on each of n objects, exactly.
+
+    `patterns` (n_patterns, pixels) times `photons_per_level` are photoelectrons per exposure and unit transmission, lit all the
+    time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
+    ValueError for shapes that do not fit and for more than one channel.
+    """
+    _check_arguments(automaton, patterns, transmission)
+    n, n_leaves = len(transmission), automaton.n_leaves
+    found = ExpectedWalk(*(np.empty(n) for _ in range(4)), np.empty((n, n_leaves)))
+    step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
+    slots = _states_by_slot(automaton)
+    shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level
+    for start in range(0, n, step):
+        here = slice(start, min(start + step, n))
+        light = _light(patterns, transmission[here], photons_per_level)
+        _walk_block(automaton, slots, light, shown, law, found, here)
+    return found
+
+
+def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission: NDArray[Any]) -> None:
+    if automaton.channels != 1:
+        raise ValueError(f"an automaton of {automaton.channels} channels, allowed: 1")
+    if patterns.ndim != 2 or transmission.ndim != 2 or patterns.shape[1] != transmission.shape[1]:
+        raise ValueError(f"patterns {patterns.shape} and objects {transmission.shape}, allowed: the same pixels")
+    if int(automaton.pattern.max()) >= len(patterns):
+        raise ValueError(f"a state shows pattern {automaton.pattern.max()} of {len(patterns)}")
+    if len(transmission) * automaton.n_leaves > LEAF_NUMBERS_MAX:
+        most = LEAF_NUMBERS_MAX // automaton.n_leaves
+        raise ValueError(
+            f"{len(transmission)} objects and {automaton.n_leaves} leaves, allowed: {most} objects at once"
+        )
+
+
+def _states_by_slot(automaton: Automaton) -> list[NDArray[np.int64]]:
+    order = np.argsort(automaton.depth, kind="stable").astype(np.int64)
+    ends = np.searchsorted(automaton.depth[order], np.arange(automaton.n_slots + 1))
+    return [order[ends[slot] : ends[slot + 1]] for slot in range(automaton.n_slots)]
+
+
+def _light(patterns: NDArray[Any], transmission: NDArray[Any], scale: float) -> F64:
+    """Photoelectrons (objects, patterns) at full dwell."""
+    wide = transmission.astype(np.float64)
+    light = np.empty((len(wide), len(patterns)))
+    for start in range(0, len(patterns), _PATTERNS_AT_ONCE):
+        part = patterns[start : start + _PATTERNS_AT_ONCE]
+        light[:, start : start + _PATTERNS_AT_ONCE] = wide @ part.T.astype(np.float64)
+    light *= scale
+    return light
+
+
+def _walk_block(
+    automaton: Automaton,
+    slots: list[NDArray[np.int64]],
+    light: F64,
+    shown: F64,
+    law: ClickLaw,
+    found: ExpectedWalk,
+    here: slice,
+) -> None:
+    alpha = np.zeros((len(light), len(automaton.posteriors)))
+    alpha[:, 0] = 1.0
+    sums = np.zeros((4, len(light)))
+    for states in slots:
+        pattern = automaton.pattern[states]
+        share = automaton.dwell[states] / automaton.dwell_steps
+        photoelectrons = light[:, pattern] * share
+        click = click_probability(law, photoelectrons)
+        miss = np.exp(log_no_click(law, photoelectrons))  # keeps its digits where a click is all but certain
+        reached = alpha[:, states]
+        sums[0] += (reached * click).sum(axis=1)
+        sums[1] += (reached * photoelectrons).sum(axis=1)
+        sums[2] += reached @ (shown[pattern] * share)
+        sums[3] += reached.sum(axis=1)
+        pass_on(alpha, states, automaton.successors, click, miss)
+    for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
+        total[here] = row
+    found.leaves[here] = alpha[:, automaton.n_states :]
+
+
+@njit(cache=True, nogil=True)
+def pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], click: F64, miss: F64) -> None:
+    """Add what leaves each of `states` (m,) to its successors: alpha (n, nodes), click and miss (n, m) the chances of both outcomes."""
+    for i in range(alpha.shape[0]):
+        for k in range(states.size):
+            state = states[k]
+            reached = alpha[i, state]
+            alpha[i, successors[state, 0]] += reached * miss[i, k]
+            alpha[i, successors[state, 1]] += reached * click[i, k]

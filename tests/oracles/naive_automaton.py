@@ -1,0 +1,51 @@
+"""Slow oracles for automata, from the definition: one walk, and sums over all click words in exact or mpmath numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+from pans.runtime.bundle import Automaton
+
+
+class Walk(NamedTuple):
+    """The states that were shown, and the leaf."""
+
+    states: list[int]
+    leaf: int
+
+
+def walk(automaton: Automaton, word: Sequence[int]) -> Walk:
+    """Walk a click word; bit t * channels + k is channel k in slot t."""
+    states: list[int] = []
+    node = 0
+    while node < automaton.n_states:
+        bits = word[len(states) * automaton.channels : (len(states) + 1) * automaton.channels]
+        states.append(node)
+        node = int(automaton.successors[node][sum(2**k for k, bit in enumerate(bits) if bit)])
+    return Walk(states, node - automaton.n_states)
+
+
+def expectation(automaton: Automaton, click: Sequence[Any], one: Any) -> dict[str, Any]:
+    """Sums over all 2**T words of one object: `click[s]` is the chance of a click in state s, `one` the number 1 of their type.
+
+    Returns clicks, exposures, the chance that each state is shown and the chance of each leaf.
+    """
+    zero = one * 0
+    found: dict[str, Any] = {"clicks": zero, "exposures": zero}
+    found["shown"], found["leaves"] = [zero] * automaton.n_states, [zero] * automaton.n_leaves
+    words: dict[tuple[int, ...], Walk] = {}
+    for word in product((0, 1), repeat=automaton.n_slots):
+        passed = walk(automaton, word)
+        words[word[: len(passed.states)]] = passed  # words that differ after the leaf are one walk
+    for word, passed in words.items():
+        chance = one
+        for state, bit in zip(passed.states, word):
+            chance *= click[state] if bit else one - click[state]
+        found["clicks"] += chance * sum(word)
+        found["exposures"] += chance * len(passed.states)
+        found["leaves"][passed.leaf] += chance
+        for state in passed.states:
+            found["shown"][state] += chance
+    return found

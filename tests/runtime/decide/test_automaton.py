@@ -1,0 +1,186 @@
+"""The automaton as a back end: every walk as the oracle, exact expectations as sums over all words, abstention where nothing is sure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import mpmath
+import naive_automaton as naive
+import numpy as np
+import pytest
+from automata import automaton_bundle, diamond, early_leaf, random_automaton
+from bundles import made_bundle
+
+from pans.runtime.bundle import Automaton
+from pans.runtime.decide import make_decider
+from pans.runtime.decide.automaton import AutomatonDecider, walk_words
+from pans.runtime.decide.expectation import expected_walk
+from pans.runtime.decide.verdict import NO_LABEL
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.instrument.click_law import ClickLaw, click_probability
+
+AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=9), random_automaton(2, slots=5, channels=2)]
+
+
+@pytest.mark.uncompiled
+@pytest.mark.parametrize("automaton", AUTOMATA)
+def test_every_walk_as_the_oracle(automaton: Automaton) -> None:
+    words = np.random.default_rng(1).integers(0, 2, (300, automaton.n_bits))
+    leaves, exposures = np.empty(300, np.uint32), np.empty(300, np.uint16)
+    assert walk_words(automaton.successors, words, automaton.channels, leaves, exposures) == -1
+    wanted = [naive.walk(automaton, word) for word in words.tolist()]
+    assert leaves.tolist() == [walk.leaf for walk in wanted]
+    assert exposures.tolist() == [len(walk.states) for walk in wanted]
+    words[17, 0] = 2
+    assert walk_words(automaton.successors, words, automaton.channels, leaves, exposures) == 17
+
+
+@pytest.mark.parametrize("automaton", AUTOMATA)
+def test_all_answers_of_a_decider_agree(automaton: Automaton) -> None:
+    decider = make_decider(automaton_bundle(automaton))
+    assert isinstance(decider, AutomatonDecider)
+    assert (decider.n_features, decider.n_classes) == (automaton.n_bits, automaton.n_classes)
+    words = np.random.default_rng(2).integers(0, 2, (50, automaton.n_bits))
+    found, scores = decider.verdicts(words, 1), decider.scores_batch(words, 1)
+    for i, word in enumerate(words):
+        posterior = automaton.posteriors[automaton.n_states + naive.walk(automaton, word.tolist()).leaf]
+        verdict = decider.decide(word, 1)
+        assert verdict == (posterior.argmax(), posterior.max()) == (found.labels[i], found.probabilities[i])
+        assert np.exp(scores[i]) == pytest.approx(posterior, rel=1e-6)
+    assert decider.decide_batch(words, 1).tolist() == found.labels.tolist()
+
+
+def test_ties_go_to_the_lowest_label() -> None:
+    tied = Automaton([0], [1], 1, [[1, 2]], [[0.4, 0.3, 0.3], [0.25, 0.375, 0.375], [0.4, 0.2, 0.4]])
+    assert make_decider(automaton_bundle(tied)).decide_batch([[0], [1]], 1).tolist() == [1, 0]
+
+
+def test_what_cannot_answer_is_refused() -> None:
+    bundle = automaton_bundle()
+    for backend in ("table", "onnx", "sparse", "int8", "float64", "count-table"):
+        with pytest.raises(UsageError, match="its automaton decides"):
+            make_decider(bundle, backend=backend)
+    with pytest.raises(UsageError, match="not on 3 shots"):
+        make_decider(bundle, shots=3)
+    fixed = made_bundle(table=np.zeros((4, 2)))
+    with pytest.raises(UsageError, match="has no automaton"):
+        make_decider(fixed, backend="automaton")
+    with pytest.raises(UsageError, match=r"confidence is 0\.9"):
+        make_decider(fixed, confidence=0.9)
+    decider = make_decider(bundle, backend="automaton")
+    for counts in ([2, 0, 0], [-1, 0, 0]):
+        with pytest.raises(UsageError, match="clicks of 0 or 1"):
+            decider.decide(np.array(counts), 1)
+        with pytest.raises(ValueError, match="counts run from"):
+            decider.decide_batch([counts], 1)
+
+
+def test_golden_walks_bind_the_back_end() -> None:
+    bundle = automaton_bundle()
+    assert bundle.golden_walks is not None
+    wrong = bundle.golden_walks.copy()
+    wrong[3, -1] += 1 if wrong[3, -1] < 7 else -1
+    with pytest.raises(DamagedFileError, match="golden walk 3"):
+        make_decider(replace(bundle, golden_walks=wrong))
+    with pytest.raises(DamagedFileError, match="contradicts the golden vectors"):
+        make_decider(replace(bundle, golden_scores=bundle.golden_scores[::-1]))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_below_the_confidence_nothing_is_decided(seed: int) -> None:
+    automaton = random_automaton(seed, slots=8)
+    decider = make_decider(automaton_bundle(automaton), confidence=0.8)
+    assert isinstance(decider, AutomatonDecider)
+    words = np.random.default_rng(seed).integers(0, 2, (400, decider.n_features))
+    labels, probabilities = decider.verdicts(words, 1)
+    whole = make_decider(automaton_bundle(automaton))
+    abstained = labels == NO_LABEL
+    assert 0 < abstained.sum() < len(words)
+    assert ((probabilities < np.float32(0.8)) == abstained).all()
+    _, exposures = decider.leaves(words)
+    longer = np.zeros((len(words), whole.n_features), np.int64)
+    longer[:, : words.shape[1]] = words
+    for i in np.flatnonzero(~abstained):
+        states = naive.walk(automaton, longer[i].tolist()).states
+        sure = [s for s in states[1:] if automaton.posteriors[s].max() >= np.float32(0.8)]
+        assert exposures[i] == (automaton.depth[sure[0]] if sure else len(states))
+
+
+# ---- exact expectations ----
+
+
+def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.random((int(automaton.pattern.max()) + 1, 6)) * 0.6, rng.random((n, 6))
+
+
+LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2, 1.5)]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+@pytest.mark.parametrize("automaton", [early_leaf(), diamond(), random_automaton(5, slots=8)])
+def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLaw) -> None:
+    patterns, objects = of_objects(automaton)
+    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5)
+    for i, seen in enumerate(objects):
+        light = [
+            1.5 * float(patterns[p] @ seen) * d / automaton.dwell_steps
+            for p, d in zip(automaton.pattern, automaton.dwell)
+        ]
+        click = [float(click_probability(law, mu)) for mu in light]
+        wanted = naive.expectation(automaton, [Fraction(p) for p in click], Fraction(1))
+        assert found.clicks[i] == pytest.approx(float(wanted["clicks"]), rel=1e-12)
+        assert found.exposures[i] == pytest.approx(float(wanted["exposures"]), rel=1e-12)
+        assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
+        photons = sum(float(chance) * mu for chance, mu in zip(wanted["shown"], light))
+        assert found.photons[i] == pytest.approx(photons, rel=1e-12)
+        whole = [
+            1.5 * patterns[p].sum() * d / automaton.dwell_steps for p, d in zip(automaton.pattern, automaton.dwell)
+        ]
+        assert found.illumination[i] == pytest.approx(
+            sum(float(c) * e for c, e in zip(wanted["shown"], whole)), rel=1e-12
+        )
+        assert found.leaves[i].sum() == pytest.approx(1.0, abs=1e-13)
+
+
+@pytest.mark.parametrize("brightness", [1e-12, 40.0, 150.0])
+def test_chances_keep_their_digits_however_small(brightness: float) -> None:
+    """A leaf behind a missed bright exposure, or behind a click in the dark, against 60 digits."""
+    automaton = random_automaton(6, slots=7, width=3)
+    patterns, objects = of_objects(automaton, n=2)
+    found = expected_walk(automaton, patterns, objects, ClickLaw(), photons_per_level=brightness)
+    with mpmath.workdps(60):
+        for i, seen in enumerate(objects):
+            light = [
+                brightness * float(patterns[p] @ seen) * d / automaton.dwell_steps
+                for p, d in zip(automaton.pattern, automaton.dwell)
+            ]
+            click = [1 - mpmath.exp(-mpmath.mpf(mu)) for mu in light]
+            wanted = naive.expectation(automaton, click, mpmath.mpf(1))
+            for chance, exact in zip(found.leaves[i], wanted["leaves"]):
+                if exact > mpmath.mpf("1e-290"):  # below it float64 ends
+                    assert abs(chance - exact) < 1e-10 * exact
+            assert min(wanted["leaves"]) < 1e-10 or brightness < 1
+
+
+def test_objects_in_pieces_are_objects_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    automaton = random_automaton(7, slots=6)
+    patterns, objects = of_objects(automaton, n=23)
+    whole = expected_walk(automaton, patterns, objects, ClickLaw(0.01))
+    monkeypatch.setattr("pans.runtime.decide.expectation._NUMBERS_AT_ONCE", 5 * len(automaton.posteriors))
+    monkeypatch.setattr("pans.runtime.decide.expectation._PATTERNS_AT_ONCE", 2)
+    pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01))
+    for name in ("clicks", "photons", "illumination", "exposures", "leaves"):
+        assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-13)
+
+
+def test_expectations_refuse_what_does_not_fit() -> None:
+    automaton = diamond()
+    patterns, objects = of_objects(automaton)
+    with pytest.raises(ValueError, match="the same pixels"):
+        expected_walk(automaton, patterns[:, 1:], objects, ClickLaw())
+    with pytest.raises(ValueError, match="shows pattern 2 of 2"):
+        expected_walk(automaton, patterns[:2], objects, ClickLaw())
+    with pytest.raises(ValueError, match="2 channels"):
+        expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw())
