@@ -11,6 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.wire.commands import PARALLEL
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """An automaton that the device follows: pattern int64 and light float64 (states,), successors int64 (states, 2).
+
+    `light` is the part of the exposure that the light is on. The successors are those after no click and after one; from
+    `len(pattern)` on they are leaves.
+    """
+
+    pattern: NDArray[np.int64]
+    light: NDArray[np.float64]
+    successors: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +40,11 @@ class Program:
     offsets: NDArray[np.int64]
     patterns: NDArray[np.uint16]
     blocks: tuple[tuple[int, int], ...]
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the clicks choose what is shown."""
+        return bool((self.patterns == ADAPTIVE_PATTERN).any())
 
     @property
     def n_slots(self) -> int:

@@ -18,14 +18,17 @@ from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire import messages as wire
+from pans.runtime.wire.automata import Extension, announcement, unpack_masks, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
 from .gates import GATE_CHANNELS, Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
+from .states import ShowList, StateMemory
 from .stream_buffer import U32, StreamBuffer
 from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Refused
 from .view import View
+from .walking import PatternLight
 
 if TYPE_CHECKING:
     from .parallel import FrameRun
@@ -75,6 +78,11 @@ class Instrument:
         self.gates = Gates()
         self._epoch, self._tick, self._tick_hz = epoch, power_on_tick, profile.clock.tick_hz
         self._draws = 0  # exposures drawn in earlier runs
+        projector = profile.projector
+        automata = (
+            profile.mode == "sequential" and optics is None
+        )  # what the clicks choose must be shown one after another
+        self.extension = Extension(projector.automaton_states, projector.dwell_steps) if automata else None
         self.stream = StreamBuffer(buffer_messages)
         self._out: list[bytes | memoryview] = []
         self._forget_session()
@@ -83,8 +91,10 @@ class Instrument:
         projector = self.profile.projector
         pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
-        self._plan = PlanMemory(self.profile)
-        self._light: tuple[tuple[int, int, int], Table] | None = None
+        self._plan = PlanMemory(self.profile, adaptive=self.extension is not None)
+        self._states = StateMemory(self.extension or Extension(0, 1))
+        self._shows: ShowList | None = None  # of a run that the host drives
+        self._light: tuple[tuple[int, int, int, bool], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
         self._run: Measurement | FrameRun | None = None
         self._lease_tick: int | None = None
@@ -173,7 +183,7 @@ class Instrument:
             self._out += self.stream.put(rest, self.session)
         self._exposures_ended = run.ended_by(self._tick)
         self._draws += run.begun_by(self._tick)
-        self._run = self._lease_tick = None
+        self._run = self._lease_tick = self._shows = None
         if reason is not StateReason.COMPLETED:
             self.gates.close_all(self._tick)
         self._enter(state, reason)
@@ -235,26 +245,31 @@ class Instrument:
         profile = self.profile
         optics, scene = self.view.optics, self.view.scene
         passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
-        return passive | {
-            "firmware": FIRMWARE,
-            "serial": f"SIM-{self.view.seed & U32:08X}",
-            "epoch": self._epoch,
-            "tick_hz": self._tick_hz,
-            "tick": self._tick,
-            "mode": profile.mode,
-            "channels": profile.detector.channels,
-            "levels": profile.projector.levels,
-            "pattern_memory": profile.projector.pattern_memory,
-            "pattern_pixels": min(profile.projector.width_px * profile.projector.height_px, MAX_PATTERN_PIXELS),
-            "slot_memory": MAX_SLOTS,
-            "buffer_messages": self.stream.capacity,
-            "simulated": True,
-            "profile": profile.name,
-            "gate_channels": GATE_CHANNELS,
-            "scene": scene.name[:60],  # a receiver takes at most 256 bytes of text
-            "objects": scene.n_objects,
-            "seed": self.view.seed,
-        }
+        automata = {} if self.extension is None else announcement(self.extension)
+        return (
+            passive
+            | automata
+            | {
+                "firmware": FIRMWARE,
+                "serial": f"SIM-{self.view.seed & U32:08X}",
+                "epoch": self._epoch,
+                "tick_hz": self._tick_hz,
+                "tick": self._tick,
+                "mode": profile.mode,
+                "channels": profile.detector.channels,
+                "levels": profile.projector.levels,
+                "pattern_memory": profile.projector.pattern_memory,
+                "pattern_pixels": min(profile.projector.width_px * profile.projector.height_px, MAX_PATTERN_PIXELS),
+                "slot_memory": MAX_SLOTS,
+                "buffer_messages": self.stream.capacity,
+                "simulated": True,
+                "profile": profile.name,
+                "gate_channels": GATE_CHANNELS,
+                "scene": scene.name[:60],  # a receiver takes at most 256 bytes of text
+                "objects": scene.n_objects,
+                "seed": self.view.seed,
+            }
+        )
 
     def _grant(self, grant: wire.Grant) -> None:
         if self._run is not None and grant.lease_ms:
@@ -292,9 +307,14 @@ class Instrument:
             if self.view.optics is not None:
                 raise Refused(AckStatus.OUT_OF_RANGE, "passive optics: there is no projector to show a pattern")
             self._patterns.load(unpack_pattern(body))
+        elif opcode in (Opcode.LOAD_MASKS, Opcode.LOAD_STATES, Opcode.SHOW) and self.extension is not None:
+            self._automaton(Opcode(opcode), body)
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
-            self._plan.load(unpack_plan(body))
+            chunk = unpack_plan(body)
+            self._plan.load(chunk)
+            if chunk.first_slot == 0:
+                self._states.forget()
             if self._plan.program is not None:
                 with suppress(Refused):  # ARM says what is wrong
                     self._light_table(self._plan.program)  # seconds for many pictures in flow: ARM must not wait for it
@@ -312,6 +332,24 @@ class Instrument:
         else:
             raise Refused(AckStatus.UNKNOWN_OPCODE, f"opcode {opcode:#04x} is not in protocol {wire.PROTOCOL_VERSION}")
 
+    def _automaton(self, opcode: Opcode, body: bytes) -> None:
+        """The commands of protocol.md, section 11."""
+        if opcode == Opcode.SHOW:
+            run, shows, program = self._run, self._shows, self._plan.program
+            if run is None or shows is None or program is None:
+                raise Refused(AckStatus.WRONG_STATE, "SHOW needs a run whose states the host names")
+            shows.put(unpack_show(body), program, run.begun_by(self._tick), run.n_exposures)
+            return
+        self._require_idle(opcode.name)
+        if opcode == Opcode.LOAD_MASKS:
+            self._patterns.load_masks(unpack_masks(body))
+            return
+        self._states.load(unpack_states(body), self._plan.program)
+        if self._states.states is not None:
+            from . import walk_kernels
+
+            walk_kernels.warm_up()  # ARM must not wait for a compiler
+
     def _require_idle(self, what: str) -> None:
         if self.state is not DeviceState.IDLE:
             hint = ": RESET leaves it" if self.state is DeviceState.SAFE else ""
@@ -322,15 +360,19 @@ class Instrument:
         if program is None:
             raise Refused(AckStatus.WRONG_STATE, "no complete plan is loaded")
         check_arm(program, arm, self._tick, self._tick_hz)
-        self._run = self.view.run(program, arm, self._light_table(program), self._draws)
+        if self._states.begun:
+            raise Refused(AckStatus.WRONG_STATE, "some states of the automaton have not come")
+        shows = ShowList(self._states.extension) if program.adaptive and self._states.states is None else None
+        self._run = self.view.run(program, arm, self._light_table(program), self._draws, shows or self._states.states)
+        self._shows = shows
         self.stream.restart()
         self._exposures_ended = 0
         self._renew(arm.lease_ms)
         self._enter(DeviceState.ARMED, StateReason.NONE)
 
-    def _light_table(self, program: Program) -> Table:
+    def _light_table(self, program: Program) -> Table | PatternLight:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
-        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks)
+        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks, program.adaptive)
         if self._light is None or self._light[0] != key:
             patterns = self._patterns.stack(program.n_patterns) if self.view.optics is None else None
             self._light = (key, self.view.tabulate(program, patterns))

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program
-from pans.firmware_sim.scene.drawing import ClickSource
-from pans.firmware_sim.scene.light import StillObjects
+from pans.firmware_sim.scene.light import StillMarks
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import NO_OBJECT, AckStatus, ClickBlock, FrameBlock, Mark
 
 from .upload import Refused
+from .walking import SlotSource
 
-BATCH_NUMBERS = 1 << 14  # clicks drawn at a time
 MAX_LEASE_MS = 3_600_000  # an hour without a word from the host
 MAX_ARM_AHEAD_S = 3600
 MAX_TICK = 1 << 62  # ticks are signed 64-bit numbers in the kernels; a cycle more does not overflow
@@ -49,6 +48,11 @@ class Timetable:
         )  # at which the last cycle is over; None when the run lasts until STOP
 
     @property
+    def n_exposures(self) -> int | None:
+        """Exposures of the whole run; None when it lasts until STOP."""
+        return None if self._n_cycles is None else self._n_cycles * self._program.n_slots
+
+    @property
     def start_tick(self) -> int:
         """The tick at which the first cycle begins."""
         return self._start_tick
@@ -70,7 +74,7 @@ class Timetable:
 class Measurement(Timetable):
     """The run that ARM started; `next_tick` is the tick of the next message, None after the last."""
 
-    def __init__(self, program: Program, arm: Arm, light: StillObjects, source: ClickSource) -> None:
+    def __init__(self, program: Program, arm: Arm, light: StillMarks, source: SlotSource) -> None:
         super().__init__(program, arm)
         self._light, self._source = light, source
         self._block_ends = [
@@ -79,6 +83,7 @@ class Measurement(Timetable):
         self._cycle, self._block, self._cycle_tick = 0, 0, arm.start_tick
         self._mark_tick = self._next_mark_tick()
         self._batch = np.zeros((0, 1), np.uint8)
+        self._stamps = np.zeros(0, np.uint16)
         self._batch_first = 0
         self._before_batch = np.zeros(1, np.uint8)
         self.next_tick: int | None = None
@@ -137,19 +142,24 @@ class Measurement(Timetable):
         exposure = self._cycle * program.n_slots + first
         tick = self._cycle_tick + int(program.offsets[first])
         number = (self._cycle // program.cycles_per_object) % NO_OBJECT
-        clicks = self._clicks(exposure, count)
-        patterns = program.patterns[first : first + count]
+        patterns, clicks = self._drawn(exposure, count)
         return ClickBlock(0, 0, tick, exposure, program.slot_period_ticks, number, patterns, clicks)
 
-    def _clicks(self, first: int, count: int) -> NDArray[np.uint8]:
+    def _drawn(self, first: int, count: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        """What was shown, uint16 (count,), and the clicks, uint8 (count,)."""
         start = first - self._batch_first
         if start + count > len(self._batch):
             if start:  # forget what has been sent, but for the clicks of the last exposure
-                self._before_batch, self._batch = self._batch[start - 1], self._batch[start:]
+                self._before_batch, self._batch, self._stamps = (
+                    self._batch[start - 1],
+                    self._batch[start:],
+                    self._stamps[start:],
+                )
                 self._batch_first = first
             before = self._batch[-1] if len(self._batch) else self._before_batch
-            missing = max(count - len(self._batch), BATCH_NUMBERS)
-            new = self._source.clicks(first + len(self._batch), missing, before)
-            self._batch = np.concatenate([self._batch, new]) if len(self._batch) else new
+            missing = max(count - len(self._batch), self._source.ahead)
+            stamps, clicks = self._source.exposures(first + len(self._batch), missing, before)
+            self._batch = np.concatenate([self._batch, clicks]) if len(self._batch) else clicks
+            self._stamps = np.concatenate([self._stamps, stamps]) if len(self._stamps) else stamps
             start = 0
-        return self._batch[start : start + count, 0]
+        return self._stamps[start : start + count], self._batch[start : start + count, 0]

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.wire.automata import MaskChunk
 from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk, PlanChunk
-from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, DARK_PATTERN, MAX_PAYLOAD_BYTES, AckStatus
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, BLOCK_HEADER_BYTES, DARK_PATTERN, MAX_PAYLOAD_BYTES, AckStatus
 
 MAX_PATTERN_PIXELS = 1 << 22
 MAX_UPLOAD_BYTES = 1 << 28
@@ -48,15 +49,32 @@ class PatternMemory:
     max_pixels: int
     levels: int
     revision: int = 0
+    held_bytes: int = 0
     _patterns: dict[int, _Pattern] = field(default_factory=dict)
 
     def load(self, chunk: PatternChunk) -> None:
         """Store one chunk, or raise `Refused`."""
+        top = int(chunk.levels.max())
+        _require(top < self.levels, lambda: f"level {top}: the projector has 0..{self.levels - 1}")
+        self._store(chunk)
+
+    def load_masks(self, chunk: MaskChunk) -> None:
+        """Store masks as patterns of the levels 0 and 1, or raise `Refused` and store none."""
+        count, held = len(chunk.rows), self.held_bytes
+        last = chunk.first_pattern + count - 1
+        _require(last < self.capacity, lambda: f"pattern {last}: memory holds {self.capacity}")
+        if chunk.first_pixel == 0:  # before any of them is stored: a refused command stores nothing
+            known = (self._patterns.get(index) for index in range(chunk.first_pattern, last + 1))
+            wanted = held + 2 * count * chunk.n_pixels - sum(one.levels.nbytes for one in known if one is not None)
+            _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
+        for row, packed in enumerate(chunk.rows):
+            levels = np.unpackbits(packed, count=chunk.pixels, bitorder="little").astype(np.uint16)
+            self._store(PatternChunk(chunk.first_pattern + row, chunk.first_pixel, chunk.n_pixels, levels))
+
+    def _store(self, chunk: PatternChunk) -> None:
         _require(chunk.pattern < self.capacity, lambda: f"pattern {chunk.pattern}: memory holds {self.capacity}")
         allowed = min(self.max_pixels, MAX_PATTERN_PIXELS)
         _require(chunk.n_pixels <= allowed, lambda: f"pattern of {chunk.n_pixels} pixels: allowed {allowed}")
-        top = int(chunk.levels.max())
-        _require(top < self.levels, lambda: f"level {top}: the projector has 0..{self.levels - 1}")
         pattern = self._patterns.get(chunk.pattern)
         if chunk.first_pixel == 0:
             pattern = self._new(chunk)
@@ -69,9 +87,10 @@ class PatternMemory:
         self.revision += 1
 
     def _new(self, chunk: PatternChunk) -> _Pattern:
-        held = sum(pattern.levels.nbytes for index, pattern in self._patterns.items() if index != chunk.pattern)
-        wanted = held + 2 * chunk.n_pixels
+        before = self._patterns.get(chunk.pattern)
+        wanted = self.held_bytes + 2 * chunk.n_pixels - (0 if before is None else before.levels.nbytes)
         _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
+        self.held_bytes = wanted
         pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, np.uint16))
         return pattern
 
@@ -94,6 +113,7 @@ class PlanMemory:
     """The uploaded plan; `program` is None until its last slot has come and all of it can be done."""
 
     profile: Profile
+    adaptive: bool = False  # whether the clicks may choose what a slot shows
     program: Program | None = None
     _head: PlanChunk | None = None
     _slots: list[NDArray[np.void]] = field(default_factory=list)
@@ -108,7 +128,7 @@ class PlanMemory:
             raise Refused(
                 AckStatus.OUT_OF_RANGE, f"slot {chunk.first_slot} does not continue the plan at {self._filled}"
             )
-        _check_slots(chunk)
+        _check_slots(chunk, self.adaptive)
         self._slots.append(chunk.slots)
         self._filled += len(chunk.slots)
         if self._filled == chunk.n_slots:
@@ -118,8 +138,12 @@ class PlanMemory:
         offsets = slots["offset_ticks"].astype(np.int64)
         gaps = np.diff(offsets, append=offsets[0] + head.cycle_ticks)
         _check_spacing(self.profile, head, gaps)
+        shown = slots["pattern"]
+        adaptive = (shown == ADAPTIVE_PATTERN) & self.adaptive
+        fixed = int(np.count_nonzero(~adaptive & (shown != DARK_PATTERN)))
+        _require(not (fixed and adaptive.any()), lambda: f"{fixed} slots with a fixed pattern beside adaptive ones")
         if head.mode != PARALLEL:
-            _check_pattern_rate(self.profile, head, offsets, slots["pattern"])
+            _check_pattern_rate(self.profile, head, offsets[adaptive | (shown != np.roll(shown, 1))])
         return Program(
             head.mode, head.n_patterns, head.exposure_ticks, head.slot_period_ticks, head.cycle_ticks,
             head.cycles_per_object, offsets, slots["pattern"].astype(np.uint16),
@@ -153,12 +177,13 @@ def _check_head(profile: Profile, head: PlanChunk) -> None:
     _require(head.cycles_per_object > 0, lambda: "0 cycles per object: at least 1 is needed")
 
 
-def _check_slots(chunk: PlanChunk) -> None:
+def _check_slots(chunk: PlanChunk, adaptive: bool) -> None:
     last = int(chunk.slots["offset_ticks"].max())
     limit = chunk.cycle_ticks
     _require(last < limit, lambda: f"exposure at {last} of a cycle of {limit} ticks")
     shown = chunk.slots["pattern"]
-    lit = shown[shown != DARK_PATTERN]
+    chosen = (shown == ADAPTIVE_PATTERN) & adaptive
+    lit = shown[(shown != DARK_PATTERN) & ~chosen]
     top = int(lit.max()) if lit.size else 0
     _require(top < chunk.n_patterns, lambda: f"a slot shows pattern {top}: the plan has {chunk.n_patterns}")
 
@@ -171,11 +196,8 @@ def _check_spacing(profile: Profile, head: PlanChunk, gaps: NDArray[np.int64]) -
     _require(shortest >= needed, lambda: f"exposures {shortest} ticks apart: at least {needed} are needed")
 
 
-def _check_pattern_rate(
-    profile: Profile, head: PlanChunk, offsets: NDArray[np.int64], shown: NDArray[np.uint16]
-) -> None:
-    """Refuse patterns that follow each other faster than the projector can change them."""
-    changes = offsets[shown != np.roll(shown, 1)]
+def _check_pattern_rate(profile: Profile, head: PlanChunk, changes: NDArray[np.int64]) -> None:
+    """Refuse patterns that follow each other faster than the projector can change them, at ticks `changes` of the cycle."""
     if not len(changes):
         return
     shortest = int(np.diff(changes, append=changes[0] + head.cycle_ticks).min())

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.firmware_sim.program import Program
+from pans.firmware_sim.program import Program, States
 from pans.firmware_sim.scene.changes import Changes
 from pans.firmware_sim.scene.detector_model import detector_model
 from pans.firmware_sim.scene.drawing import ClickSource
 from pans.firmware_sim.scene.exposure_times import Exposures
-from pans.firmware_sim.scene.light import RunLight, StillObjects, Table, begin, prepare, tabulate, warm_up
+from pans.firmware_sim.scene.light import RunLight, StillMarks, StillObjects, Table, begin, prepare, tabulate, warm_up
 from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.optics import passive_photoelectrons
 from pans.firmware_sim.scene.still import Scene
@@ -29,7 +29,9 @@ from pans.runtime.wire.commands import PARALLEL, Arm
 from pans.runtime.wire.messages import AckStatus
 
 from .sequential import Measurement
+from .states import ShowList
 from .upload import Refused
+from .walking import PatternLight, PlanSource, ShownSource, Walked, WalkSource
 
 if TYPE_CHECKING:
     from .parallel import FrameRun
@@ -69,10 +71,13 @@ class View:
         """The exposure time of `program` on this instrument's clock."""
         return program.exposure_ticks * 1e6 / self.profile.clock.tick_hz
 
-    def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None) -> Table:
+    def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None) -> Table | PatternLight:
         """Return the light of the scene through `patterns`, uint16 (n, pixels), or through the optics; `Refused` if they do not fit."""
         exposure_us = self.exposure_us(program)
         try:
+            if patterns is not None and program.adaptive:
+                assert isinstance(self.scene.what, Scene)  # see check_and_warm_up
+                return PatternLight(self.profile, self.scene.what, patterns, exposure_us)
             if patterns is not None:
                 return prepare(self.profile, self.scene, patterns, exposure_us)
             assert self.optics is not None
@@ -97,11 +102,35 @@ class View:
         model = detector_model(self.profile, self.exposure_us(program))
         return light, ClickSource(light, exposures, model, changes, self.seed, first_draw)
 
-    def run(self, program: Program, arm: Arm, table: Table, first_draw: int = 0) -> Measurement | FrameRun:
-        """Return the run that ARM starts: pattern after pattern, or of all channels at once."""
+    def run(
+        self,
+        program: Program,
+        arm: Arm,
+        table: Table | PatternLight,
+        first_draw: int = 0,
+        drive: States | ShowList | None = None,
+    ) -> Measurement | FrameRun:
+        """Return the run that ARM starts: pattern after pattern, or of all channels at once; `drive` chooses patterns by the clicks."""
+        if isinstance(table, PatternLight):
+            assert drive is not None
+            return self._walks(program, arm, table, first_draw, drive)
         light, source = self.light_and_clicks(program, arm.n_cycles, table, first_draw)
         if isinstance(light, StillObjects) and program.mode != PARALLEL:
-            return Measurement(program, arm, light, source)
+            return Measurement(program, arm, light, PlanSource(program, source))
         from .parallel import FrameRun  # numba is loaded only for parallel instruments
 
         return FrameRun(program, arm, light, source, self.scene.moves)
+
+    def _walks(
+        self, program: Program, arm: Arm, light: PatternLight, first_draw: int, drive: States | ShowList
+    ) -> Measurement:
+        scene = self.scene.what
+        assert isinstance(scene, Scene)
+        exposures = Exposures(program, arm.n_cycles or None, self.profile.clock.tick_hz)
+        changes = Changes(self.scene.changes, program.channels)
+        model = detector_model(self.profile, self.exposure_us(program))
+        walked = Walked(program, light, scene.n_objects, exposures, changes, model, self.seed, first_draw)
+        source = ShownSource(walked, drive) if isinstance(drive, ShowList) else WalkSource(walked, drive)
+        return Measurement(
+            program, arm, StillMarks(scene, program, exposures, changes, source.expected_photoelectrons), source
+        )

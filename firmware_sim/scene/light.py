@@ -6,6 +6,7 @@ says; cells and tape have modules of their own, with numba, loaded only where so
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
@@ -116,17 +117,22 @@ def begin(
     return TapeFlow(cast(Tape, what), cast("BarTable", table), exposures, changes, flow_seed)
 
 
-class StillObjects:
-    """Objects that stand still for `cycles_per_object` cycles each, in the order of the scene, and start over at its end."""
+class StillMarks:
+    """The marks of objects that stand still for `cycles_per_object` cycles each, in the order of the scene, which starts over at its end.
+
+    `photons` gives what one shot on an object of the scene brings in expectation; NaN where that is not known.
+    """
 
     def __init__(
-        self, scene: Scene, table: LightTable, program: Program, exposures: Exposures, changes: Changes
+        self,
+        scene: Scene,
+        program: Program,
+        exposures: Exposures,
+        changes: Changes,
+        photons: Callable[[int], float],
     ) -> None:
         self._scene, self._program, self._exposures, self._changes = scene, program, exposures, changes
-        self._photons = table.photoelectrons.sum(axis=1)
-        self._light = _by_row(table.photoelectrons, program.mode)
-        self.probability: F64 | None = _by_row(table.probability, program.mode)
-        self._column = np.where(program.patterns == DARK_PATTERN, program.n_patterns, program.patterns).astype(np.int64)
+        self._photons_of = photons
         self._object = 0
 
     @property
@@ -135,7 +141,7 @@ class StillObjects:
         exposure = self._object * self._program.cycles_per_object * self._program.n_slots
         tick = int(self._exposures.begins(exposure, 1)[0])
         number = self._object % NO_OBJECT
-        photons = float(self._photons[number % self._scene.n_objects])
+        photons = self._photons_of(number % self._scene.n_objects)
         if self._changes:
             photons *= float(self._changes.efficiency(np.array([tick / self._exposures.tick_hz]))[0])
         return Mark(0, number, self._scene.truth(number % self._scene.n_objects), exposure, tick, photons)
@@ -143,6 +149,19 @@ class StillObjects:
     def take_mark(self) -> None:
         """Go on to the mark after."""
         self._object += 1
+
+
+class StillObjects(StillMarks):
+    """Still objects under the fixed patterns of a plan."""
+
+    def __init__(
+        self, scene: Scene, table: LightTable, program: Program, exposures: Exposures, changes: Changes
+    ) -> None:
+        super().__init__(scene, program, exposures, changes, lambda number: float(self._photons[number]))
+        self._photons = table.photoelectrons.sum(axis=1)
+        self._light = _by_row(table.photoelectrons, program.mode)
+        self.probability: F64 | None = _by_row(table.probability, program.mode)
+        self._column = np.where(program.patterns == DARK_PATTERN, program.n_patterns, program.patterns).astype(np.int64)
 
     def take_marks(self, before_tick: int) -> I64:
         """See `RunLight`."""

@@ -1,18 +1,25 @@
-"""A plan as the LOAD_PLAN bodies that a device is sent, and back.
+"""A plan as the LOAD_PLAN and LOAD_STATES bodies that a device is sent, and back.
 
-Owns the conversion; never sends anything. The bodies themselves are laid out in wire/commands.py.
+Owns the conversion; never sends anything. The bodies themselves are laid out in wire/commands.py and wire/automata.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pans.runtime.wire.automata import MAX_STATES_PER_CHUNK, StateChunk
 from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk
-from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, MalformedMessage
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage
+from pans.runtime.wire.schema import STATE_DTYPE
 
-from .plan import Plan
+from .layout import Plan
+
+if TYPE_CHECKING:
+    from pans.runtime.bundle.automaton import Automaton
 
 SLOTS_MAX = 1 << 24  # of a plan that is rebuilt: 256 MiB
 
@@ -40,8 +47,27 @@ def plan_chunks(plan: Plan) -> list[PlanChunk]:
     ]
 
 
-def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:
-    """Invert `plan_chunks`: the plan that a device was sent; MalformedMessage when slots are missing."""
+def state_chunks(plan: Plan) -> list[StateChunk]:
+    """Return the automaton that the device is to follow as LOAD_STATES bodies; none of a plan that it does not drive."""
+    return [] if plan.automaton is None or plan.drive != "device" else _chunks_of(plan.automaton)
+
+
+def _chunks_of(automaton: Automaton) -> list[StateChunk]:
+    states = np.zeros(automaton.n_states, STATE_DTYPE)
+    states["pattern"], states["dwell"] = automaton.pattern, automaton.dwell
+    states["next_dark"], states["next_click"] = automaton.successors.T
+    starts = range(0, len(states), MAX_STATES_PER_CHUNK)
+    head = automaton.dwell_steps, automaton.n_leaves
+    return [StateChunk(len(states), first, *head, states[first : first + MAX_STATES_PER_CHUNK]) for first in starts]
+
+
+def plan_from_chunks(
+    chunks: Sequence[PlanChunk], tick_hz: int, automaton: Automaton | None = None, states: Sequence[StateChunk] = ()
+) -> Plan:
+    """Invert `plan_chunks` and `state_chunks`: the plan that a device was sent, with the `automaton` that it was made for.
+
+    MalformedMessage when slots or states are missing, or the states are not those of `automaton`.
+    """
     if not chunks:
         raise MalformedMessage("no plan was sent to the device")
     if not 1 <= chunks[-1].n_slots <= SLOTS_MAX:
@@ -57,7 +83,10 @@ def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:
     if covered < len(slots):
         raise MalformedMessage(f"{covered} of {len(slots)} slots of the plan were sent")
     lit = slots["pattern"] != DARK_PATTERN
-    if not lit.any() or not head.n_patterns or int(slots["pattern"][lit].max()) >= head.n_patterns:
+    adaptive = slots["pattern"] == ADAPTIVE_PATTERN
+    _check_automaton(slots[adaptive], automaton, states)
+    fixed = slots["pattern"][lit & ~adaptive]
+    if not lit.any() or not head.n_patterns or (fixed.size and int(fixed.max()) >= head.n_patterns):
         raise MalformedMessage("a plan that shows no pattern, or one that it does not have")
     if (
         min(head.exposure_ticks, head.slot_period_ticks, head.cycle_ticks, head.cycles_per_object, head.block_exposures)
@@ -77,4 +106,22 @@ def plan_from_chunks(chunks: Sequence[PlanChunk], tick_hz: int) -> Plan:
         cycles_per_object=head.cycles_per_object,
         block_exposures=head.block_exposures,
         exposure_us=head.exposure_ticks * 1e6 / tick_hz,
+        automaton=automaton,
+        drive="" if automaton is None else "device" if states else "host",
     )
+
+
+def _check_automaton(adaptive: NDArray[Any], automaton: Automaton | None, states: Sequence[StateChunk]) -> None:
+    """Raise MalformedMessage unless the adaptive slots and the states that were sent are those of `automaton`."""
+    walk = 0 if automaton is None else automaton.n_slots
+    if len(adaptive) != walk:
+        raise MalformedMessage(f"a plan of {len(adaptive)} adaptive slots for walks of {walk} exposures")
+    if automaton is None or not states:
+        if states:
+            raise MalformedMessage("states were sent, but no automaton is known")
+        return
+    sent = {chunk.first_state: chunk for chunk in states}
+    for chunk in _chunks_of(automaton):
+        found = sent.get(chunk.first_state)
+        if found is None or found[:4] != chunk[:4] or found.states.tobytes() != chunk.states.tobytes():
+            raise MalformedMessage(f"the states from {chunk.first_state} on were not sent as the automaton has them")

@@ -25,7 +25,11 @@ MAX_PROFILE_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Projector:
-    """What shows the patterns; `peak_photoelectrons_hz`: what one pixel at the top level yields through a clear object."""
+    """What shows the patterns; `peak_photoelectrons_hz`: what one pixel at the top level yields through a clear object.
+
+    `automaton_states`: most states of an automaton that the device follows by itself, 0 if it cannot; `dwell_steps`: into how many steps
+    it divides the time that the light is on within an exposure, 1 if it cannot.
+    """
 
     kind: str
     width_px: int
@@ -35,6 +39,8 @@ class Projector:
     pattern_rate_max_hz: float
     pattern_memory: int
     peak_photoelectrons_hz: float
+    automaton_states: int = 0
+    dwell_steps: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +88,14 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """A decision follows the last exposure within the deadline; the device goes dark when the lease is not renewed."""
+    """A decision follows the last exposure within the deadline; the device goes dark when the lease is not renewed.
+
+    `host_turn_us`: from the end of an exposure until the projector knows the next pattern, where the host names it.
+    """
 
     decision_deadline_us: float
     lease_ms: int
+    host_turn_us: float = 1000.0
 
 
 @dataclass(frozen=True, slots=True)

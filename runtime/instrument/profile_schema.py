@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pans.runtime.errors import ConfigError
+from pans.runtime.wire.fields import MAX_STATES
 
 from .checked_toml import Key, KeyPath, Position, found, near, position_of, type_remedy
 
@@ -35,6 +36,8 @@ _SCHEMA: dict[str, dict[str, Key]] = {
         "pattern_rate_max_hz": Key("number", 0, 1e9, above=True),
         "pattern_memory": Key("whole", 1, 65535),  # 65535 patterns are 0..0xFFFE: 0xFFFF is the dark pattern
         "peak_photoelectrons_hz": Key("number", 0, 1e15, above=True),
+        "automaton_states": Key("whole", 0, MAX_STATES, required=False),
+        "dwell_steps": Key("whole", 1, 65535, required=False),
     },
     "object": {
         "contrast": Key("number", 1, 1e12, above=True, infinite=True),
@@ -61,6 +64,7 @@ _SCHEMA: dict[str, dict[str, Key]] = {
     "timing": {
         "decision_deadline_us": Key("number", 0, 1e9, above=True),
         "lease_ms": Key("whole", 1, 3_600_000),
+        "host_turn_us": Key("number", 0, 1e9, required=False),
     },
 }
 _OPTIONAL_SECTIONS = ("object", "sources")

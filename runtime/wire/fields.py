@@ -23,6 +23,8 @@ _BITS = {"B": 8, "H": 16, "I": 32, "Q": 64}
 LARGEST_TICK = (1 << 63) - 1
 MAX_LEASE_MS = 3_600_000
 U16_MAX, U32_MAX = (1 << 16) - 1, (1 << 32) - 1
+MAX_STATES = 0xFFFD  # of an automaton: the two numbers above mean "chosen by the clicks" and "dark"
+MAX_LEAVES = 1 << 20
 
 
 class Field(NamedTuple):
@@ -159,6 +161,37 @@ MESSAGES: Mapping[str, tuple[Field, ...]] = {
         _reserved("H"),
     ),
 }
+# What a device may know beside version 1, in the order of its own schema text (protocol.md, section 11). Older devices do not announce it.
+AUTOMATON_MESSAGES: Mapping[str, tuple[Field, ...]] = {
+    "LOAD_MASKS": (
+        Field("index", "H", "index of the first"),
+        Field("count", "H", "masks", "patterns", low=1),
+        Field("first_pixel", "I", "first pixel", "pixels"),
+        Field("n_pixels", "I", "pixels in the whole pattern", "pixels", low=1),
+        Field("pixels", "I", "pixels here", "pixels", low=1),
+    ),
+    "LOAD_STATES": (
+        Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES),
+        Field("first_state", "H", "first state", high=MAX_STATES - 1),
+        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
+        _reserved("H"),
+        Field("n_leaves", "I", "leaves", low=1, high=MAX_LEAVES),
+    ),
+    "STATE": (
+        Field("pattern", "H", "pattern", high=U16_MAX - 1),
+        Field("dwell", "H", "dwell", "steps", low=1),
+        Field("next_dark", "I", "successor without a click", low=1, high=MAX_STATES + MAX_LEAVES - 1),
+        Field("next_click", "I", "successor after a click", low=1, high=MAX_STATES + MAX_LEAVES - 1),
+    ),
+    "SHOW": (
+        Field("exposure_index", "Q", "exposure", "exposures", high=LARGEST_TICK),
+        Field("state", "H", "state", high=MAX_STATES - 1),
+        Field("pattern", "H", "pattern", high=U16_MAX - 1),
+        Field("dwell", "H", "dwell", "steps", low=1),
+        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
+    ),
+}
+ALL_MESSAGES: Mapping[str, tuple[Field, ...]] = {**MESSAGES, **AUTOMATON_MESSAGES}
 FROM_DEVICE = (
     "PONG",
     "ACK",
@@ -200,6 +233,9 @@ FACTS: Mapping[str, Fact] = {
     "serial": Fact(str),
     "simulated": Fact(bool),
     "optics_sha256": Fact(str),
+    "automaton_schema": Fact(int, False, 0, U32_MAX),
+    "automaton_states": Fact(int, False, 0, MAX_STATES),
+    "dwell_steps": Fact(int, False, 1, U16_MAX),
 }
 
 
@@ -209,12 +245,12 @@ def layout(name: str) -> str:
     >>> layout("GRANT")
     '<II'
     """
-    return "<" + "".join(field.code for field in MESSAGES[name])
+    return "<" + "".join(field.code for field in ALL_MESSAGES[name])
 
 
 def narrow_fields(name: str) -> tuple[tuple[int, Field], ...]:
     """Return place and field of those whose range is less than what their layout holds."""
-    return tuple((place, field) for place, field in enumerate(MESSAGES[name]) if field.range != field.span)
+    return tuple((place, field) for place, field in enumerate(ALL_MESSAGES[name]) if field.range != field.span)
 
 
 def wrong_facts(facts: Mapping[str, Any]) -> list[str]:

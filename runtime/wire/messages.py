@@ -23,6 +23,7 @@ from .framing import FrameDecoder as FrameDecoder
 from .framing import cobs_decode as cobs_decode
 from .framing import cobs_encode as cobs_encode
 from .framing import encode_frame as encode_frame
+from .schema import ADAPTIVE_PATTERN as ADAPTIVE_PATTERN
 from .schema import BLOCK_HEADER_BYTES as BLOCK_HEADER_BYTES
 from .schema import DARK_PATTERN as DARK_PATTERN
 from .schema import HEADER as HEADER

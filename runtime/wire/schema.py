@@ -14,13 +14,14 @@ import numpy as np
 
 from pans.runtime.errors import PansError
 
-from .fields import MESSAGES, layout
+from .fields import AUTOMATON_MESSAGES, MESSAGES, layout
 
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 65536
 MAX_WELCOME_BYTES = 4096
 MAX_ACK_TEXT_BYTES = 512
 DARK_PATTERN = 0xFFFF
+ADAPTIVE_PATTERN = 0xFFFE  # in a slot of a plan: what is shown there, the clicks before decide
 UNKNOWN_TRUTH = -1
 NO_OBJECT = 0xFFFFFFFF
 
@@ -54,6 +55,9 @@ class Opcode(IntEnum):
     STOP = 0x04
     RESET = 0x05
     GATE = 0x06
+    LOAD_MASKS = 0x07  # this and those below: of the extension for automata
+    LOAD_STATES = 0x08
+    SHOW = 0x09
 
 
 class DeviceState(IntEnum):
@@ -92,9 +96,13 @@ class AckStatus(IntEnum):
 LAYOUTS: dict[str, str] = {name: layout(name) for name in MESSAGES}
 SCHEMA_TEXT = f"pans-wire/{PROTOCOL_VERSION};" + ";".join(f"{name}={layout}" for name, layout in LAYOUTS.items())
 SCHEMA = zlib.crc32(SCHEMA_TEXT.encode("ascii"))
-STRUCTS = {name: struct.Struct(layout) for name, layout in LAYOUTS.items()}
+AUTOMATON_LAYOUTS: dict[str, str] = {name: layout(name) for name in AUTOMATON_MESSAGES}
+AUTOMATON_SCHEMA_TEXT = "pans-automaton/1;" + ";".join(f"{name}={layout}" for name, layout in AUTOMATON_LAYOUTS.items())
+AUTOMATON_SCHEMA = zlib.crc32(AUTOMATON_SCHEMA_TEXT.encode("ascii"))
+STRUCTS = {name: struct.Struct(layout) for name, layout in {**LAYOUTS, **AUTOMATON_LAYOUTS}.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])
+STATE_DTYPE = np.dtype([("pattern", "<u2"), ("dwell", "<u2"), ("next_dark", "<u4"), ("next_click", "<u4")])
 BLOCK_HEADER_BYTES = STRUCTS["CLICKS"].size
 MAX_FRAME_BYTES = HEADER.size + MAX_PAYLOAD_BYTES + 4 + (MAX_PAYLOAD_BYTES + 12) // 254 + 2

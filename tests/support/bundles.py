@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 
 
@@ -26,3 +27,47 @@ def made_bundle(d_f: int = 2, n_classes: int = 2, **facts: Any) -> Bundle:
         part(**{name: given.pop(name) for name in part.__slots__ if name in given}) for part in (Shown, BackEnd)
     )
     return make_bundle(optics=shown, back_end=back_end, **given)
+
+
+def two_states() -> Automaton:
+    """Two classes, walks of one or two exposures: a click in the first decides at once. One exposure time for all."""
+    return Automaton(
+        pattern=[0, 1], dwell=[1, 1], dwell_steps=1, successors=[[1, 2], [3, 4]],
+        posteriors=[[0.5, 0.5], [0.6, 0.4], [0.1, 0.9], [0.8, 0.2], [0.3, 0.7]],
+    )  # fmt: skip
+
+
+def six_states() -> Automaton:
+    """Three classes, walks of two, three or four exposures, three patterns for six states, dwell in quarters of the exposure.
+
+    0 -> 1 | 2      1 -> 3 | 4      2 -> 4 | leaf 0      3 -> 5 | leaf 1      4 -> leaf 2 | 5      5 -> leaf 3 | leaf 4
+    """
+    leaf = 6
+    return Automaton(
+        pattern=[0, 1, 2, 0, 1, 2], dwell=[4, 2, 1, 4, 3, 4], dwell_steps=4,
+        successors=[[1, 2], [3, 4], [4, leaf], [5, leaf + 1], [leaf + 2, 5], [leaf + 3, leaf + 4]],
+        posteriors=[
+            [1 / 3, 1 / 3, 1 / 3], [0.4, 0.4, 0.2], [0.2, 0.3, 0.5], [0.5, 0.4, 0.1], [0.3, 0.4, 0.3], [0.45, 0.45, 0.1],
+            [0.05, 0.05, 0.9], [0.1, 0.8, 0.1], [0.2, 0.6, 0.2], [0.7, 0.2, 0.1], [0.15, 0.7, 0.15],
+        ],
+    )  # fmt: skip
+
+
+def automaton_bundle(automaton: Automaton, photons: float = 1.0, **facts: Any) -> Bundle:
+    """A bundle around `automaton` with patterns of 2 x 3 pixels and two levels; a lit pixel gives `photons` per exposure."""
+    n_patterns = int(automaton.pattern.max()) + 1
+    masks = np.random.default_rng(5).integers(0, 2, (n_patterns, 6))
+    masks[np.arange(n_patterns), np.arange(n_patterns) % 6] = 1  # none is dark
+    toy: dict[str, Any] = {
+        "name": "toy",
+        "task": "test",
+        "classes": [f"c{i}" for i in range(automaton.n_classes)],
+        "image_shape": (2, 3),
+        "provenance": {},
+        "levels": 2,
+        "pattern_levels": masks,
+        "photons_per_level": photons,
+    }
+    given = toy | facts
+    shown = Shown(**{name: given.pop(name) for name in Shown.__slots__})
+    return make_bundle(optics=shown, automaton=automaton, **given)

@@ -13,9 +13,9 @@ from tree import ROOT
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire import walk
-from pans.runtime.wire.fields import FACTS, FROM_DEVICE, LARGEST_TICK, MESSAGES, Fact, Field, wrong_facts
+from pans.runtime.wire.fields import ALL_MESSAGES, FACTS, FROM_DEVICE, LARGEST_TICK, MESSAGES, Fact, Field, wrong_facts
 from pans.runtime.wire.messages import MalformedMessage, decode_welcome
-from pans.runtime.wire.schema import LAYOUTS, SCHEMA, SCHEMA_TEXT, STRUCTS
+from pans.runtime.wire.schema import AUTOMATON_SCHEMA, AUTOMATON_SCHEMA_TEXT, LAYOUTS, SCHEMA, SCHEMA_TEXT, STRUCTS
 
 DOCUMENT = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
 RANGES = DOCUMENT.partition("## 8. Ranges")[2].partition("\n## ")[0]
@@ -39,6 +39,9 @@ FACTS_OF_A_DEVICE = {
         "firmware": "f",
         "serial": "s",
         "simulated": True,
+        "automaton_schema": AUTOMATON_SCHEMA,
+        "automaton_states": 0,
+        "dwell_steps": 1,
     },
 }
 
@@ -111,8 +114,14 @@ def test_the_schema_is_that_of_version_1() -> None:
         assert struct.calcsize(layout) == STRUCTS[name].size
 
 
+def test_the_schema_of_the_extension_for_automata_is_its_own_and_stands_in_the_document() -> None:
+    assert AUTOMATON_SCHEMA == 0xD00A27FF
+    assert AUTOMATON_SCHEMA_TEXT in DOCUMENT
+    assert f"0x{AUTOMATON_SCHEMA:08X}" in DOCUMENT
+
+
 def test_every_field_with_a_name_in_the_document_has_its_range_there() -> None:
-    for name, fields in MESSAGES.items():
+    for name, fields in ALL_MESSAGES.items():
         for field in fields:
             rows = [row for row in ROWS if name in re.split(r", ", row[0]) or row[0] == "all"]
             assert not field.title or any(field.title in row[1] for row in rows), f"{name}: {field.title}"

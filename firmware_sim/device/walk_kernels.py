@@ -1,0 +1,107 @@
+"""The compiled loops of an automaton that the simulated device follows.
+
+Owns the loops and the whole-number thresholds that they compare with; every bit is the one that `scene.detector.sample_clicks` draws.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pans.firmware_sim.scene.detector_kernels import click_thresholds
+from pans.firmware_sim.scene.detector_model import (
+    CHANNEL_STEP,
+    CLICK_STREAM,
+    GOLDEN,
+    MIX_1,
+    MIX_2,
+    DetectorModel,
+    first_click_probability,
+    stream_key,
+)
+from pans.runtime.wire.messages import DARK_PATTERN
+
+_U = np.uint64
+_GOLDEN, _STEP = _U(GOLDEN), _U(CHANNEL_STEP)
+_M1, _M2 = _U(MIX_1), _U(MIX_2)
+_S11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
+
+
+@njit(cache=True, nogil=True)
+def _mix(word):  # type: ignore[no-untyped-def]
+    word = (word ^ (word >> _S30)) * _M1
+    word = (word ^ (word >> _S27)) * _M2
+    return word ^ (word >> _S31)
+
+
+@njit(cache=True, nogil=True)
+def follow(limits, successors, adaptive, key, first, begin, stamps, clicks):  # type: ignore[no-untyped-def]
+    """Follow a walk through slots of one cycle; return the node that it stands in then.
+
+    limits uint64 (2, states + 1): see `thresholds`; successors int64 (states, 2); adaptive bool (n,): which slots show states; `first`: the
+    number of the first exposure in the detector's life; begin: the node, and the click of the exposure before; stamps uint16 (n,) and
+    clicks uint8 (n,) are set.
+    """
+    node, click = begin
+    n_states = successors.shape[0]
+    for i in range(stamps.shape[0]):
+        lit = adaptive[i] and node < n_states
+        limit = limits[click, node if lit else n_states]
+        number = _mix(_mix(_U(first + i) * _GOLDEN + key) + _STEP) >> _S11
+        click = 1 if number < limit else 0
+        clicks[i] = click
+        stamps[i] = node if lit else DARK_PATTERN
+        if lit:
+            node = successors[node, click]
+    return node
+
+
+@njit(cache=True, nogil=True)
+def expected_light(probability, light, successors):  # type: ignore[no-untyped-def]
+    """The light of a walk in expectation: probability and light float64 (states,) of an exposure in each, successors int64 (states, 2)."""
+    n_states = successors.shape[0]
+    reached = np.zeros(n_states)
+    reached[0] = 1.0
+    total = 0.0
+    for state in range(n_states):
+        total += reached[state] * light[state]
+        dark, clicked = successors[state, 0], successors[state, 1]
+        if dark < n_states:
+            reached[dark] += reached[state] * (1.0 - probability[state])
+        if clicked < n_states:
+            reached[clicked] += reached[state] * probability[state]
+    return total
+
+
+def thresholds(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return the whole numbers below which a 53-bit number is a click, uint64 (2, n), after an exposure without and with a click.
+
+    light float64 (n,): photoelectrons expected.
+    """
+    probability = first_click_probability(model, light)
+    primed = probability
+    if model.afterpulse_probability:
+        primed = 1.0 - (1.0 - probability) * (1.0 - model.afterpulse_probability)
+    return click_thresholds(np.stack([probability, primed]))
+
+
+def key_of(seed: int) -> np.uint64:
+    """Return the key of the clicks' random numbers."""
+    return _U(stream_key(seed, CLICK_STREAM))
+
+
+def warm_up() -> None:
+    """Compile or load the loops."""
+    limits, successors = np.zeros((2, 2), np.uint64), np.ones((1, 2), np.int64)
+    follow(
+        limits,
+        successors,
+        np.ones(1, np.bool_),
+        _U(0),
+        0,
+        (0, 0),
+        np.zeros(1, np.uint16),
+        np.zeros((1, 1), np.uint8)[:, 0],
+    )
+    expected_light(np.zeros(1), np.zeros(1), successors)
