@@ -24,6 +24,7 @@ CHANNELS_MAX = 8
 POSTERIOR_SUM_TOLERANCE = 1e-5
 DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
 CONFIDENCE_RANGE = Range(1e-6, 1.0)
+_EDGES_AT_ONCE = 1 << 20  # explored together, so that memory stays small
 _UNREACHED = 0xFFFF  # as a depth: above SLOTS_MAX
 
 
@@ -197,21 +198,25 @@ def _explored(successors: NDArray[Any], n_leaves: int) -> tuple[NDArray[np.uint1
 
     Level by level. Each state is gone through once, as none may come back at another depth.
     """
-    n_states = len(successors)
+    n_states, outcomes = successors.shape
     depth = np.full(n_states, _UNREACHED, np.uint16)
     unreached = np.ones(n_states + n_leaves, np.bool_)
-    frontier, level = np.zeros(1, np.int64), 0
+    shown_next = np.zeros(n_states, np.bool_)
+    frontier, level, step = np.zeros(1, np.int64), 0, max(1, _EDGES_AT_ONCE // outcomes)
     while frontier.size:
         demand(level < SLOTS_MAX, f"walks of more than {SLOTS_MAX} exposures, allowed: at most {SLOTS_MAX}")
-        before = depth[frontier]
-        if (before != _UNREACHED).any():
-            state = int(frontier[(before != _UNREACHED).argmax()])
+        twice = depth[frontier] != _UNREACHED
+        if twice.any():
+            state = int(frontier[twice.argmax()])
             raise ValueError(f"state {state} is reached after {depth[state]} and after {level} exposures, allowed: one")
         depth[frontier] = level
         unreached[frontier] = False
-        after = successors[frontier].reshape(-1)
-        unreached[after] = False
-        frontier = np.unique(after[after < n_states]).astype(np.int64)
+        shown_next[:] = False
+        for start in range(0, len(frontier), step):
+            after = successors[frontier[start : start + step]].reshape(-1)
+            unreached[after] = False
+            shown_next[after[after < n_states]] = True
+        frontier = np.flatnonzero(shown_next)
         level += 1
     return depth, unreached
 

@@ -19,7 +19,7 @@ from pans.runtime.ranges import Range, demand
 
 from .automaton import Automaton
 from .head import HEAD_MAX_BYTES
-from .int8 import STEP_MAX, WEIGHT_MAX, Int8Head
+from .layers import STEP_MAX, WEIGHT_MAX, Int8Head
 from .onnx_check import check_head
 from .optics import LIGHT_RANGE, Analyser, check_analyser
 from .walks import check_expected, greatest_light, log_scores, walk_difference

@@ -20,50 +20,45 @@ from pans.runtime.container import FILE_MAX_BYTES, MIB, canonical_json, parse_js
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.ranges import demand
 
+from . import automaton_file
 from .facts import LEVELS_MAX, Bundle, check_bundle, frozen
-from .int8 import Int8Head
+from .layers import Int8Head
 from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
-VERSIONS = (1, 2)  # a bundle is written in the lowest that can say it
+VERSIONS = (1, 2, 3)  # a bundle is written in the lowest that can say it
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
 _HEADER_KEYS = {
     *("name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"),
 }
-_NEW_KEYS = {"sensor", "picture_shape"}  # of version 2
+_KEYS_OF_VERSION: dict[int, set[str]] = {
+    1: set(),
+    2: {"sensor", "picture_shape"},
+    3: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
+}
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
 _MATRIX_PARTS = {"<f4": "matrix", "<c8": "matrix_complex"}  # of a passive sensor, in place of the patterns: one of them
 _INT8_PARTS = {"int8_sizes": "<u4", "int8_weights": "|i1", "int8_affine": "<f4"}  # all three or none
 _PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"} | {name: dtype for dtype, name in _MATRIX_PARTS.items()}
+_ALL_PARTS = _PARTS | automaton_file.PARTS  # no name has two dtypes
 _SENSOR_KEYS = ("light", "optics", "full_scale_photoelectrons", "exposure_us")
 _REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
 
 
 def bundle_bytes(bundle: Bundle) -> bytes:
     """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 256 MiB."""
-    if bundle.automaton is not None:
-        raise UsageError("automata are not written yet")
-    parts: list[tuple[str, NDArray[Any]]] = [_optics_part(bundle)]
-    if bundle.head_onnx is not None:
-        parts.append(("head_onnx", np.frombuffer(bundle.head_onnx, dtype=np.uint8)))
-    if bundle.table is not None:
-        parts.append(("table", bundle.table))
-    parts += [("golden_means", bundle.golden_means), ("golden_scores", bundle.golden_scores)]
-    if bundle.int8_head is not None:
-        head = bundle.int8_head
-        parts += [("int8_sizes", head.sizes), ("int8_weights", head.weights), ("int8_affine", head.affine)]
-    if bundle.int8_onnx is not None:
-        parts.append(("int8_onnx", np.frombuffer(bundle.int8_onnx, dtype=np.uint8)))
+    automaton = bundle.automaton
+    parts = _fixed_parts(bundle) if automaton is None else automaton_file.parts_of(bundle, automaton)
     rows, blobs, offset = [], [], 0
     for name, array in parts:
-        blob = array.astype(_PARTS[name]).tobytes()
+        blob = array.astype(_ALL_PARTS[name]).tobytes()
         digest = hashlib.sha256(blob).hexdigest()
         rows.append(
             {
-                **{"name": name, "dtype": _PARTS[name], "shape": list(array.shape)},
+                **{"name": name, "dtype": _ALL_PARTS[name], "shape": list(array.shape)},
                 **{"offset": offset, "length": len(blob), "sha256": digest},
             }
         )
@@ -89,9 +84,24 @@ def bundle_bytes(bundle: Bundle) -> bytes:
         raise UsageError(
             f"this bundle would have a header of {len(header)} and {total} bytes in all, allowed: {allowed}"
         )
-    version = VERSIONS[bool(_new_facts(bundle))]
+    version = _version_of(set(_new_facts(bundle)))
     body = b"".join([_PROLOGUE.pack(MAGIC, version, len(header)), header, *blobs])
     return body + hashlib.sha256(body).digest()
+
+
+def _fixed_parts(bundle: Bundle) -> list[tuple[str, NDArray[Any]]]:
+    parts: list[tuple[str, NDArray[Any]]] = [_optics_part(bundle)]
+    if bundle.head_onnx is not None:
+        parts.append(("head_onnx", np.frombuffer(bundle.head_onnx, dtype=np.uint8)))
+    if bundle.table is not None:
+        parts.append(("table", bundle.table))
+    parts += [("golden_means", bundle.golden_means), ("golden_scores", bundle.golden_scores)]
+    if bundle.int8_head is not None:
+        head = bundle.int8_head
+        parts += [("int8_sizes", head.sizes), ("int8_weights", head.weights), ("int8_affine", head.affine)]
+    if bundle.int8_onnx is not None:
+        parts.append(("int8_onnx", np.frombuffer(bundle.int8_onnx, dtype=np.uint8)))
+    return parts
 
 
 def _optics_part(bundle: Bundle) -> tuple[str, NDArray[Any]]:
@@ -102,13 +112,19 @@ def _optics_part(bundle: Bundle) -> tuple[str, NDArray[Any]]:
 
 
 def _new_facts(bundle: Bundle) -> dict[str, Any]:
-    """What version 1 cannot say: a passive sensor, a picture instead of classes."""
+    """What version 1 cannot say: a passive sensor, a picture instead of classes, an automaton."""
+    if bundle.automaton is not None:
+        return automaton_file.facts_of(bundle, bundle.automaton)
     facts: dict[str, Any] = {}
     if bundle.analyser is not None:
         facts["sensor"] = {name: getattr(bundle.analyser, name) for name in _SENSOR_KEYS}
     if bundle.picture_shape is not None:
         facts["picture_shape"] = list(bundle.picture_shape)
     return facts
+
+
+def _version_of(new_keys: set[str]) -> int:
+    return 3 if "automaton" in new_keys else 2 if new_keys else 1
 
 
 def parse_bundle(data: bytes, where: str) -> Bundle:
@@ -167,34 +183,42 @@ def _what_changed(data: bytes, header_end: int) -> str:
 def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict[str, NDArray[Any]]:
     """Return the parts by name, after checking that they fill the file without gap, overlap or rest."""
     version = _PROLOGUE.unpack_from(data)[1]
-    keys = _HEADER_KEYS | (set(header) & _NEW_KEYS if version > 1 else set())
+    new_keys = set(header) & _KEYS_OF_VERSION[version]
+    if version == 3:
+        new_keys |= automaton_file.HEADER_KEYS
+    keys = _HEADER_KEYS | new_keys
     demand(set(header) == keys, f"the header has the keys {_quoted(header)}, allowed: {_quoted(keys)}")
-    demand(
-        version == VERSIONS[bool(keys & _NEW_KEYS)], f"a bundle of format version {version} that says no more than 1"
-    )
+    demand(version == _version_of(new_keys), f"a bundle of format version {version} that says no more than 1")
+    known = automaton_file.PARTS if version == 3 else _PARTS
     rows = header["parts"]
-    demand(isinstance(rows, list) and len(rows) <= len(_PARTS), "the header's parts are not a short list")
+    demand(isinstance(rows, list) and len(rows) <= len(known), "the header's parts are not a short list")
     parts: dict[str, NDArray[Any]] = {}
     offset, room = 0, len(data) - _DIGEST_BYTES - header_end
     for row in rows:
         demand(isinstance(row, dict) and set(row) == _PART_KEYS, f"a part needs the keys {_quoted(_PART_KEYS)}")
         name, shape, length = row["name"], row["shape"], row["length"]
-        demand(isinstance(name, str) and name in _PARTS, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(_PARTS)}")
+        demand(isinstance(name, str) and name in known, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(known)}")
         demand(name not in parts, f"the part {name} stands twice")
-        demand(row["dtype"] == _PARTS[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {_PARTS[name]}")
+        demand(row["dtype"] == known[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {known[name]}")
         good_shape = isinstance(shape, list) and len(shape) in (1, 2) and all(_is_count(n) for n in shape)
         demand(good_shape and _is_count(length), f"{name} has shape {ascii(shape)[:80]}, allowed: one or two sizes")
-        wanted = math.prod(shape) * np.dtype(_PARTS[name]).itemsize
+        wanted = math.prod(shape) * np.dtype(known[name]).itemsize
         demand(length == wanted, f"{name} has {length} bytes, its shape {shape} needs {wanted}")
         demand(
             row["offset"] == offset and offset + length <= room, f"{name} lies outside the file or over another part"
         )
         blob = data[header_end + offset : header_end + offset + length]
         demand(hashlib.sha256(blob).hexdigest() == row["sha256"], f"the part {name} does not have its SHA-256")
-        native = np.dtype(_PARTS[name]).newbyteorder("=")
-        parts[name] = frozen(np.frombuffer(blob, dtype=_PARTS[name]).reshape(shape).astype(native))
+        native = np.dtype(known[name]).newbyteorder("=")
+        parts[name] = frozen(np.frombuffer(blob, dtype=known[name]).reshape(shape).astype(native))
         offset += length
     demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
+    if version < 3:
+        _demand_fixed_parts(header, parts)
+    return parts
+
+
+def _demand_fixed_parts(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> None:
     optics = [name for name in ("pattern_levels", *_MATRIX_PARTS.values()) if name in parts]
     passive = "sensor" in header
     demand(len(optics) <= 1, f"the parts {', '.join(optics)}, allowed: one of them")
@@ -202,14 +226,13 @@ def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict
         optics = ["pattern_levels"]
     for name in (*optics, "golden_means", "golden_scores"):
         demand(name in parts and parts[name].ndim == 2, f"the part {name} is missing or not a matrix")
-    return parts
 
 
 def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bundle:
     shape, classes, scale = header["image_shape"], header["classes"], header["photons_per_level"]
     good_shape = isinstance(shape, list) and len(shape) == 2 and all(_is_count(n) for n in shape)
     demand(good_shape, f"image_shape is {ascii(shape)[:80]}, allowed: [height, width]")
-    passive, picture = "sensor" in header, header.get("picture_shape")
+    passive = "sensor" in header
     levels = header["levels"]
     levels_fit = _is_count(levels) or (passive and levels == 0 and not isinstance(levels, bool))
     demand(levels_fit, f"levels is {ascii(header['levels'])[:80]}, allowed: 2 to {LEVELS_MAX}")
@@ -217,33 +240,59 @@ def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bund
     demand(good_scale, f"photons_per_level is {ascii(scale)[:80]}, allowed: finite and above 0")
     demand(isinstance(classes, list), f"classes is {ascii(classes)[:80]}, allowed: a list of names")
     demand(isinstance(header["provenance"], dict), "provenance is not an object")
+    facts: dict[str, Any] = {
+        "name": header["name"],
+        "task": header["task"],
+        "classes": tuple(classes),
+        "encoder": header["encoder"],
+        "image_shape": (shape[0], shape[1]),
+        "levels": header["levels"],
+        "photons_per_level": float(scale),
+        "provenance": header["provenance"],
+    }
+    make = _with_automaton if "automaton" in header else _with_back_end
+    bundle = make(header, parts, facts)
+    check_bundle(bundle)
+    return bundle
+
+
+def _with_automaton(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]], facts: dict[str, Any]) -> Bundle:
+    automaton_file.demand_parts(parts, header["levels"])
+    n_pixels = math.prod(facts["image_shape"])
+    automaton = automaton_file.automaton_of(header, parts)
+    golden = automaton_file.golden_of(parts, automaton)
+    return Bundle(
+        **facts,
+        head_onnx=None,
+        table=None,
+        pattern_levels=automaton_file.patterns_of(parts, header["levels"], n_pixels),
+        golden_means=golden.means,
+        golden_scores=golden.scores,
+        automaton=automaton,
+        golden_walks=golden.walks,
+        expected=automaton_file.expected_of(header),
+    )
+
+
+def _with_back_end(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]], facts: dict[str, Any]) -> Bundle:
+    picture = header.get("picture_shape")
     good_picture = isinstance(picture, list) and len(picture) == 2 and all(_is_count(n) for n in picture)
     demand(picture is None or good_picture, f"picture_shape is {ascii(picture)[:80]}, allowed: [height, width]")
-    analyser = _analyser(header, parts) if passive else None
+    analyser = _analyser(header, parts) if "sensor" in header else None
     patterns = parts["pattern_levels"] if analyser is None else frozen(np.zeros((len(analyser.matrix), 0), np.uint16))
-    head = parts.get("head_onnx")
-    int8_onnx = parts.get("int8_onnx")
-    bundle = Bundle(
-        name=header["name"],
-        task=header["task"],
-        classes=tuple(classes),
-        encoder=header["encoder"],
-        image_shape=(shape[0], shape[1]),
-        levels=header["levels"],
+    head, int8_onnx = parts.get("head_onnx"), parts.get("int8_onnx")
+    return Bundle(
+        **facts,
         pattern_levels=patterns,
-        photons_per_level=float(scale),
         head_onnx=None if head is None else head.tobytes(),
         table=parts.get("table"),
         golden_means=parts["golden_means"],
         golden_scores=parts["golden_scores"],
-        provenance=header["provenance"],
         int8_head=_int8_head(parts),
         int8_onnx=None if int8_onnx is None else int8_onnx.tobytes(),
         analyser=analyser,
         picture_shape=None if picture is None else (picture[0], picture[1]),
     )
-    check_bundle(bundle)
-    return bundle
 
 
 def _analyser(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Analyser:

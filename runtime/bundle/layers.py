@@ -1,7 +1,12 @@
-"""The layers of an ONNX head, where it is a plain chain of them: weights and biases for our own kernels.
+"""The layers of an ONNX head, where it is a plain chain of them: weights and biases for our own kernels, in float32 and in eight bits.
 
-Owns the reading of the few operators that such heads consist of; never runs a model and never imports onnx. `read_layers` returns None
-for any graph that is more than that: onnxruntime runs those. What was read is held against the golden vectors before it is used.
+Owns the reading of the few operators that such heads consist of, and the rounding of a folded head to int8 weights and its layout; never
+runs a model, never decides and never imports onnx. `read_layers` returns None for any graph that is more than that: onnxruntime runs
+those. What was read is held against the golden vectors before it is used. `quantise_head` returns an `Int8Head` for a chain of rectified
+layers; `int8_reference` is its meaning in plain numpy.
+
+Every column of a quantised layer has its own scale. The range of each hidden value is folded into its column and out of the next layer's
+row, so that a hidden value is a whole step 0..255 of its own range. Layer one needs no rounding of its input: clicks are whole.
 """
 
 from __future__ import annotations
@@ -15,6 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .onnx_file import Node, read_model
+
+WEIGHT_MAX = 127
+STEP_MAX = 255
+HEADROOM = 1.05  # of the largest hidden value that the calibration words gave
+_SIGMAS = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,3 +101,84 @@ def _append(layers: list[Layer], node: Node, current: str, tensors: Mapping[str,
     if bias.shape != (weights.shape[1],):
         raise ValueError("a bias of another length")
     layers.append(Layer(np.ascontiguousarray(weights), bias, False))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Int8Head:
+    """`sizes` int64 (layers + 1,); `weights` int8, the matrices (n_in, n_out) one after the other; `affine` float32 (2, sum of n_out).
+
+    A layer gives `steps @ weights * affine[0] + affine[1]`; between layers that is rounded to the nearest step (halves up) in 0..255.
+    The steps of layer one are clicks, and its result is divided by the shots before the bias is added.
+    """
+
+    sizes: NDArray[np.int64]
+    weights: NDArray[np.int8]
+    affine: NDArray[np.float32]
+
+    def matrices(self) -> list[tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]]:
+        """Return (weights (n_in, n_out), scale (n_out,), bias (n_out,)) of each layer."""
+        found, start, column = [], 0, 0
+        for n_in, n_out in zip(self.sizes.tolist(), self.sizes.tolist()[1:]):
+            matrix = self.weights[start : start + n_in * n_out].reshape(n_in, n_out)
+            found.append((matrix, self.affine[0, column : column + n_out], self.affine[1, column : column + n_out]))
+            start, column = start + n_in * n_out, column + n_out
+        return found
+
+
+def quantise_head(layers: tuple[Layer, ...], calibration: NDArray[np.floating[Any]] | None = None) -> Int8Head:
+    """Quantise a head whose hidden layers are rectified; `calibration` is click means (n, d_f) of typical objects.
+
+    Without it, hidden ranges are taken from independent clicks that are as likely as not. ValueError for another kind of chain.
+    """
+    if any(not layer.relu for layer in layers[:-1]) or layers[-1].relu:
+        raise ValueError("only heads with rectified hidden layers and a plain last one can be quantised")
+    ranges = _hidden_ranges(layers, calibration)
+    weights, affine = [], []
+    before = np.ones(layers[0].weights.shape[0])
+    for number, layer in enumerate(layers):
+        wide = layer.weights.astype(np.float64) * before[:, None]
+        top = np.abs(wide).max(axis=0)
+        scale = np.where(top > 0, top, 1.0) / WEIGHT_MAX
+        weights.append(np.rint(wide / scale).astype(np.int8).ravel())
+        step = ranges[number] / STEP_MAX if number < len(layers) - 1 else np.ones_like(scale)
+        affine.append(np.stack([scale / step, layer.bias.astype(np.float64) / step]))
+        before = step
+    sizes = np.array([layers[0].weights.shape[0], *(layer.weights.shape[1] for layer in layers)], np.int64)
+    head = Int8Head(sizes, np.concatenate(weights), np.concatenate(affine, axis=1).astype(np.float32))
+    if not np.isfinite(head.affine).all():
+        raise ValueError("the head's weights are not finite, or too large for eight bits")
+    return head
+
+
+def int8_reference(head: Int8Head, counts: NDArray[np.integer[Any]], shots: int) -> NDArray[np.float64]:
+    """Return the scores (n, classes) of click counts (n, d_f): integer sums, and float32 between them as the kernel has it."""
+    steps = counts.astype(np.int64)
+    unit = np.float32(1) / np.float32(shots)
+    matrices = head.matrices()
+    for weights, scale, bias in matrices[:-1]:
+        value = (steps @ weights.astype(np.int64)).astype(np.float32) * (scale * unit) + bias
+        steps = np.floor(np.clip(value, 0, STEP_MAX) + np.float32(0.5)).astype(np.int64)
+        unit = np.float32(1)
+    weights, scale, bias = matrices[-1]
+    sums = (steps @ weights.astype(np.int64)).astype(np.float32)
+    return np.asarray(sums * (scale * unit) + bias, np.float64)
+
+
+def _hidden_ranges(
+    layers: tuple[Layer, ...], calibration: NDArray[np.floating[Any]] | None
+) -> list[NDArray[np.float64]]:
+    """The largest value that each hidden unit is to represent, by layer; 1 for a unit that never fires."""
+    ranges = []
+    values = None if calibration is None else calibration.astype(np.float64)
+    mean, variance = np.full(layers[0].weights.shape[0], 0.5), np.full(layers[0].weights.shape[0], 0.25)
+    for layer in layers[:-1]:
+        wide, bias = layer.weights.astype(np.float64), layer.bias.astype(np.float64)
+        if values is not None:
+            values = np.maximum(values @ wide + bias, 0.0)
+            top = values.max(axis=0) * HEADROOM
+        else:
+            mean, variance = mean @ wide + bias, variance @ wide**2
+            top = np.minimum(mean + _SIGMAS * np.sqrt(variance), np.maximum(wide, 0).sum(axis=0) * mean.size + bias)
+            mean, variance = np.maximum(mean, 0.0), variance
+        ranges.append(np.where(top > 0, top, 1.0))
+    return ranges

@@ -35,7 +35,7 @@ from .facts import (
 )
 from .format import bundle_bytes, parse_bundle
 from .head import OnnxHead, open_head
-from .int8 import Int8Head
+from .layers import Int8Head
 from .optics import Analyser
 from .walks import check_expected, golden_nodes, log_scores, walk_nodes, words_to
 

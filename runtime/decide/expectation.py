@@ -52,7 +52,7 @@ def expected_walk(
     """
     _check_arguments(automaton, patterns, transmission)
     n, n_leaves = len(transmission), automaton.n_leaves
-    found = ExpectedWalk(*(np.empty(n) for _ in range(4)), np.empty((n, n_leaves)))
+    found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)))
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
     slots = _states_by_slot(automaton)
     shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level

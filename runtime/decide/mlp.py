@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.bundle.int8 import Int8Head
-from pans.runtime.bundle.layers import Layer, read_layers, reference_scores
+from pans.runtime.bundle.layers import Int8Head, Layer, read_layers, reference_scores
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 

@@ -29,6 +29,19 @@ DTYPES = {
     "golden_means": "<f4",
     "golden_scores": "<f4",
 }
+AUTOMATON_DTYPES = {
+    "pattern_bits": "|u1",
+    "pattern_bytes": "|u1",
+    "pattern_levels": "<u2",
+    "state_pattern": "<u2",
+    "state_dwell": "<u2",
+    "successors": "<u4",
+    "posteriors": "<f4",
+    "golden_words": "|u1",
+    "golden_walks": "<u4",
+    "golden_posteriors": "<f4",
+}
+NEW_KEYS: dict[int, set[str]] = {1: set(), 2: {"sensor", "picture_shape"}, 3: {"automaton", "expected"}}
 KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}
 
 
@@ -98,21 +111,23 @@ def read_bundle(data: bytes) -> Bundle:
     """Return the bundle in `data`, every checksum checked."""
     demand(data[:8] == b"PANSBNDL" and 48 <= len(data) <= 256 * MIB, "no bundle")
     version, length = struct.unpack_from("<II", data, 8)
-    demand(version in (1, 2) and length <= MIB and 16 + length + 32 <= len(data), "version or header length")
+    demand(version in NEW_KEYS and length <= MIB and 16 + length + 32 <= len(data), "version or header length")
     demand(hashlib.sha256(data[:-32]).digest() == data[-32:], "the closing SHA-256")
     header = strict_json(data[16 : 16 + length])
     more = set(header) - KEYS
-    demand(set(header) >= KEYS and more <= {"sensor", "picture_shape"} and bool(more) == (version == 2), "header keys")
+    demand(set(header) >= KEYS and more <= NEW_KEYS[version] and bool(more) == (version > 1), "header keys")
+    demand(version < 3 or "automaton" in more, "an automaton")
+    dtypes = AUTOMATON_DTYPES if version == 3 else DTYPES
     parts: dict[str, NDArray[Any]] = {}
     begin, offset = 16 + length, 0
     for row in header["parts"]:
         name, shape = row["name"], row["shape"]
-        demand(name in DTYPES and name not in parts and row["dtype"] == DTYPES[name], f"part {name}")
-        size = int(np.prod(shape, dtype=object)) * np.dtype(DTYPES[name]).itemsize
+        demand(name in dtypes and name not in parts and row["dtype"] == dtypes[name], f"part {name}")
+        size = int(np.prod(shape, dtype=object)) * np.dtype(dtypes[name]).itemsize
         demand(row["offset"] == offset and row["length"] == size, f"place of {name}")
         blob = data[begin + offset : begin + offset + size]
         demand(hashlib.sha256(blob).hexdigest() == row["sha256"], f"SHA-256 of {name}")
-        parts[name] = np.frombuffer(blob, DTYPES[name]).reshape(shape)
+        parts[name] = np.frombuffer(blob, dtypes[name]).reshape(shape)
         offset += size
     demand(begin + offset + 32 == len(data), "a rest behind the last part")
     height, width = header["image_shape"]

@@ -16,7 +16,7 @@ from lab_recording import read_recording
 from tree import ROOT
 
 from pans.runtime.bundle import Bundle, load_bundle, write_bundle
-from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import main
 from pans.runtime.container import parse_json_object
 from pans.runtime.errors import DamagedFileError

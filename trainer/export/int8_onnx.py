@@ -1,6 +1,6 @@
 """The quantised head as an ONNX model: the same integers and scales as the bundle's arrays, in operators that every runtime has.
 
-Owns the graph only; the quantisation is `pans.runtime.bundle.int8`'s. Clicks come as means in [0, 1] and are taken as whole 255ths,
+Owns the graph only; the quantisation is `pans.runtime.bundle.layers`'s. Clicks come as means in [0, 1] and are taken as whole 255ths,
 which is exact for one shot; means of several shots round to the nearest of them.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import NodeProto, TensorProto, helper
 
-from pans.runtime.bundle.int8 import STEP_MAX, Int8Head
+from pans.runtime.bundle.layers import STEP_MAX, Int8Head
 
 from .onnx_heads import model_bytes
 

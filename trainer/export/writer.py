@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from pans.runtime import __version__
 from pans.runtime.bundle.facts import GOLDEN_TOLERANCE
-from pans.runtime.bundle.int8 import quantise_head
-from pans.runtime.bundle.layers import read_layers
+from pans.runtime.bundle.layers import quantise_head, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_bundle, word_means, write_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider

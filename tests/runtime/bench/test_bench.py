@@ -22,7 +22,7 @@ from pans.runtime.bench.rows import (
     repeated,
     table_text,
 )
-from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import main
 from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider

@@ -14,7 +14,7 @@ import pytest
 from heads import head_bundle, random_layers
 from plans import parallel
 
-from pans.runtime.bundle.int8 import quantise_head
+from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream import StreamCore

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from heads import head_bundle, onnx_chain, random_layers
 
-from pans.runtime.bundle.int8 import Int8Head, int8_reference, quantise_head
-from pans.runtime.bundle.layers import Layer, read_layers, reference_scores
+from pans.runtime.bundle.layers import Int8Head, Layer, int8_reference, quantise_head, read_layers, reference_scores
 from pans.runtime.bundle.model import bundle_bytes, parse_bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import Int8Decider, ReferenceDecider, SparseDecider, golden_counts

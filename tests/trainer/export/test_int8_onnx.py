@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from heads import head_bundle, random_layers
 
-from pans.runtime.bundle.int8 import int8_reference, quantise_head
-from pans.runtime.bundle.layers import reference_scores
+from pans.runtime.bundle.layers import int8_reference, quantise_head, reference_scores
 from pans.runtime.decide.backends import make_decider
 
 pytest.importorskip("onnx")

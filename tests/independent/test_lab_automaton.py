@@ -1,0 +1,90 @@
+"""The reader of automata written from the document alone against the package: same meaning, same refusals."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from automata import automaton_bundle, diamond, early_leaf, random_automaton
+from lab_automaton import ABSTAINS, read_automaton
+from lab_bundle import Damaged, read_bundle
+
+from pans.firmware_sim.resealed.contents import mutated_array
+from pans.runtime.bundle import Automaton, bundle_bytes, parse_bundle, with_expected
+from pans.runtime.decide import make_decider
+from pans.runtime.decide.automaton import AutomatonDecider
+from pans.runtime.errors import DamagedFileError
+
+AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=12), random_automaton(2, slots=5, channels=2)]
+
+
+@pytest.mark.parametrize("levels", [2, 100, 1000])
+@pytest.mark.parametrize("automaton", AUTOMATA)
+def test_an_automaton_means_the_same(automaton: Automaton, levels: int) -> None:
+    made = automaton_bundle(automaton, levels=levels)
+    found = read_automaton(read_bundle(bundle_bytes(made)))
+    assert np.array_equal(found.patterns, made.pattern_levels)
+    light = [found.patterns[p].sum() * made.photons_per_level * d for p, d in zip(found.shows, found.dwell_share)]
+    assert light == pytest.approx(made.state_light())
+    words = np.random.default_rng(levels).integers(0, 2, (100, made.n_features))
+    decider = make_decider(made)
+    for word in words:
+        assert found.decide(word.tolist()) == decider.decide(word, 1)
+
+
+@pytest.mark.parametrize("confidence", [0.4, 0.75, 0.9, 1.0])
+@pytest.mark.parametrize("automaton", AUTOMATA[1:])
+def test_stopping_means_the_same(automaton: Automaton, confidence: float) -> None:
+    made = automaton_bundle(automaton)
+    found = read_automaton(read_bundle(bundle_bytes(made)))
+    decider = make_decider(made, confidence=confidence)
+    assert isinstance(decider, AutomatonDecider)
+    words = np.random.default_rng(4).integers(0, 2, (200, made.n_features))
+    short = words[:, : decider.n_features]
+    exposures = decider.leaves(short)[1]
+    for word, bits, length in zip(words.tolist(), short, exposures):
+        assert found.decide(word, confidence) == decider.decide(bits, 1)
+        assert len(found.walk(word, confidence)) - 1 == length
+    assert confidence < 0.9 or ABSTAINS in decider.decide_batch(short, 1)
+
+
+def accepted(read: object) -> bool:
+    try:
+        read()  # type: ignore[operator]
+    except (Damaged, DamagedFileError):
+        return False
+    return True
+
+
+def test_both_readers_accept_and_refuse_the_same() -> None:
+    """Arrays changed, checksums made to fit: whatever the one takes, the other takes."""
+    facts = {"profile": "p", "task": "t", "split": "s", "objects": 3}
+    figures = {"accuracy": 0.5, "clicks": 1.0, "photons": 1.0, "illumination": 2.0, "exposures": 1.5}
+    base = bundle_bytes(with_expected(automaton_bundle(diamond(), levels=2), facts | figures))
+    dice, taken = random.Random(6), 0
+    for number in range(400):
+        data = with_one_part_changed(base, dice)
+        ours = accepted(lambda data=data: parse_bundle(data, "here"))
+        theirs = accepted(lambda data=data: read_automaton(read_bundle(data)))
+        assert ours == theirs, number
+        taken += ours
+    assert 20 < taken < 380
+
+
+def with_one_part_changed(data: bytes, dice: random.Random) -> bytes:
+    length = struct.unpack_from("<I", data, 12)[0]
+    header, begin = json.loads(data[16 : 16 + length]), 16 + length
+    chosen, blobs = dice.randrange(len(header["parts"])), []
+    for number, row in enumerate(header["parts"]):
+        blob = data[begin + row["offset"] : begin + row["offset"] + row["length"]]
+        if number == chosen:
+            blob = mutated_array(dice, np.frombuffer(blob, row["dtype"]).reshape(row["shape"])).tobytes()
+        row["sha256"] = sha256(blob).hexdigest()
+        blobs.append(blob)
+    text = json.dumps(header).encode()
+    body = data[:12] + struct.pack("<I", len(text)) + text + b"".join(blobs)
+    return body + sha256(body).digest()

@@ -1,0 +1,190 @@
+"""Bundles of format version 3: every byte comes back, every lie about an automaton is named, small files stay small in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from automata import automaton_bundle, diamond, early_leaf, random_automaton
+from bundles import made_bundle
+
+from pans.runtime.bundle import Automaton, Bundle, bundle_bytes, load_bundle, parse_bundle, with_expected, write_bundle
+from pans.runtime.bundle.automaton_file import PARTS
+from pans.runtime.errors import DamagedFileError
+
+EXPECTED: dict[str, Any] = {
+    **{"profile": "ideal", "task": "test", "split": "test", "objects": 100},
+    **{"accuracy": 0.5, "clicks": 1.2, "photons": 3.0, "illumination": 9.0, "exposures": 2.5},
+}
+
+
+def taken_apart(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[16 : 16 + length])
+    begin = 16 + length
+    rows = header["parts"]
+    blobs = {row["name"]: data[begin + row["offset"] : begin + row["offset"] + row["length"]] for row in rows}
+    arrays = {row["name"]: np.frombuffer(blobs[row["name"]], row["dtype"]).reshape(row["shape"]).copy() for row in rows}
+    return header, arrays
+
+
+def put_together(header: dict[str, Any], arrays: dict[str, np.ndarray], version: int = 3) -> bytes:
+    header["parts"], blobs, offset = [], [], 0
+    for name, array in arrays.items():
+        blob = array.tobytes()
+        row = {"name": name, "dtype": array.dtype.str, "shape": list(array.shape), "offset": offset}
+        header["parts"].append(row | {"length": len(blob), "sha256": hashlib.sha256(blob).hexdigest()})
+        blobs.append(blob)
+        offset += len(blob)
+    text = json.dumps(header).encode()
+    body = struct.pack("<8sII", b"PANSBNDL", version, len(text)) + text + b"".join(blobs)
+    return body + hashlib.sha256(body).digest()
+
+
+def same(one: Bundle, other: Bundle) -> None:
+    assert one.automaton is not None
+    assert other.automaton is not None
+    for name in ("pattern", "dwell", "successors", "posteriors", "depth"):
+        a, b = getattr(one.automaton, name), getattr(other.automaton, name)
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b), name
+    assert one.automaton.dwell_steps == other.automaton.dwell_steps
+    for name in ("pattern_levels", "golden_means", "golden_scores", "golden_walks"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert a.dtype == b.dtype
+        assert not b.flags.writeable
+        assert np.array_equal(a, b), name
+    for name in (
+        "name",
+        "task",
+        "classes",
+        "encoder",
+        "image_shape",
+        "levels",
+        "photons_per_level",
+        "provenance",
+        "expected",
+    ):
+        assert getattr(one, name) == getattr(other, name)
+
+
+@pytest.mark.parametrize("levels", [2, 3, 256, 257, 65536])
+@pytest.mark.parametrize("automaton", [early_leaf(), random_automaton(3, slots=11), random_automaton(4, channels=2)])
+def test_every_fact_comes_back(tmp_path: Path, automaton: Automaton, levels: int) -> None:
+    made = with_expected(automaton_bundle(automaton, levels=levels), EXPECTED | {"exposures": 1.5})
+    digest = write_bundle(made, tmp_path / "a.pans")
+    read, found = load_bundle(tmp_path / "a.pans")
+    assert found == digest
+    same(made, read)
+    assert bundle_bytes(read) == (tmp_path / "a.pans").read_bytes()
+    part = {2: "pattern_bits", 3: "pattern_bytes", 256: "pattern_bytes"}.get(levels, "pattern_levels")
+    header, arrays = taken_apart((tmp_path / "a.pans").read_bytes())
+    assert list(arrays) == [part, *list(PARTS)[3:]]
+    assert put_together(header, arrays) is not None
+
+
+def test_without_expected_figures_none_stand_in_the_file() -> None:
+    header, _ = taken_apart(bundle_bytes(automaton_bundle()))
+    assert "expected" not in header
+    assert header["automaton"] == {"dwell_steps": 2}
+
+
+def test_bits_lie_as_the_document_says() -> None:
+    levels = np.zeros((3, 20), np.int64)
+    levels[0, [0, 9, 19]] = 1
+    levels[2] = 1
+    made = automaton_bundle(diamond(), levels=2, image_shape=(4, 5), pattern_levels=levels)
+    _, arrays = taken_apart(bundle_bytes(made))
+    assert arrays["pattern_bits"].tolist() == [[1, 2, 8], [0, 0, 0], [255, 255, 15]]
+    assert arrays["golden_words"][:5].tolist() == [[0], [7], [1], [2], [4]]
+    assert arrays["golden_walks"][:2].tolist() == [[0, 1, 3, 5], [0, 2, 4, 6]]
+
+
+def test_older_versions_are_written_as_before() -> None:
+    data = bundle_bytes(made_bundle(table=np.arange(8).reshape(4, 2)))
+    assert struct.unpack_from("<I", data, 8)[0] == 1
+
+
+Change = Callable[[dict[str, Any], dict[str, np.ndarray]], Any]
+
+
+def put(part: str, place: Any, value: Any) -> Change:
+    return lambda header, arrays: arrays[part].__setitem__(place, value)
+
+
+def replace_part(part: str, make: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda header, arrays: arrays.__setitem__(part, make(arrays[part]))
+
+
+LIES: list[tuple[Change, str]] = [
+    (lambda h, a: h.pop("automaton"), "the header has the keys"),
+    (lambda h, a: h.update(sensor={}), "the header has the keys"),
+    (lambda h, a: h.update(automaton={}), "automaton is {}"),
+    (lambda h, a: h.update(automaton={"dwell_steps": 2.0}), r"dwell_steps is 2\.0"),
+    (lambda h, a: h.update(automaton={"dwell_steps": 1}), "dwell runs from 1 to 2"),
+    (lambda h, a: h.update(expected=None), "expected is None"),
+    (lambda h, a: h.update(expected={}), "expected has the keys"),
+    (lambda h, a: h.update(expected=EXPECTED | {"accuracy": 2}), r"expected\.accuracy is 2"),
+    (lambda h, a: h.update(expected=EXPECTED | {"clicks": 9.0}), r"expected\.clicks is 9"),
+    (lambda h, a: h.update(encoder="active"), "encoder active, and an automaton"),
+    (lambda h, a: h.update(levels=2), "the parts .*needed: .*pattern_bits"),
+    (lambda h, a: h.update(image_shape=[2, 3]), "rows of 4, patterns of 6 pixels need 6"),
+    (lambda h, a: a.pop("golden_walks"), "the parts"),
+    (lambda h, a: a.update(table=np.zeros((8, 3), "<f4")), "unknown part 'table'"),
+    (put("state_pattern", 1, 3), "a state shows pattern 3"),
+    (put("successors", (0, 0), 0), "state 0 has the successors"),
+    (put("successors", (4, 1), 8), "a successor is 8"),
+    (put("successors", (1, 0), 5), "a golden walk|golden walk"),
+    (put("posteriors", (6, 0), np.nan), "posteriors run from nan"),
+    (put("posteriors", 6, [0.3, 0.6, 0.1]), "the golden posteriors are not those"),
+    (put("golden_words", (2, 0), 2), "golden walk 2 is at node"),
+    (put("golden_words", (0, 0), 8), "bits behind the last of 3"),
+    (put("golden_walks", (0, 1), 2), "golden walk 0 is at node 2 after 1"),
+    (put("golden_walks", (0, 3), 4), "ends at a node outside 5 to 7"),
+    (put("golden_walks", (0, 3), 0xFFFFFFFF), "ends at a node outside 5 to 7"),
+    (put("golden_posteriors", (0, 0), 0.69), "the golden posteriors are not those"),
+    (replace_part("golden_walks", lambda a: a[:, :3].copy()), "golden_walks has shape"),
+    (replace_part("golden_words", lambda a: np.repeat(a, 2, axis=1)), "golden_words has rows of 2 bytes"),
+    (replace_part("golden_words", lambda a: np.zeros((4097, 1), np.uint8)), "4097 golden walks"),
+    (replace_part("state_dwell", lambda a: a[:4].copy()), r"dwell has shape \(4,\)"),
+    (replace_part("successors", lambda a: a.reshape(-1)), "successors has 1 axes"),
+    (replace_part("posteriors", lambda a: a[:, :2].copy()), "golden posteriors|sums to 1"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), LIES, ids=[words[:30] for _, words in LIES])
+def test_a_lie_with_right_checksums_is_named(change: Change, words: str) -> None:
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle()))
+    change(header, arrays)
+    with pytest.raises(DamagedFileError, match=words):
+        parse_bundle(put_together(header, arrays), "here")
+
+
+def test_a_version_that_says_too_little_is_refused() -> None:
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle()))
+    for version in (1, 2):
+        with pytest.raises(DamagedFileError, match="the header has the keys"):
+            parse_bundle(put_together(header, arrays, version), "here")
+
+
+def test_bits_that_would_fill_the_memory_are_refused_before() -> None:
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle(levels=2)))
+    header["image_shape"] = [1024, 2048]
+    arrays["pattern_bits"] = np.zeros((33, 1 << 18), np.uint8)
+    with pytest.raises(DamagedFileError, match="33 patterns of 2097152 pixels, allowed: 67108864 in all"):
+        parse_bundle(put_together(header, arrays), "here")
+
+
+def test_every_byte_counts() -> None:
+    whole = bundle_bytes(automaton_bundle())
+    for at in np.random.default_rng(5).integers(0, len(whole), 80).tolist():
+        changed = bytearray(whole)
+        changed[at] ^= 4
+        with pytest.raises(DamagedFileError):
+            parse_bundle(bytes(changed), "here")
