@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instrument_bench import IDEAL, NONCE, POWER_ON, Bench, greeted, of_type, plan, slots_at
 
 from pans.firmware_sim.device.gates import GATE_CHANNELS, MAX_PENDING_GATES, GatePulse, GateRefusal
-from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.upload import word_bytes
-from pans.firmware_sim.scene.still import load_scene, scene_from_arrays
+from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.instrument.click_law import click_law, click_probability, object_transmission
-from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.instrument.profile import load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.commands import Arm, Gate, PatternChunk, pack_arm, pack_gate, pack_pattern, pack_plan
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
-    SLOT_DTYPE,
     AckStatus,
     DeviceState,
     MessageType,
@@ -30,120 +29,8 @@ from pans.runtime.wire.messages import (
     StateReason,
 )
 
-NONCE = 0x11223344
-POWER_ON = 1000
-IDEAL = load_profile("ideal")  # 1 MHz clock, exposures from 10 us, no readout
 PARALLEL = load_profile("wdm-snspd")
 FULL = 65535
-DECODERS: dict[int, Any] = {
-    MessageType.WELCOME: wire.decode_welcome,
-    MessageType.PONG: wire.decode_pong,
-    MessageType.ACK: wire.decode_ack,
-    MessageType.STATUS: wire.decode_status,
-    MessageType.CLICKS: wire.decode_clicks,
-    MessageType.FRAMES: wire.decode_frames,
-    MessageType.MARK: wire.decode_mark,
-}
-
-
-class Bench:
-    """A host that sends what it is told at the tick it is told, and keeps every answer with the tick at which it came."""
-
-    def __init__(self, profile: Profile = IDEAL, scene: Any = None, **options: Any) -> None:
-        scene = load_scene("uniform") if scene is None else scene
-        self.device = Instrument(profile, scene, power_on_tick=POWER_ON, **options)
-        self.decoder = wire.FrameDecoder()
-        self.command_id = 0
-        self.got: list[tuple[int, Any]] = []
-
-    def send(self, data: bytes) -> list[Any]:
-        return self._keep(self.device.tick, self.device.step(self.device.tick, data))
-
-    def run_to(self, tick: int) -> list[Any]:
-        """Step from event to event until `tick`; return the messages that came."""
-        messages = []
-        while (due := self.device.next_event_tick()) is not None and due <= tick:
-            messages += self._keep(due, self.device.step(due, b""))
-        return messages + self._keep(tick, self.device.step(tick, b""))
-
-    def _keep(self, tick: int, sent: bytes) -> list[Any]:
-        frames = self.decoder.feed(sent)
-        assert all(frame.session == self.device.session for frame in frames)
-        messages = [DECODERS[frame.type](frame.payload) for frame in frames]
-        self.got += [(tick, message) for message in messages]
-        return messages
-
-    def hello(self) -> list[Any]:
-        self.command_id = 0
-        if self.device.session == NONCE:  # another host in between, or it would be a repetition
-            self.device.step(self.device.tick, wire.encode_hello(NONCE + 1))
-        return self.send(wire.encode_hello(NONCE))
-
-    def command(self, opcode: int, body: bytes = b"", command_id: int | None = None) -> Any:
-        if command_id is None:
-            self.command_id = command_id = self.command_id + 1
-        answers = self.send(wire.encode_command(command_id, opcode, body, NONCE))
-        acks = [answer for answer in answers if isinstance(answer, wire.Ack)]
-        assert len(acks) == 1
-        return acks[0]
-
-    def done(self, opcode: int, body: bytes = b"") -> None:
-        ack = self.command(opcode, body)
-        assert ack.refused_id != ack.last_id, ack.text
-
-    def refused(self, opcode: int, body: bytes = b"") -> tuple[int, str]:
-        ack = self.command(opcode, body)
-        assert ack.last_id == ack.refused_id == self.command_id
-        return ack.status, ack.text
-
-    def gate_open(self, channel: int) -> bool:
-        return self.device.gates.is_open(channel, self.device.tick)
-
-    def grant(self, limit: int = 1 << 30, lease_ms: int = 0) -> list[Any]:
-        return self.send(wire.encode_grant(wire.Grant(limit, lease_ms), NONCE))
-
-    def upload(self, levels: np.ndarray, shown: list[int], **changes: Any) -> None:
-        for index, row in enumerate(levels):
-            self.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, 0, len(row), row)))
-        self.done(Opcode.LOAD_PLAN, pack_plan(plan(len(levels), shown, **changes)))
-
-    def ready(self, levels: np.ndarray | None = None, shown: list[int] | None = None, **changes: Any) -> Bench:
-        levels = np.full((2, 4), 100, np.uint16) if levels is None else levels
-        self.hello()
-        self.upload(levels, [0, 1, DARK_PATTERN] if shown is None else shown, **changes)
-        return self
-
-    def arm(self, start: int = 2000, cycles: int = 2, lease_ms: int = 100) -> Bench:
-        self.done(Opcode.ARM, pack_arm(Arm(start, cycles, lease_ms)))
-        return self
-
-    def granted(self) -> Bench:
-        self.grant()
-        return self
-
-
-def greeted(*args: Any, **options: Any) -> Bench:
-    bench = Bench(*args, **options)
-    bench.hello()
-    return bench
-
-
-def slots_at(patterns: list[int], period: int = 100) -> np.ndarray:
-    slots = np.zeros(len(patterns), SLOT_DTYPE)
-    slots["offset_ticks"] = np.arange(len(patterns)) * period
-    slots["pattern"] = patterns
-    return slots
-
-
-def plan(n_patterns: int, patterns: list[int], **changes: Any) -> PlanChunk:
-    """Exposures of 80 ticks every 100, one cycle per object, unless changed."""
-    slots = slots_at(patterns)
-    head = PlanChunk(0, n_patterns, len(slots), 0, 80, 100, 100 * len(slots), 16, 1, slots)
-    return head._replace(**changes)
-
-
-def of_type(messages: list[Any], kind: type) -> list[Any]:
-    return [message for message in messages if isinstance(message, kind)]
 
 
 # -- golden conversations ----------------------------------------------------------------------------------------------

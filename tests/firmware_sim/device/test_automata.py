@@ -1,0 +1,536 @@
+"""The instrument with an automaton: followed by the device or named by the host, bit for bit, and everything that it refuses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import naive_walks
+import numpy as np
+import pytest
+from bundles import automaton_bundle, six_states, two_states
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instrument_bench import IDEAL, Bench, of_type, plan
+
+from pans.firmware_sim.device import walk_kernels
+from pans.firmware_sim.device.states import MAX_SHOWS
+from pans.firmware_sim.scene.moving import Change, SceneFile
+from pans.firmware_sim.scene.still import scene_from_arrays
+from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.core.plan import Plan, build_plan
+from pans.runtime.core.plan_codec import plan_chunks, state_chunks
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.automata import (
+    MaskChunk,
+    Show,
+    StateChunk,
+    announced,
+    mask_chunks,
+    pack_masks,
+    pack_show,
+    pack_states,
+)
+from pans.runtime.wire.commands import Arm, PatternChunk, pack_arm, pack_pattern, pack_plan
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, AckStatus, Opcode
+from pans.runtime.wire.schema import STATE_DTYPE
+
+IMAGES = np.random.default_rng(3).integers(0, 256, (5, 2, 3)).astype(np.uint8)
+SCENE = scene_from_arrays("five", IMAGES, np.arange(5) % 3, ("c0", "c1", "c2"))
+EXPOSURE_US = 80.0
+SEED = 7
+
+
+def instrument(**changes: Any) -> Profile:
+    """The DMD with a SPAD, whose dark counts and afterpulses are strong enough to matter, on a clock of 1 MHz."""
+    profile = load_profile("dmd-spad")
+    projector = replace(profile.projector, automaton_states=100, dwell_steps=4)
+    detector = replace(profile.detector, dark_rate_hz=2000.0, afterpulse_probability=0.3)
+    timing = replace(profile.timing, host_turn_us=200.0)
+    clock = replace(profile.clock, tick_hz=1_000_000)
+    return replace(profile, projector=projector, detector=replace(detector, **changes), timing=timing, clock=clock)
+
+
+def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, **options: Any) -> tuple[Bench, Plan]:
+    """A bench with `automaton` uploaded; light is about one photoelectron per exposure."""
+    profile = profile or instrument()
+    top = EXPOSURE_US * 1e-6 * profile.projector.peak_photoelectrons_hz
+    bundle = automaton_bundle(automaton, photons=top)
+    made = build_plan(profile, bundle, shots_per_object=2, drive=drive)
+    bench = Bench(profile, options.pop("scene", SCENE), **{"seed": SEED, **options})
+    bench.hello()
+    upload(bench, bundle.pattern_levels, made)
+    bench.grant()
+    return bench, made
+
+
+def upload(bench: Bench, levels: np.ndarray, made: Plan) -> None:
+    packed = np.packbits(levels.astype(np.uint8), axis=1, bitorder="little")
+    for masks in mask_chunks(packed, levels.shape[1]):
+        bench.done(Opcode.LOAD_MASKS, pack_masks(masks))
+    for chunk in plan_chunks(made):
+        bench.done(Opcode.LOAD_PLAN, pack_plan(chunk))
+    for states in state_chunks(made):
+        bench.done(Opcode.LOAD_STATES, pack_states(states))
+
+
+def bright(automaton: Automaton, drive: str = "device", **options: Any) -> tuple[Bench, Plan]:
+    """As `set_up`, with a hundred times the light, so that about every second exposure clicks."""
+    profile = options.pop("profile", None) or instrument()
+    projector = replace(profile.projector, peak_photoelectrons_hz=profile.projector.peak_photoelectrons_hz * 5)
+    return set_up(automaton, drive, replace(profile, projector=projector), **options)
+
+
+def run(bench: Bench, made: Plan, cycles: int, start: int = 2000) -> tuple[np.ndarray, np.ndarray, list[Any]]:
+    """Arm, run to the end, and return stamps, clicks and all messages."""
+    start = bench.device.tick + start
+    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 100_000)))
+    messages = bench.run_to(start + cycles * made.cycle_ticks)
+    return (*joined(messages), messages)
+
+
+def joined(messages: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    blocks = of_type(messages, wire.ClickBlock)
+    return np.concatenate([block.patterns for block in blocks]), np.concatenate([block.bits for block in blocks])
+
+
+def run_hosted(bench: Bench, made: Plan, automaton: Automaton, cycles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Arm and name every state as soon as the click before it is known."""
+    start = bench.device.tick + 2000
+    bench.done(Opcode.ARM, pack_arm(Arm(start, cycles, 100_000)))
+    slots, node, messages = made.slots_per_cycle, 0, []
+    for exposure in range(cycles * slots):
+        cycle, slot = divmod(exposure, slots)
+        node = node if slot else 0
+        shown = made.slot_pattern[slot] == ADAPTIVE_PATTERN and node < automaton.n_states
+        if shown:
+            bench.done(Opcode.SHOW, pack_show(show(automaton, node, exposure)))
+        end = start + cycle * made.cycle_ticks + int(made.slot_offset_ticks[slot]) + made.exposure_ticks
+        (block,) = of_type(bench.run_to(end), wire.ClickBlock)
+        messages.append(block)
+        if shown:
+            node = int(automaton.successors[node, int(block.bits[0])])
+    return joined(messages)
+
+
+def show(automaton: Automaton, state: int, exposure: int) -> Show:
+    facts = int(automaton.pattern[state]), int(automaton.dwell[state]), automaton.dwell_steps
+    return Show(exposure, state, *facts)
+
+
+def naive(bench: Bench, made: Plan, automaton: Automaton, count: int) -> tuple[list[int], list[int]]:
+    """The same run by the oracle, from profile, patterns and images alone."""
+    profile = bench.device.profile
+    states = [
+        (int(p), int(d) / automaton.dwell_steps, int(a), int(b))
+        for p, d, (a, b) in zip(automaton.pattern, automaton.dwell, automaton.successors)
+    ]
+    levels = automaton_bundle(automaton).pattern_levels.astype(float)
+    seconds = made.exposure_us * 1e-6
+    per_level = profile.projector.peak_photoelectrons_hz * seconds
+    lambdas = per_level * IMAGES.reshape(5, 6) / 255.0 @ levels.T
+
+    def light(cycle: int, pattern: int) -> float:
+        return float(lambdas[cycle // made.cycles_per_object % 5, pattern])
+
+    detector = profile.detector
+    dark = detector.dark_rate_hz * seconds
+    slots = made.slot_pattern.tolist()
+    return naive_walks.exposures(states, slots, light, dark, detector.afterpulse_probability, SEED, count)
+
+
+@pytest.mark.parametrize("automaton", [two_states(), six_states()], ids=["two", "six"])
+@pytest.mark.parametrize("afterpulses", [0.0, 0.3])
+def test_the_device_follows_the_automaton_as_the_oracle_does(automaton: Automaton, afterpulses: float) -> None:
+    bench, made = bright(automaton, profile=instrument(afterpulse_probability=afterpulses))
+    stamps, clicks, _ = run(bench, made, 300)
+    wanted = naive(bench, made, automaton, len(stamps))
+    assert (stamps.tolist(), clicks.tolist()) == wanted
+    assert set(stamps.tolist()) == {*range(automaton.n_states), DARK_PATTERN}  # every state was visited
+    assert 0.2 < clicks.mean() < 0.9
+
+
+@pytest.mark.parametrize("automaton", [two_states(), six_states()], ids=["two", "six"])
+def test_both_ways_of_driving_give_the_same_walks(automaton: Automaton) -> None:
+    stamps, clicks, _ = run(*bright(automaton), cycles=60)
+    hosted = run_hosted(*bright(automaton, "host"), automaton, 60)
+    assert np.array_equal(stamps, hosted[0])
+    assert np.array_equal(clicks, hosted[1])
+
+
+def test_behind_a_leaf_the_slots_are_dark_and_click_as_in_the_dark() -> None:
+    quiet = instrument(dark_rate_hz=0.0, afterpulse_probability=0.0)
+    stamps, clicks, _ = run(*bright(two_states(), profile=quiet), cycles=200)
+    walks, bits = stamps.reshape(200, -1), clicks.reshape(200, -1)
+    slots = (walks[:, 0] == DARK_PATTERN).all(), (walks[:, 1] == 0).all()
+    assert slots == (True, True)
+    stopped = bits[:, 1] == 1  # a click in state 0 leads to a leaf
+    assert (walks[stopped, 2] == DARK_PATTERN).all()
+    assert (walks[~stopped, 2] == 1).all()
+    assert not bits[stopped, 2].any()
+    assert 0 < stopped.sum() < 200
+
+
+def test_light_is_on_for_the_dwell_and_dark_counts_for_the_whole_exposure() -> None:
+    """With a quarter of the exposure, the light alone is a quarter: clicks follow 1 - exp(-(light / 4 + dark))."""
+    quarter = Automaton([0], [1], 4, [[1, 1]], [[0.5, 0.5], [0.5, 0.5]])
+    profile = instrument(dark_rate_hz=5000.0, afterpulse_probability=0.0)
+    bench, made = bright(quarter, profile=profile, scene=scene_from_arrays("w", IMAGES[:1] * 0 + 255, None, ()))
+    stamps, clicks, messages = run(bench, made, 6000)
+    lit = stamps == 0
+    pixels = automaton_bundle(quarter).pattern_levels.sum()
+    seconds = made.exposure_us * 1e-6
+    light = bench.device.profile.projector.peak_photoelectrons_hz * seconds * pixels / 4
+    for chosen, mean in ((lit, light + 5000 * seconds), (~lit, 5000 * seconds)):
+        p = 1 - math.exp(-mean)
+        assert abs(clicks[chosen].mean() - p) < 5 * math.sqrt(p * (1 - p) / chosen.sum())
+    assert of_type(messages, wire.Mark)[0].photons == pytest.approx(light, rel=1e-6)
+
+
+def test_marks_tell_the_light_of_a_walk_in_expectation() -> None:
+    automaton = six_states()
+    bench, made = bright(automaton)
+    _, _, messages = run(bench, made, 10)
+    profile, seconds = bench.device.profile, made.exposure_us * 1e-6
+    levels = automaton_bundle(automaton).pattern_levels.astype(float)
+    lambdas = profile.projector.peak_photoelectrons_hz * seconds * IMAGES.reshape(5, 6) / 255.0 @ levels.T
+    states = [
+        (int(p), int(d) / 4, int(a), int(b))
+        for p, d, (a, b) in zip(automaton.pattern, automaton.dwell, automaton.successors)
+    ]
+    dark = profile.detector.dark_rate_hz * seconds
+    for mark in of_type(messages, wire.Mark):
+        row = lambdas[mark.object_index % 5]
+        wanted = naive_walks.expected_light(states, lambda pattern, row=row: row[pattern], dark)
+        assert mark.photons == pytest.approx(wanted, rel=1e-6)
+    hosted, plan_of_host = bright(automaton, "host")
+    run(hosted, plan_of_host, 1)
+    assert math.isnan(of_type([message for _, message in hosted.got], wire.Mark)[0].photons)
+
+
+def test_a_changing_detector_gives_both_ways_the_same_walks_and_other_ones_than_a_steady_one() -> None:
+    changes = (
+        Change("drift", 0.001, 1.0, -1, -5000.0),
+        Change("burst", 0.004, 0.003, -1, 20_000.0),
+        Change("dead", 0.01, 0.002, 0, 0.0),
+    )
+    scene, automaton = SceneFile("changing", SCENE, changes), six_states()
+    prompt = instrument()
+    prompt = replace(
+        prompt, timing=replace(prompt.timing, host_turn_us=0.0)
+    )  # slots come at the same times in both ways
+    stamps, clicks, _ = run(*bright(automaton, scene=scene, profile=prompt), cycles=60)
+    hosted = run_hosted(*bright(automaton, "host", scene=scene, profile=prompt), automaton, 60)
+    assert np.array_equal(stamps, hosted[0])
+    assert np.array_equal(clicks, hosted[1])
+    steady = run(*bright(automaton, profile=prompt), cycles=60)
+    assert not np.array_equal(steady[1], clicks)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(1, 3000), min_size=1, max_size=20))
+def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
+    bench, made = bright(six_states())
+    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 40, 100_000)))
+    for cut in cuts:
+        bench.run_to(bench.device.tick + cut)
+    bench.run_to(bench.device.tick + 41 * made.cycle_ticks)
+    stamps, clicks = joined([message for _, message in bench.got])
+    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+
+
+def test_two_runs_of_a_session_walk_differently() -> None:
+    bench, made = bright(six_states())
+    first, second = (run(bench, made, 50)[1] for _ in range(2))
+    assert not np.array_equal(first, second)
+
+
+def test_a_broken_off_walk_is_sent_as_far_as_it_went() -> None:
+    bench, made = bright(six_states())
+    start = bench.device.tick + 100
+    bench.done(Opcode.ARM, pack_arm(Arm(start, 10, 100_000)))
+    bench.run_to(start + 3 * made.cycle_ticks + 2 * made.slot_period_ticks + made.exposure_ticks + 1)
+    bench.done(Opcode.STOP)
+    stamps, clicks = joined([message for _, message in bench.got])
+    assert len(stamps) == 3 * made.slots_per_cycle + 3
+    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+
+
+def test_many_objects_and_patterns_need_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Objects are computed when they come; a walk is the same whether one, a few or all of them are kept."""
+    whole = run(*bright(six_states()), cycles=40)[:2]
+    monkeypatch.setattr("pans.firmware_sim.device.walking.BLOCK_ENTRIES", 6)  # two objects at a time
+    monkeypatch.setattr("pans.firmware_sim.device.walking.MAX_BLOCKS", 1)
+    monkeypatch.setattr("pans.firmware_sim.device.walking.MAX_THRESHOLDS", 1)
+    bench, made = bright(six_states())
+    assert np.array_equal(np.stack(whole), np.stack(run(bench, made, 40)[:2]))
+    assert len(bench.device._light[1]._blocks) == 1
+
+
+@pytest.mark.uncompiled
+def test_the_kernels_walk_as_the_oracle_does() -> None:
+    automaton, slots = six_states(), [0xFFFF, *[0xFFFE] * 4]
+    light = np.linspace(0.2, 2.0, 6)
+    states = [(p, 1.0, int(a), int(b)) for p, (a, b) in enumerate(automaton.successors)]
+    wanted = naive_walks.exposures(states, slots, lambda _, pattern: light[pattern], 0.0, 0.0, 3, 5 * 40)
+    limits = np.ceil(-np.expm1(-np.append(light, 0.0)) * 2.0**53).astype(np.uint64)
+    successors = automaton.successors.astype(np.int64)
+    stamps, clicks, before = np.zeros((40, 5), np.uint16), np.zeros((40, 5), np.uint8), 0
+    for walk in range(40):
+        walk_kernels.follow(
+            np.stack([limits, limits]), successors, np.array(slots) == ADAPTIVE_PATTERN, walk_kernels.key_of(3),
+            5 * walk, (0, before), stamps[walk], clicks[walk],
+        )  # fmt: skip
+        before = int(clicks[walk, -1])
+    assert (stamps.ravel().tolist(), clicks.ravel().tolist()) == wanted
+    expected = walk_kernels.expected_light(-np.expm1(-light), light, successors)
+    assert expected == pytest.approx(naive_walks.expected_light(states, lambda pattern: light[pattern], 0.0))
+
+
+# -- what the host names -----------------------------------------------------------------------------------------------
+
+
+def hosted() -> tuple[Bench, Plan, int]:
+    """A bench that is armed and waits for SHOW; the run has two cycles of a dark and four adaptive slots."""
+    bench, made = bright(six_states(), "host")
+    start = bench.device.tick + 1000
+    bench.done(Opcode.ARM, pack_arm(Arm(start, 2, 100_000)))
+    return bench, made, start
+
+
+def test_what_is_named_late_is_refused_and_dark() -> None:
+    bench, made, start = hosted()
+    bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))
+    begins = start + made.slot_period_ticks
+    bench.run_to(begins - 1)
+    bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))  # again, just in time
+    bench.run_to(begins + made.slot_period_ticks)
+    status, text = bench.refused(Opcode.SHOW, pack_show(show(six_states(), 1, 2)))
+    assert (status, text) == (AckStatus.TOO_LATE, "exposure 2 has begun: 3 have")
+    bench.run_to(start + 2 * made.cycle_ticks)
+    stamps, _ = joined([message for _, message in bench.got])
+    assert stamps.tolist() == [DARK_PATTERN, 0, *[DARK_PATTERN] * 8]
+
+
+def test_the_latest_name_of_an_exposure_counts() -> None:
+    bench, made, start = hosted()
+    for state in (0, 1, 4):
+        bench.done(Opcode.SHOW, pack_show(show(six_states(), state, 1)))
+    bench.run_to(start + made.cycle_ticks)
+    assert joined([message for _, message in bench.got])[0].tolist() == [DARK_PATTERN, 4, *[DARK_PATTERN] * 3]
+
+
+@pytest.mark.parametrize(
+    ("shown", "text"),
+    [
+        (Show(0, 0, 0, 1, 1), "exposure 0 is dark"),
+        (Show(10, 0, 0, 1, 1), "exposure 10: the run has 10"),
+        (Show(1, 0, 3, 1, 1), "pattern 3: the plan has 3"),
+        (Show(1, 0, 0, 0, 4), "dwell 0: allowed 1..4"),
+        (Show(1, 0, 0, 5, 4), "dwell 5: allowed 1..4"),
+        (Show(1, 0, 0, 1, 3), "dwell in 3 steps: the device has 4"),
+        (Show(1, 0, 0, 1, 0), "dwell in 0 steps"),
+        (Show(1, 65533, 0, 1, 1), "state 65533: allowed 0..65532"),
+    ],
+)
+def test_an_impossible_name_is_refused(shown: Show, text: str) -> None:
+    bench, _, _ = hosted()
+    status, found = bench.refused(Opcode.SHOW, pack_show(shown))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert found.startswith(text)
+
+
+def test_names_need_a_run_that_the_host_drives_and_are_limited() -> None:
+    bench, made = bright(six_states(), "host")
+    assert bench.refused(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))[0] == AckStatus.WRONG_STATE
+    start = bench.device.tick + 1000
+    bench.done(Opcode.ARM, pack_arm(Arm(start, 1000, 100_000)))
+    adaptive = np.flatnonzero(np.tile(made.slot_pattern, 1000) == ADAPTIVE_PATTERN)
+    for exposure in adaptive[:MAX_SHOWS]:
+        bench.done(Opcode.SHOW, pack_show(show(six_states(), 0, int(exposure))))
+    full = bench.refused(Opcode.SHOW, pack_show(show(six_states(), 0, int(adaptive[MAX_SHOWS]))))
+    assert full == (AckStatus.OUT_OF_RANGE, f"{MAX_SHOWS} exposures are named already")
+    bench.done(Opcode.STOP)
+    driven, made = bright(six_states())
+    driven.done(Opcode.ARM, pack_arm(Arm(driven.device.tick + 100, 1, 100_000)))
+    assert driven.refused(Opcode.SHOW, pack_show(show(six_states(), 0, 1)))[0] == AckStatus.WRONG_STATE
+
+
+# -- uploads -----------------------------------------------------------------------------------------------------------
+
+
+def states(*rows: tuple[int, int, int, int], **changes: Any) -> StateChunk:
+    chunk = StateChunk(len(rows), 0, 1, 2, np.array(list(rows), STATE_DTYPE))
+    return chunk._replace(**changes)
+
+
+def with_plan(slots: int = 2, profile: Profile | None = None) -> Bench:
+    bench = Bench(profile or instrument(), SCENE)
+    bench.hello()
+    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(0, 0, 6, 6, np.ones((2, 1), np.uint8))))
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [ADAPTIVE_PATTERN] * slots)))
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("chunk", "text"),
+    [
+        (states((2, 1, 1, 2)), "a state shows pattern 2: the plan has 2"),
+        (states((0, 0, 1, 2)), "dwell 0..0: allowed 1..1"),
+        (states((0, 2, 1, 2)), "dwell 2..2: allowed 1..1"),
+        (states((0, 1, 0, 2)), "state 0 leads to 0: allowed 1..2"),
+        (states((0, 1, 1, 2), (0, 1, 2, 1)), "state 1 leads to 1: allowed 2..3"),
+        (states((0, 1, 1, 3)), "state 0 leads to 3: allowed 1..2"),
+        (states((0, 1, 1, 2), dwell_steps=3), "dwell in 3 steps: the device has 4"),
+        (states((0, 1, 1, 2), dwell_steps=0), "dwell in 0 steps"),
+        (states((0, 1, 1, 2), n_leaves=0), "0 leaves: allowed 1..1048576"),
+        (states((0, 1, 1, 2), n_leaves=1 << 21), "2097152 leaves"),
+        (states((0, 1, 1, 2), n_states=101), "101 states: the device follows 100"),
+        (states((0, 1, 3, 4), n_states=2, first_state=1), "state 1 continues no states"),
+        (states((0, 1, 1, 2), (0, 1, 2, 3), (0, 1, 3, 4)), "walks of 3 exposures: a cycle has 2 adaptive slots"),
+    ],
+)
+def test_impossible_states_are_refused_and_none_are_stored(chunk: StateChunk, text: str) -> None:
+    bench = with_plan()
+    status, found = bench.refused(Opcode.LOAD_STATES, pack_states(chunk))
+    assert status == AckStatus.OUT_OF_RANGE
+    assert found.startswith(text)
+    assert bench.device._states.states is None
+    bench.done(Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2))))
+    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 1, 1000)))
+
+
+def test_states_in_pieces_and_a_plan_that_forgets_them() -> None:
+    bench = with_plan()
+    whole = states((0, 1, 1, 2), (1, 1, 2, 3))
+    first, second = (whole._replace(first_state=n, states=whole.states[n : n + 1]) for n in (0, 1))
+    arm = pack_arm(Arm(bench.device.tick + 10_000, 1, 1000))
+    bench.done(Opcode.LOAD_STATES, pack_states(first))
+    assert bench.refused(Opcode.ARM, arm)[0] == AckStatus.WRONG_STATE
+    assert bench.refused(Opcode.LOAD_STATES, pack_states(second._replace(n_leaves=3)))[0] == AckStatus.OUT_OF_RANGE
+    bench.done(Opcode.LOAD_STATES, pack_states(second))
+    assert bench.device._states.states is not None
+    assert bench.refused(Opcode.LOAD_STATES, pack_states(second))[0] == AckStatus.OUT_OF_RANGE
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(2, [ADAPTIVE_PATTERN] * 2)))
+    assert bench.device._states.states is None
+    assert bench.refused(Opcode.LOAD_STATES, pack_states(second))[0] == AckStatus.OUT_OF_RANGE
+    bench.done(Opcode.ARM, arm)  # without states: the host drives
+
+
+def test_states_need_a_plan_with_adaptive_slots() -> None:
+    bench = Bench(instrument(), SCENE)
+    bench.hello()
+    body = pack_states(states((0, 1, 1, 2)))
+    assert bench.refused(Opcode.LOAD_STATES, body)[0] == AckStatus.WRONG_STATE
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(1, [0])))
+    assert bench.refused(Opcode.LOAD_STATES, body)[0] == AckStatus.WRONG_STATE
+
+
+@pytest.mark.parametrize(
+    ("slots", "text"),
+    [
+        ([ADAPTIVE_PATTERN, 0], "1 slots with a fixed pattern beside adaptive ones"),
+        ([ADAPTIVE_PATTERN, 2], "a slot shows pattern 2"),
+    ],
+)
+def test_adaptive_slots_stand_beside_dark_ones_alone(slots: list[int], text: str) -> None:
+    bench = Bench(instrument(), SCENE)
+    bench.hello()
+    status, found = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(2, slots)))
+    assert (status, found.startswith(text)) == (AckStatus.OUT_OF_RANGE, True)
+
+
+def test_adaptive_slots_may_not_follow_faster_than_the_projector_changes_its_pattern() -> None:
+    slow = replace(instrument(), projector=replace(instrument().projector, pattern_rate_max_hz=1000.0))
+    bench = Bench(slow, SCENE)
+    bench.hello()
+    status, text = bench.refused(Opcode.LOAD_PLAN, pack_plan(plan(1, [ADAPTIVE_PATTERN] * 3)))
+    assert (status, text) == (AckStatus.OUT_OF_RANGE, "patterns change after 100 ticks: the projector needs 999")
+
+
+def test_arming_needs_every_pattern_of_the_plan() -> None:
+    bench = with_plan()
+    bench.done(Opcode.LOAD_PLAN, pack_plan(plan(3, [ADAPTIVE_PATTERN] * 2)))
+    bench.done(Opcode.LOAD_STATES, pack_states(states((2, 1, 1, 2))))
+    status, text = bench.refused(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 1, 1000)))
+    assert (status, text) == (AckStatus.WRONG_STATE, "1 of 3 patterns are not loaded")
+
+
+def test_masks_are_patterns_of_two_levels() -> None:
+    bench = Bench(IDEAL, SCENE)
+    bench.hello()
+    rows = np.random.default_rng(0).integers(0, 2, (5, 13)).astype(np.uint8)
+    packed = np.packbits(rows, axis=1, bitorder="little")
+    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(3, 0, 13, 13, packed)))
+    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(0, 0, 13, rows[0].astype(np.uint16))))
+    bench.done(Opcode.LOAD_MASKS, pack_masks(MaskChunk(1, 0, 13, 8, packed[1:2, :1])))
+    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(1, 8, 13, rows[1, 8:].astype(np.uint16))))
+    bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(2, 0, 13, rows[2].astype(np.uint16))))
+    held = bench.device._patterns.stack(8)
+    assert np.array_equal(held, rows[[0, 1, 2, 0, 1, 2, 3, 4]])
+    assert bench.device._patterns.held_bytes == held.nbytes
+
+
+def test_large_masks_go_in_pieces_and_small_ones_together() -> None:
+    rows = np.random.default_rng(0).integers(0, 256, (3, 100_000)).astype(np.uint8)
+    chunks = mask_chunks(rows, 800_000)
+    assert {len(pack_masks(chunk)) <= 65536 for chunk in chunks} == {True}
+    for number in range(3):
+        pieces = [chunk.rows[0] for chunk in chunks if chunk.first_pattern == number]
+        assert np.array_equal(np.concatenate(pieces), rows[number])
+    small = mask_chunks(np.zeros((12_000, 98), np.uint8), 784)
+    assert sum(len(chunk.rows) for chunk in small) == 12_000
+    assert len(small) == 36  # 32 kB each
+
+
+@pytest.mark.parametrize(
+    ("chunk", "status"),
+    [
+        (MaskChunk(43_690 - 1, 0, 6, 6, np.ones((2, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
+        (MaskChunk(0, 0, 1 << 22, 8, np.ones((1, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
+        (MaskChunk(0, 8, 16, 8, np.ones((1, 1), np.uint8)), AckStatus.OUT_OF_RANGE),
+        (MaskChunk(0, 0, 16, 8, np.ones((2, 1), np.uint8)), AckStatus.MALFORMED),
+        (MaskChunk(0, 8, 15, 8, np.ones((1, 1), np.uint8)), AckStatus.MALFORMED),
+        (MaskChunk(0, 0, 6, 0, np.ones((1, 0), np.uint8)), AckStatus.MALFORMED),
+        (MaskChunk(0, 0, 6, 6, np.ones((0, 1), np.uint8)), AckStatus.MALFORMED),
+        (MaskChunk(0, 0, 6, 6, np.ones((1, 2), np.uint8)), AckStatus.MALFORMED),
+    ],
+)
+def test_impossible_masks_are_refused_and_none_are_stored(chunk: MaskChunk, status: int) -> None:
+    bench = Bench(instrument(), SCENE)
+    bench.hello()
+    assert bench.refused(Opcode.LOAD_MASKS, pack_masks(chunk))[0] == status
+    assert bench.device._patterns.held_bytes == 0
+
+
+def test_uploads_need_idle() -> None:
+    bench, _, _ = hosted()
+    for opcode, body in (
+        (Opcode.LOAD_MASKS, pack_masks(MaskChunk(0, 0, 6, 6, np.ones((1, 1), np.uint8)))),
+        (Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2)))),
+    ):
+        assert bench.refused(opcode, body)[0] == AckStatus.WRONG_STATE
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from([Opcode.LOAD_MASKS, Opcode.LOAD_STATES, Opcode.SHOW]), st.binary(max_size=60))
+def test_no_body_brings_the_device_down(opcode: Opcode, body: bytes) -> None:
+    bench = with_plan()
+    ack = bench.command(opcode, body)
+    assert ack.status in (AckStatus.DONE, AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE)
+    bench.done(Opcode.STOP)
+
+
+def test_what_the_device_announces() -> None:
+    (welcome, _) = Bench(instrument(), SCENE).hello()
+    extension = announced(welcome.facts)
+    assert extension is not None
+    assert (extension.states, extension.dwell_steps) == (100, 4)
+    assert announced({**welcome.facts, "automaton_schema": 1}) is None
+    parallel = Bench(load_profile("wdm-snspd"))
+    (welcome, _) = parallel.hello()
+    assert announced(welcome.facts) is None
+    status, _ = parallel.refused(Opcode.LOAD_STATES, pack_states(states((0, 1, 1, 2))))
+    assert status == AckStatus.UNKNOWN_OPCODE
