@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.wire.automata import MAX_STATES_PER_CHUNK, StateChunk
+from pans.runtime.wire.automata import STATES_PER_COMMAND, StateChunk
 from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage
 from pans.runtime.wire.schema import STATE_DTYPE
@@ -56,9 +56,9 @@ def _chunks_of(automaton: Automaton) -> list[StateChunk]:
     states = np.zeros(automaton.n_states, STATE_DTYPE)
     states["pattern"], states["dwell"] = automaton.pattern, automaton.dwell
     states["next_dark"], states["next_click"] = automaton.successors.T
-    starts = range(0, len(states), MAX_STATES_PER_CHUNK)
+    starts = range(0, len(states), STATES_PER_COMMAND)
     head = automaton.dwell_steps, automaton.n_leaves
-    return [StateChunk(len(states), first, *head, states[first : first + MAX_STATES_PER_CHUNK]) for first in starts]
+    return [StateChunk(len(states), first, *head, states[first : first + STATES_PER_COMMAND]) for first in starts]
 
 
 def plan_from_chunks(

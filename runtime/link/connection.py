@@ -13,16 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_chunks
 from pans.runtime.errors import DeviceError, LinkError, PansError
 from pans.runtime.timing.clock import ClockModel, ClockStep
 from pans.runtime.timing.evidence import Evidence, Stamped
-from pans.runtime.wire.commands import (
-    MAX_PIXELS_PER_CHUNK,
-    PatternChunk,
-    pack_pattern,
-    pack_plan,
-)
 from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Frame, FrameDecoder, Opcode, Welcome, pack_body
@@ -30,6 +23,7 @@ from pans.runtime.wire.session import ANSWER_TYPES, HostSession
 
 from .base import Link
 from .reader import Chunk, LinkReader
+from .upload import check_automaton, upload_commands
 
 if TYPE_CHECKING:
     from pans.runtime.wire.bulk import BulkDecoder
@@ -191,17 +185,12 @@ class Connection:
             self.pump(SETUP_POLL_S)
 
     def upload(self, plan: Plan, bundle: Bundle) -> None:
-        """Send the patterns and the plan, and wait until the device has them."""
-        for index, levels in enumerate(bundle.pattern_levels):
-            for first in range(0, len(levels), MAX_PIXELS_PER_CHUNK):
-                part = levels[first : first + MAX_PIXELS_PER_CHUNK]
-                while not self.session.has_room:
-                    self.pump(SETUP_POLL_S)
-                self.session.submit(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, first, len(levels), part)))
-        for chunk in plan_chunks(plan):
+        """Send the patterns, the plan and its automaton's states, and wait until the device has them."""
+        facts = {} if self.session.welcome is None else self.session.welcome.facts
+        for opcode, body in upload_commands(plan, bundle, facts):
             while not self.session.has_room:
                 self.pump(SETUP_POLL_S)
-            self.session.submit(Opcode.LOAD_PLAN, pack_plan(chunk))
+            self.session.submit(opcode, body)
         self.settle()
 
     def synchronise(self) -> ClockModel:
@@ -247,6 +236,7 @@ def check_device(facts: Any, plan: Plan, bundle: Bundle, tick_hz: int) -> None:
                 f"the device's {what}: {held}, needed {needed}", remedy="use a device or a bundle that fits"
             )
     _check_optics(facts, bundle)
+    check_automaton(facts, plan)
     if facts["mode"] != plan.mode:
         raise DeviceError(f"the device measures in {facts['mode']} mode, the profile says {plan.mode}")
     if int(facts["tick_hz"]) != tick_hz:

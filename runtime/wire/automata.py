@@ -6,17 +6,20 @@ bytes for `wire.encode_command`, `unpack_*` return named tuples or raise `Malfor
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from .fields import U16_MAX
 from .messages import MAX_PAYLOAD_BYTES, STRUCTS, MalformedMessage, fields
 from .schema import AUTOMATON_SCHEMA, STATE_DTYPE
 
 MAX_STATES_PER_CHUNK = 4096
-MAX_MASK_BYTES = 32768  # of one command: a frame of half the longest, so that answers and probes come between
+# What the host puts into one command: a fifth of a second at 40 kB/s, so that even a slow line acknowledges it before it is repeated.
+MASK_BYTES = 8192
+STATES_PER_COMMAND = 680
 U8 = npt.NDArray[np.uint8]
 
 
@@ -98,18 +101,20 @@ def unpack_masks(body: bytes) -> MaskChunk:
     return MaskChunk(first, first_pixel, n_pixels, pixels, rows)
 
 
-def mask_chunks(rows: U8, n_pixels: int) -> list[MaskChunk]:
-    """Cut packed patterns, uint8 (n, ceil(n_pixels / 8)), into as few LOAD_MASKS as may be."""
-    row_bytes = rows.shape[1]
-    if row_bytes > MAX_MASK_BYTES:
-        return [
-            MaskChunk(number, 8 * first, n_pixels, min(8 * MAX_MASK_BYTES, n_pixels - 8 * first), row[None, first : first + MAX_MASK_BYTES])
-            for number, row in enumerate(rows)
-            for first in range(0, row_bytes, MAX_MASK_BYTES)
-        ]  # fmt: skip
-    per_command = min(MAX_MASK_BYTES // row_bytes, 0xFFFF)
-    starts = range(0, len(rows), per_command)
-    return [MaskChunk(first, 0, n_pixels, n_pixels, rows[first : first + per_command]) for first in starts]
+def mask_chunks(levels: npt.NDArray[Any]) -> Iterator[MaskChunk]:
+    """Cut patterns of the levels 0 and 1, (n, pixels), into LOAD_MASKS of about MASK_BYTES."""
+    n_patterns, n_pixels = levels.shape
+    per_command = min(MASK_BYTES // ((n_pixels + 7) // 8), U16_MAX)
+    if per_command:
+        for first in range(0, n_patterns, per_command):
+            rows = np.packbits(levels[first : first + per_command] != 0, axis=1, bitorder="little")
+            yield MaskChunk(first, 0, n_pixels, n_pixels, rows)
+        return
+    for number in range(n_patterns):
+        for first in range(0, n_pixels, 8 * MASK_BYTES):
+            piece = levels[number : number + 1, first : first + 8 * MASK_BYTES] != 0
+            rows = np.packbits(piece, axis=1, bitorder="little")
+            yield MaskChunk(number, first, n_pixels, piece.shape[1], rows)
 
 
 def pack_states(chunk: StateChunk) -> bytes:

@@ -67,8 +67,7 @@ def set_up(automaton: Automaton, drive: str, profile: Profile | None = None, **o
 
 
 def upload(bench: Bench, levels: np.ndarray, made: Plan) -> None:
-    packed = np.packbits(levels.astype(np.uint8), axis=1, bitorder="little")
-    for masks in mask_chunks(packed, levels.shape[1]):
+    for masks in mask_chunks(levels):
         bench.done(Opcode.LOAD_MASKS, pack_masks(masks))
     for chunk in plan_chunks(made):
         bench.done(Opcode.LOAD_PLAN, pack_plan(chunk))
@@ -474,15 +473,17 @@ def test_masks_are_patterns_of_two_levels() -> None:
 
 
 def test_large_masks_go_in_pieces_and_small_ones_together() -> None:
-    rows = np.random.default_rng(0).integers(0, 256, (3, 100_000)).astype(np.uint8)
-    chunks = mask_chunks(rows, 800_000)
-    assert {len(pack_masks(chunk)) <= 65536 for chunk in chunks} == {True}
-    for number in range(3):
-        pieces = [chunk.rows[0] for chunk in chunks if chunk.first_pattern == number]
-        assert np.array_equal(np.concatenate(pieces), rows[number])
-    small = mask_chunks(np.zeros((12_000, 98), np.uint8), 784)
+    levels = np.random.default_rng(0).integers(0, 2, (3, 200_003)).astype(np.uint16)
+    bench = Bench(instrument(), SCENE)
+    bench.hello()
+    bodies = [pack_masks(chunk) for chunk in mask_chunks(levels)]
+    assert max(map(len, bodies)) < 9000
+    for body in bodies:
+        bench.done(Opcode.LOAD_MASKS, body)
+    assert np.array_equal(bench.device._patterns.stack(3), levels)
+    small = list(mask_chunks(np.zeros((12_000, 784), np.uint16)))
     assert sum(len(chunk.rows) for chunk in small) == 12_000
-    assert len(small) == 36  # 32 kB each
+    assert len(small) == 145  # of 83 masks each
 
 
 @pytest.mark.parametrize(

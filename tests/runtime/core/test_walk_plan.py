@@ -15,7 +15,7 @@ from pans.runtime.core.plan import ADAPTIVE_PATTERN, DARK_PATTERN, NO_SHOT, buil
 from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks, state_chunks
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.wire.automata import MAX_STATES_PER_CHUNK, pack_states, unpack_states
+from pans.runtime.wire.automata import STATES_PER_COMMAND, pack_states, unpack_states
 from pans.runtime.wire.messages import MalformedMessage
 
 DMD = load_profile("dmd-spad")
@@ -122,7 +122,7 @@ def test_a_plan_goes_to_the_device_and_back(automaton: Automaton) -> None:
     profile = instrument(60_000)
     plan = build_plan(profile, bundle_for(automaton))
     states = [unpack_states(pack_states(chunk)) for chunk in state_chunks(plan)]
-    assert len(states) == -(-automaton.n_states // MAX_STATES_PER_CHUNK)
+    assert len(states) == -(-automaton.n_states // STATES_PER_COMMAND)
     rows = np.concatenate([chunk.states for chunk in states])
     assert np.array_equal(rows["pattern"], automaton.pattern)
     assert np.array_equal(rows["dwell"], automaton.dwell)
