@@ -19,8 +19,9 @@ from typing import Any, BinaryIO
 from .errors import DamagedFileError, UsageError
 
 MIB = 1 << 20
-FILE_MAX_BYTES = 256 * MIB
+FILE_MAX_BYTES = 64 * MIB  # of a bundle: its arrays, its sessions and the program stay below 400 MiB together
 JSON_DEPTH_MAX = 64  # our own headers need about six
+JSON_VALUES_MAX = 1 << 18  # values take up to 250 bytes each once they are read
 
 
 def canonical_json(value: Any) -> bytes:
@@ -51,9 +52,10 @@ def _refuse_strange(value: Any, path: str) -> None:
 def parse_json_object(data: bytes, where: str) -> dict[str, Any]:
     """Decode one JSON object strictly; DamagedFileError otherwise.
 
-    Strictly: no NaN, no number beyond float64 or 64 bits, no double keys, at most JSON_DEPTH_MAX levels.
+    Strictly: no NaN, no number beyond float64 or 64 bits, no double keys, at most JSON_DEPTH_MAX levels and JSON_VALUES_MAX values.
     """
     try:
+        _demand_few(data)
         value = json.loads(
             data.decode("utf-8"),
             object_pairs_hook=_without_doubles,
@@ -68,6 +70,13 @@ def parse_json_object(data: bytes, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DamagedFileError(f"{where}: expected a JSON object, found a {type(value).__name__}")
     return value
+
+
+def _demand_few(data: bytes) -> None:
+    """Refuse, before anything is made of it, a text that would become far larger in memory; commas within texts count too."""
+    values = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    if values > JSON_VALUES_MAX:
+        raise ValueError(f"{values} values, allowed at most {JSON_VALUES_MAX}")
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -165,6 +174,11 @@ class Block:
     payload: bytes
     end: int
     chain: int
+
+    @property
+    def begin(self) -> int:
+        """The file offset of the payload."""
+        return self.end - _CRC.size - len(self.payload)
 
 
 def file_prologue(magic: bytes, version: int) -> tuple[bytes, int]:

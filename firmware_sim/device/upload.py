@@ -97,15 +97,19 @@ class PatternMemory:
     def stack(self, n_patterns: int) -> NDArray[np.uint16]:
         """Return patterns 0..n-1 as uint16 (n, pixels); `Refused` when one is missing, incomplete or of another size."""
         chosen = [self._patterns.get(index) for index in range(n_patterns)]
-        complete = [one.levels for one in chosen if one is not None and one.filled == len(one.levels)]
+        complete = [one for one in chosen if one is not None and one.filled == len(one.levels)]
         if len(complete) < n_patterns:
             raise Refused(
                 AckStatus.WRONG_STATE, f"{n_patterns - len(complete)} of {n_patterns} patterns are not loaded"
             )
-        sizes = sorted({len(levels) for levels in complete})
+        sizes = sorted({len(one.levels) for one in complete})
         if len(sizes) > 1:
             raise Refused(AckStatus.OUT_OF_RANGE, f"patterns have different sizes: {sizes[0]} and {sizes[-1]} pixels")
-        return np.stack(complete)
+        stacked = np.empty((n_patterns, sizes[0]), np.uint16)
+        for row, one in zip(stacked, complete):
+            row[:] = one.levels
+            one.levels = row  # what is in the memory already does not stand there twice
+        return stacked
 
 
 @dataclass(slots=True)

@@ -110,7 +110,7 @@ def _plannable(profile: Profile, bundle: Bundle) -> bool:
 
 def _use_recording(path: Path) -> None:
     recording = read_recording(path)
-    if recording.bundle_data() and {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
+    if recording.bundle_place and {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
         recorded_plan(recording)
         replay(recording, recording.bundle())
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .shifts import ShiftTable
     from .tape import BarTable
 
+_ROWS_AT_ONCE = 4096  # whose intermediate results stand in memory
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Table: TypeAlias = "LightTable | ShiftTable | BarTable"  # what a scene needs to know of a pattern set
@@ -64,7 +65,11 @@ def light_table(profile: Profile, scene: Scene, levels: NDArray[np.uint16], expo
 def tabulate(profile: Profile, photons: F64, exposure_us: float) -> LightTable:
     """Return the table of expected photoelectrons (objects, patterns) of one exposure each."""
     with_dark = np.column_stack([photons, np.zeros(len(photons))])
-    return LightTable(with_dark, first_click_probability(detector_model(profile, exposure_us), with_dark))
+    model, probability = detector_model(profile, exposure_us), np.empty_like(with_dark)
+    for first in range(0, len(with_dark), _ROWS_AT_ONCE):
+        rows = slice(first, first + _ROWS_AT_ONCE)
+        probability[rows] = first_click_probability(model, with_dark[rows])
+    return LightTable(with_dark, probability)
 
 
 def prepare(profile: Profile, scene: SceneFile, levels: NDArray[np.uint16], exposure_us: float) -> Table:

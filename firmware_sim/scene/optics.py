@@ -18,8 +18,8 @@ from pans.runtime.instrument.profile import Profile
 
 from .still import Scene
 
-MAX_TABLE_ENTRIES = 1 << 26  # 512 MiB of float64
-_OBJECTS_PER_BLOCK = 1024
+MAX_TABLE_ENTRIES = 1 << 22  # 32 MiB of float64, a few times over
+_VALUES_PER_BLOCK = 1 << 20  # of float64 copies of patterns and pictures: 8 MiB each
 
 
 def photons_per_level(profile: Profile, exposure_us: float) -> float:
@@ -47,12 +47,15 @@ def expected_photoelectrons(
         )
     if not scene.lit:
         return np.zeros((scene.n_objects, n_patterns))
-    levels = pattern_levels.astype(np.float64).T
     t_min = profile.min_transmission
-    total = levels.sum(axis=0)
+    total = pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64)
     grey, white = grey_steps(profile)
-    through = _grey_sums(scene, grey, levels, total) / white
-    return photons_per_level(profile, exposure_us) * (t_min * total + (1.0 - t_min) * through)
+    light = _grey_sums(scene, grey, pattern_levels, total)
+    light /= white  # in place from here on: the table may be large
+    light *= 1.0 - t_min
+    light += t_min * total
+    light *= photons_per_level(profile, exposure_us)
+    return light
 
 
 def passive_photoelectrons(analyser: Analyser, scene: Scene, exposure_us: float) -> NDArray[np.float64]:
@@ -82,15 +85,26 @@ def grey_steps(profile: Profile) -> tuple[NDArray[np.float64], int]:
 
 
 def _grey_sums(
-    scene: Scene, grey: NDArray[np.float64], levels: NDArray[np.float64], total: NDArray[np.float64]
+    scene: Scene, grey: NDArray[np.float64], pattern_levels: NDArray[np.uint16], total: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Sum of level times grey step, an exact integer: float64 (n_objects, n_patterns)."""
     if scene.any_shape:
         return grey[scene.images.reshape(-1, 1)] * total
-    lit = np.flatnonzero(levels.any(axis=1))  # trained patterns are dark nearly everywhere: dark pixels add nothing
-    seen = levels[lit]
-    sums = np.empty((scene.n_objects, levels.shape[1]))
-    for first in range(0, scene.n_objects, _OBJECTS_PER_BLOCK):
-        block = scene.images[first : first + _OBJECTS_PER_BLOCK]
-        np.matmul(grey[block.reshape(len(block), -1)[:, lit]], seen, out=sums[first : first + len(block)])
+    n_patterns, n_pixels = pattern_levels.shape
+    sums = np.zeros((scene.n_objects, n_patterns))
+    at_once = max(1, _VALUES_PER_BLOCK // n_patterns)
+    for first in range(0, n_pixels, at_once):
+        levels = pattern_levels[:, first : first + at_once].astype(np.float64).T
+        lit = np.flatnonzero(levels.any(axis=1))  # trained patterns are dark nearly everywhere: dark pixels add nothing
+        _add_pixels(scene, grey, levels[lit], first + lit, sums)
     return sums
+
+
+def _add_pixels(
+    scene: Scene, grey: NDArray[np.float64], seen: NDArray[np.float64], lit: NDArray[np.intp], sums: NDArray[np.float64]
+) -> None:
+    """Add to the sums of all objects what comes through the pixels `lit`, which have the levels `seen` (pixels, patterns)."""
+    at_once = max(1, _VALUES_PER_BLOCK // max(1, len(lit)))
+    for first in range(0, scene.n_objects, at_once):
+        images = scene.images[first : first + at_once]
+        sums[first : first + at_once] += grey[images.reshape(len(images), -1)[:, lit]] @ seen

@@ -16,7 +16,7 @@ from pans.runtime.instrument.profile import Profile
 from .optics import grey_steps, photons_per_level
 from .still import Scene
 
-MAX_TABLE_BYTES = 1 << 29
+MAX_TABLE_BYTES = 1 << 27
 _PICTURES_AT_A_TIME = 64
 _U32_MAX = (1 << 32) - 1
 

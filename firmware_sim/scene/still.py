@@ -21,7 +21,7 @@ from pans.runtime.npz_file import read_arrays
 
 MAX_OBJECTS = 1 << 17
 MAX_PIXELS = 1 << 22
-MAX_SCENE_BYTES = 1 << 29
+MAX_SCENE_BYTES = 1 << 26
 MAX_CLASSES = 4096
 NAME_MAX = 250  # of a file: longer ones no system has
 UNKNOWN_LABEL = -1
@@ -140,6 +140,8 @@ def _read_scene(path: Path, name: str) -> Scene:
         ) from error
     if "images" not in arrays:
         raise ConfigError(f"{path}: no array `images`, found {', '.join(sorted(arrays)) or 'nothing'}")
+    for array in arrays.values():
+        array.flags.writeable = False  # nobody else has them: no copy
     checked = scene_from_arrays(str(path), arrays["images"], arrays.get("labels"), _classes(path, arrays))
     return replace(checked, name=name)
 
@@ -155,7 +157,7 @@ def _classes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     kept = np.ascontiguousarray(array)
-    if kept is array:
+    if kept is array and array.flags.writeable:
         kept = array.copy()
     kept.flags.writeable = False
     return kept

@@ -37,12 +37,14 @@ OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head gives back
 TEXT_MAX_CHARACTERS = 200
 TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
+GOLDEN_MEANS_MAX, GOLDEN_SCORES_MAX = 1 << 20, 1 << 22  # numbers
 LAYERS_MAX = 16
 # Numbers of the header; docs/reference/formats.md states the same.
 RANGES = {"levels": Range(2, LEVELS_MAX, whole=True), "photons_per_level": LIGHT_RANGE}
 GOLDEN_WORK_MAX = 1 << 36  # multiply-adds for all golden vectors together: about ten seconds
 AFFINE_MAX = 1e20  # of an int8 head: its sums, below 2**31, stay finite in float32
 GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
+_COMPARE_VALUES = 1 << 20  # at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,22 +131,33 @@ def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *,
     """
     if found.shape != golden.shape:
         return f"scores of shape {found.shape}, expected {golden.shape}"
+    step = max(1, _COMPARE_VALUES // max(1, golden.shape[1]))  # rows at once, so that float64 copies stay small
+    pieces = [slice(start, start + step) for start in range(0, len(golden), step)]
+    wrong = (_score_violation(found[rows], golden[rows], rows.start) for rows in pieces)
+    decided = (_decision_violation(found[rows], golden[rows], rows.start) for rows in pieces if decides)
+    return next((text for texts in (wrong, decided) for text in texts if text), "")
+
+
+def _score_violation(found: NDArray[np.float32], golden: NDArray[np.float32], first: int) -> str:
     wanted = golden.astype(np.float64)
-    scale = np.maximum(1.0, np.abs(wanted))
-    error = np.abs(found.astype(np.float64) - wanted) / scale
-    if not np.all(error <= GOLDEN_TOLERANCE):  # a NaN fails too
-        row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
-        worst = float(error[row].max())
-        return f"the scores of vector {row} are off by {worst:.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
-    if not decides:
+    error = np.abs(found.astype(np.float64) - wanted) / np.maximum(1.0, np.abs(wanted))
+    if np.all(error <= GOLDEN_TOLERANCE):  # not of a NaN
         return ""
+    row = int(np.argmax(np.where(np.isfinite(error), error, np.inf).max(axis=1)))
+    off = f"off by {float(error[row].max()):.3g} of max(1, |score|), allowed {GOLDEN_TOLERANCE:g}"
+    return f"the scores of vector {first + row} are {off}"
+
+
+def _decision_violation(found: NDArray[np.float32], golden: NDArray[np.float32], first: int) -> str:
+    wanted = golden.astype(np.float64)
     ranked = np.sort(wanted, axis=1)
-    clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale.max(axis=1)
+    scale = np.maximum(1.0, np.abs(wanted).max(axis=1))
+    clear = ranked[:, -1] - ranked[:, -2] > GOLDEN_TOLERANCE * scale
     differs = clear & (found.argmax(axis=1) != golden.argmax(axis=1))
-    if differs.any():
-        row = int(np.argmax(differs))
-        return f"the decision for vector {row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
-    return ""
+    if not differs.any():
+        return ""
+    row = int(np.argmax(differs))
+    return f"the decision for vector {first + row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
 
 
 def row_index(means: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -301,7 +314,8 @@ def _check_int8(head: Int8Head, n_features: int, n_classes: int) -> None:
     demand(int(head.weights.min()) >= -WEIGHT_MAX, f"an int8 weight is below -{WEIGHT_MAX}")
     wanted = (2, sum(sizes[1:]))
     demand(head.affine.shape == wanted, f"int8_affine has shape {head.affine.shape}, allowed: {wanted}")
-    demand(bool((np.abs(head.affine) <= AFFINE_MAX).all()), f"the int8 head holds scales beyond {AFFINE_MAX:g}")
+    fits = float(head.affine.min()) >= -AFFINE_MAX and float(head.affine.max()) <= AFFINE_MAX  # a NaN is both
+    demand(fits, f"the int8 head holds scales beyond {AFFINE_MAX:g}")
     # a sum of integers stays exact: the kernel adds in int32
     largest = max(n_in for n_in in sizes[1:-1]) * STEP_MAX * WEIGHT_MAX if len(sizes) > 2 else 0
     demand(largest < 1 << 31, f"an int8 layer of {max(sizes[1:])} inputs could leave int32")
@@ -320,6 +334,8 @@ def _check_golden(bundle: Bundle) -> None:
     )
     wanted = (count, bundle.n_outputs)
     demand(scores.shape == wanted, f"golden_scores has shape {scores.shape}, allowed: {wanted}")
+    for what, array, most in (("means", means, GOLDEN_MEANS_MAX), ("scores", scores, GOLDEN_SCORES_MAX)):
+        demand(array.size <= most, f"golden_{what} holds {array.size} numbers, allowed at most {most}")
     demand(bool(((means >= 0) & (means <= 1)).all()), "golden_means leaves [0, 1]")
     demand(_finite(scores), "the golden scores are not finite (does the head answer NaN?)")
     if bundle.automaton is not None:

@@ -8,10 +8,11 @@ leaves bytes that no checksum covers.
 from __future__ import annotations
 
 import hashlib
+import io
 import math
 import struct
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +45,13 @@ _MATRIX_PARTS = {"<f4": "matrix", "<c8": "matrix_complex"}  # of a passive senso
 _INT8_PARTS = {"int8_sizes": "<u4", "int8_weights": "|i1", "int8_affine": "<f4"}  # all three or none
 _PARTS |= _INT8_PARTS | {"int8_onnx": "|u1"} | {name: dtype for dtype, name in _MATRIX_PARTS.items()}
 _ALL_PARTS = _PARTS | automaton_file.PARTS  # no name has two dtypes
+_MODELS = ("head_onnx", "int8_onnx")
 _SENSOR_KEYS = ("light", "optics", "full_scale_photoelectrons", "exposure_us")
 _REMEDY = "take the file from its source again, or export it again with `pans train` or `pans bundle`"
 
 
 def bundle_bytes(bundle: Bundle) -> bytes:
-    """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 256 MiB."""
+    """Return the file of `bundle`; the same bundle always gives the same bytes. UsageError above 64 MiB."""
     automaton = bundle.automaton
     parts = _fixed_parts(bundle) if automaton is None else automaton_file.parts_of(bundle, automaton)
     rows, blobs, offset = [], [], 0
@@ -129,26 +131,68 @@ def _version_of(new_keys: set[str]) -> int:
 
 def parse_bundle(data: bytes, where: str) -> Bundle:
     """Return the bundle in `data`; DamagedFileError, starting with `where`, for any byte that is not as written."""
+    return read_bundle(io.BytesIO(data), len(data), where)[0]
+
+
+def read_bundle(file: BinaryIO, size: int, where: str) -> tuple[Bundle, str]:
+    """Return the bundle in the next `size` bytes of `file` and their SHA-256 as hex; DamagedFileError as `parse_bundle`.
+
+    The bytes are read twice, for the closing checksum and for the parts, and memory holds them once: as the arrays of the bundle.
+    """
+    source = _Source(file, size)
     try:
-        header_end = _check_prologue(data)
-        if hashlib.sha256(data[:-_DIGEST_BYTES]).digest() != data[-_DIGEST_BYTES:]:
-            raise ValueError(_what_changed(data, header_end))
-        header = parse_json_object(data[_PROLOGUE.size : header_end], "header")
-        return _build(header, _read_parts(header, data, header_end))
+        header_end, version, header_bytes = _check_prologue(source)
+        digest, closing = source.hashed(size - _DIGEST_BYTES)
+        if digest.digest() != closing:
+            raise ValueError(_what_changed(source, header_bytes, header_end))
+        digest.update(closing)
+        header = parse_json_object(header_bytes, "header")
+        return _build(header, _read_parts(header, version, source, header_end)), digest.hexdigest()
     except DamagedFileError as error:
         raise DamagedFileError(f"{where}: {error.message}", remedy=error.remedy or _REMEDY) from error
     except (ValueError, TypeError, OverflowError) as error:
         raise DamagedFileError(f"{where}: {error}", remedy=_REMEDY) from error
 
 
-def _check_prologue(data: bytes) -> int:
-    """Check magic, version and sizes; return where the header ends."""
-    demand(len(data) <= FILE_MAX_BYTES, f"{len(data)} bytes, allowed at most {FILE_MAX_BYTES}")
-    if data[: len(MAGIC)] != MAGIC[: len(data)]:
-        raise ValueError(f"not a PANS bundle: it starts with {data[:8]!a}, expected {MAGIC!a}")
+class _Source:
+    """The bytes of one bundle in a file; every read is of the length that was asked for, or ValueError."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._start, self.size = file, file.tell(), size
+
+    def read(self, at: int, length: int) -> bytes:
+        self._file.seek(self._start + at)
+        data = self._file.read(length)
+        if len(data) != length:
+            raise ValueError("the file became shorter while it was read")
+        return data
+
+    def array(self, at: int, length: int, dtype: str) -> NDArray[Any]:
+        """Return `length` bytes as an array of its own, (n,) of `dtype`."""
+        found = np.empty(length // np.dtype(dtype).itemsize, dtype)
+        self._file.seek(self._start + at)
+        if self._file.readinto(memoryview(found).cast("B")) != length:  # type: ignore[attr-defined, arg-type]
+            raise ValueError("the file became shorter while it was read")
+        return found
+
+    def hashed(self, length: int) -> tuple[hashlib._Hash, bytes]:
+        """Return the SHA-256 of the first `length` bytes, and what follows them."""
+        digest = hashlib.sha256()
+        for at in range(0, length, MIB):
+            digest.update(self.read(at, min(MIB, length - at)))
+        return digest, self.read(length, self.size - length)
+
+
+def _check_prologue(source: _Source) -> tuple[int, int, bytes]:
+    """Check magic, version and sizes; return where the header ends, the version and the header."""
+    size = source.size
+    demand(size <= FILE_MAX_BYTES, f"{size} bytes, allowed at most {FILE_MAX_BYTES}")
+    start = source.read(0, min(size, _PROLOGUE.size))
+    if start[: len(MAGIC)] != MAGIC[: len(start)]:
+        raise ValueError(f"not a PANS bundle: it starts with {start[:8]!a}, expected {MAGIC!a}")
     smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
-    demand(len(data) >= smallest, f"truncated: {len(data)} bytes, a bundle has at least {smallest}")
-    _, version, header_length = _PROLOGUE.unpack_from(data)
+    demand(size >= smallest, f"truncated: {size} bytes, a bundle has at least {smallest}")
+    _, version, header_length = _PROLOGUE.unpack_from(start)
     if version not in VERSIONS:
         raise DamagedFileError(
             f"bundle format version {version}, allowed: {', '.join(map(str, VERSIONS))}",
@@ -156,33 +200,31 @@ def _check_prologue(data: bytes) -> int:
         )
     demand(header_length <= HEADER_MAX_BYTES, f"a header of {header_length} bytes, allowed at most {HEADER_MAX_BYTES}")
     header_end = _PROLOGUE.size + header_length
-    demand(
-        header_end + _DIGEST_BYTES <= len(data), f"truncated: {len(data)} bytes, the header alone needs {header_end}"
-    )
-    return header_end
+    demand(header_end + _DIGEST_BYTES <= size, f"truncated: {size} bytes, the header alone needs {header_end}")
+    return header_end, version, source.read(_PROLOGUE.size, header_length)
 
 
-def _what_changed(data: bytes, header_end: int) -> str:
+def _what_changed(source: _Source, header: bytes, header_end: int) -> str:
     """Say as exactly as possible why the closing checksum does not fit; the header is not trusted here, only quoted."""
+    size = source.size
     try:
-        rows = parse_json_object(data[_PROLOGUE.size : header_end], "header")["parts"]
+        rows = parse_json_object(header, "header")["parts"]
         wanted = header_end + sum(int(row["length"]) for row in rows) + _DIGEST_BYTES
-        if wanted > len(data):
-            return f"truncated: {len(data)} bytes, the header announces {wanted}"
-        if wanted < len(data):
-            return f"{len(data) - wanted} bytes too many: {len(data)}, the header announces {wanted}"
+        if wanted > size:
+            return f"truncated: {size} bytes, the header announces {wanted}"
+        if wanted < size:
+            return f"{size - wanted} bytes too many: {size}, the header announces {wanted}"
         for row in rows:
-            start = header_end + int(row["offset"])
-            if hashlib.sha256(data[start : start + int(row["length"])]).hexdigest() != row["sha256"]:
+            part = source.read(header_end + int(row["offset"]), int(row["length"]))
+            if hashlib.sha256(part).hexdigest() != row["sha256"]:
                 return f"altered: the part {ascii(row['name'])[:40]} does not have its SHA-256"
     except (DamagedFileError, KeyError, TypeError, ValueError, OverflowError):
         pass
     return "altered: the header or the closing SHA-256 is not as written"
 
 
-def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict[str, NDArray[Any]]:
-    """Return the parts by name, after checking that they fill the file without gap, overlap or rest."""
-    version = _PROLOGUE.unpack_from(data)[1]
+def _read_parts(header: Mapping[str, Any], version: int, source: _Source, header_end: int) -> dict[str, Any]:
+    """Return the parts by name, after checking that they fill the file without gap, overlap or rest; models are bytes."""
     new_keys = set(header) & _KEYS_OF_VERSION[version]
     if version == 3:
         new_keys |= automaton_file.HEADER_KEYS
@@ -192,26 +234,13 @@ def _read_parts(header: Mapping[str, Any], data: bytes, header_end: int) -> dict
     known = automaton_file.PARTS if version == 3 else _PARTS
     rows = header["parts"]
     demand(isinstance(rows, list) and len(rows) <= len(known), "the header's parts are not a short list")
-    parts: dict[str, NDArray[Any]] = {}
-    offset, room = 0, len(data) - _DIGEST_BYTES - header_end
+    parts: dict[str, Any] = {}
+    offset, room = 0, source.size - _DIGEST_BYTES - header_end
     for row in rows:
-        demand(isinstance(row, dict) and set(row) == _PART_KEYS, f"a part needs the keys {_quoted(_PART_KEYS)}")
-        name, shape, length = row["name"], row["shape"], row["length"]
-        demand(isinstance(name, str) and name in known, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(known)}")
-        demand(name not in parts, f"the part {name} stands twice")
-        demand(row["dtype"] == known[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {known[name]}")
-        good_shape = isinstance(shape, list) and len(shape) in (1, 2) and all(_is_count(n) for n in shape)
-        demand(good_shape and _is_count(length), f"{name} has shape {ascii(shape)[:80]}, allowed: one or two sizes")
-        wanted = math.prod(shape) * np.dtype(known[name]).itemsize
-        demand(length == wanted, f"{name} has {length} bytes, its shape {shape} needs {wanted}")
-        demand(
-            row["offset"] == offset and offset + length <= room, f"{name} lies outside the file or over another part"
-        )
-        blob = data[header_end + offset : header_end + offset + length]
-        demand(hashlib.sha256(blob).hexdigest() == row["sha256"], f"the part {name} does not have its SHA-256")
-        native = np.dtype(known[name]).newbyteorder("=")
-        parts[name] = frozen(np.frombuffer(blob, dtype=known[name]).reshape(shape).astype(native))
-        offset += length
+        _check_row(row, known, offset, room)
+        demand(row["name"] not in parts, f"the part {row['name']} stands twice")
+        parts[row["name"]] = _read_part(row, source, header_end + offset)
+        offset += row["length"]
     demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
     if version < 3:
         _demand_fixed_parts(header, parts)
@@ -225,10 +254,35 @@ def _demand_fixed_parts(header: Mapping[str, Any], parts: Mapping[str, NDArray[A
     if not (passive and optics):
         optics = ["pattern_levels"]
     for name in (*optics, "golden_means", "golden_scores"):
-        demand(name in parts and parts[name].ndim == 2, f"the part {name} is missing or not a matrix")
+        demand(np.ndim(parts.get(name, 0)) == 2, f"the part {name} is missing or not a matrix")
 
 
-def _build(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Bundle:
+def _check_row(row: Any, known: Mapping[str, str], offset: int, room: int) -> None:
+    """Check what the header says of one part, of those that are `known`; it begins at `offset` of `room` bytes."""
+    demand(isinstance(row, dict) and set(row) == _PART_KEYS, f"a part needs the keys {_quoted(_PART_KEYS)}")
+    name, shape, length = row["name"], row["shape"], row["length"]
+    demand(isinstance(name, str) and name in known, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(known)}")
+    demand(row["dtype"] == known[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {known[name]}")
+    good_shape = isinstance(shape, list) and len(shape) in (1, 2) and all(_is_count(n) for n in shape)
+    demand(good_shape and _is_count(length), f"{name} has shape {ascii(shape)[:80]}, allowed: one or two sizes")
+    wanted = math.prod(shape) * np.dtype(known[name]).itemsize
+    demand(length == wanted, f"{name} has {length} bytes, its shape {shape} needs {wanted}")
+    demand(row["offset"] == offset and offset + length <= room, f"{name} lies outside the file or over another part")
+
+
+def _read_part(row: Mapping[str, Any], source: _Source, at: int) -> NDArray[Any] | bytes:
+    """Return one part, after its SHA-256 was checked."""
+    name, dtype = row["name"], row["dtype"]
+    found: NDArray[Any] | bytes
+    found = source.read(at, row["length"]) if name in _MODELS else source.array(at, row["length"], dtype)
+    digest = hashlib.sha256(found if isinstance(found, bytes) else found.data).hexdigest()
+    demand(digest == row["sha256"], f"the part {name} does not have its SHA-256")
+    if isinstance(found, bytes):
+        return found
+    return frozen(found.reshape(row["shape"]).astype(np.dtype(dtype).newbyteorder("="), copy=False))
+
+
+def _build(header: Mapping[str, Any], parts: Mapping[str, Any]) -> Bundle:
     shape, classes, scale = header["image_shape"], header["classes"], header["photons_per_level"]
     good_shape = isinstance(shape, list) and len(shape) == 2 and all(_is_count(n) for n in shape)
     demand(good_shape, f"image_shape is {ascii(shape)[:80]}, allowed: [height, width]")
@@ -274,22 +328,21 @@ def _with_automaton(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]
     )
 
 
-def _with_back_end(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]], facts: dict[str, Any]) -> Bundle:
+def _with_back_end(header: Mapping[str, Any], parts: Mapping[str, Any], facts: dict[str, Any]) -> Bundle:
     picture = header.get("picture_shape")
     good_picture = isinstance(picture, list) and len(picture) == 2 and all(_is_count(n) for n in picture)
     demand(picture is None or good_picture, f"picture_shape is {ascii(picture)[:80]}, allowed: [height, width]")
     analyser = _analyser(header, parts) if "sensor" in header else None
     patterns = parts["pattern_levels"] if analyser is None else frozen(np.zeros((len(analyser.matrix), 0), np.uint16))
-    head, int8_onnx = parts.get("head_onnx"), parts.get("int8_onnx")
     return Bundle(
         **facts,
         pattern_levels=patterns,
-        head_onnx=None if head is None else head.tobytes(),
+        head_onnx=parts.get("head_onnx"),
         table=parts.get("table"),
         golden_means=parts["golden_means"],
         golden_scores=parts["golden_scores"],
         int8_head=_int8_head(parts),
-        int8_onnx=None if int8_onnx is None else int8_onnx.tobytes(),
+        int8_onnx=parts.get("int8_onnx"),
         analyser=analyser,
         picture_shape=None if picture is None else (picture[0], picture[1]),
     )

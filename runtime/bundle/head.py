@@ -19,7 +19,7 @@ from .onnx_file import MODEL_MAX_BYTES
 
 HEAD_MAX_BYTES = MODEL_MAX_BYTES
 _BATCH_ROWS = 65536
-_BATCH_VALUES = 1 << 25  # of intermediate results at once: 128 MiB
+_BATCH_VALUES = 1 << 22  # of intermediate results at once: 16 MiB
 _REMEDY = (
     "export the head again: one float32 input (n, patterns), first output float32 (n, classes), weights inside the file, "
     "operators and sizes as docs/reference/formats.md allows them"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.container import canonical_json, parse_json_object, read_file
+from pans.runtime.container import canonical_json, open_regular, parse_json_object
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import demand
 
 from .automaton import Automaton
 from .facts import (
+    GOLDEN_SCORES_MAX,
     GOLDEN_WORK_MAX,
     LEVELS_MAX,
     Bundle,
@@ -33,7 +35,7 @@ from .facts import (
     golden_violation,
     row_index,
 )
-from .format import bundle_bytes, parse_bundle
+from .format import bundle_bytes, parse_bundle, read_bundle
 from .head import OnnxHead, open_head
 from .layers import Int8Head
 from .optics import Analyser
@@ -48,6 +50,7 @@ __all__ = [
     "load_bundle",
     "make_bundle",
     "parse_bundle",
+    "read_bundle",
     "with_expected",
     "word_means",
     "write_bundle",
@@ -198,6 +201,7 @@ def _evaluate_back_end(back_end: BackEnd, n_features: int, n_outputs: int, *, de
         return _Golden(means, table[row_index(means)], table)
     head = open_head(back_end.head_onnx, n_features, n_outputs, "head")
     means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
+    means = means[:: -(-len(means) * n_outputs // GOLDEN_SCORES_MAX)]  # fewer of very large pictures
     affordable = head.cost.operations << min(n_features, TABLE_BUILD_FEATURES_MAX) <= GOLDEN_WORK_MAX
     if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX and affordable:
         table = head.scores(word_means(np.arange(1 << n_features), n_features))
@@ -247,5 +251,8 @@ def write_bundle(bundle: Bundle, path: str | Path, *, force: bool = False) -> st
 
 def load_bundle(path: str | Path) -> tuple[Bundle, str]:
     """Return the bundle in `path` and the file's SHA-256 as hex; UsageError without a file, else DamagedFileError."""
-    data = read_file(path)
-    return parse_bundle(data, str(path)), hashlib.sha256(data).hexdigest()
+    try:
+        with open_regular(path) as file:
+            return read_bundle(file, os.fstat(file.fileno()).st_size, str(path))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .onnx_protobuf import LIST_MAX, REFUSED, Reader, packed_integers
 
-MODEL_MAX_BYTES = 64 << 20
+MODEL_MAX_BYTES = 32 << 20  # onnxruntime holds up to three copies while it opens one
 NODES_MAX = 1000
 TENSORS_MAX = 2000
 ELEMENTS_MAX = 1 << 26

@@ -38,8 +38,8 @@ LIGHT_RANGE = Range(1e-20, 1e9)
 EXPOSURE_US_RANGE = Range(1e-3, 1e9)
 MATRIX_MAX = 1e6  # of an entry of W; passive optics that conserve light have singular values of at most 1
 KINDS = ("coherent", "incoherent")
-_AT_ONCE = 2048
-_IMAGES_AT_ONCE = 4096
+_SCATTERED_AT_ONCE = 4096
+_IMAGES_AT_ONCE, _VALUES_AT_ONCE = 2048, 1 << 21  # of float64 copies: 16 MiB, twice that where they are complex
 
 
 def incident_field(
@@ -76,9 +76,9 @@ def scatter(images: NDArray[np.uint8], seed: int = MASK_SEED) -> NDArray[np.comp
         )
     turn = np.exp(1j * phase_mask(seed))
     out = np.empty(images.shape, np.complex64)
-    for start in range(0, len(images), _IMAGES_AT_ONCE):
-        entrance = images[start : start + _IMAGES_AT_ONCE] / 255.0
-        out[start : start + _IMAGES_AT_ONCE] = np.fft.ifft2(np.fft.fft2(entrance) * turn)
+    for start in range(0, len(images), _SCATTERED_AT_ONCE):
+        entrance = images[start : start + _SCATTERED_AT_ONCE] / 255.0
+        out[start : start + _SCATTERED_AT_ONCE] = np.fft.ifft2(np.fft.fft2(entrance) * turn)
     return out
 
 
@@ -98,25 +98,31 @@ class Analyser:
         n_pixels = self.matrix.shape[1]
         if images.dtype != np.uint8 or images.ndim != 3 or images.shape[1] * images.shape[2] != n_pixels:
             raise ValueError(f"images are {images.dtype} {images.shape}, the sensor sees uint8 of {n_pixels} pixels")
-        wide = self.matrix.T.astype(np.complex128 if np.iscomplexobj(self.matrix) else np.float64)
         out = np.empty((len(images), len(self.matrix)))
-        for start in range(0, len(images), _AT_ONCE):
-            part = images[start : start + _AT_ONCE]
-            if self.kind == "coherent":
-                field = incident_field(part, self.light, self.optics).reshape(len(part), -1) @ wide
-                out[start : start + _AT_ONCE] = field.real**2 + field.imag**2
-            else:
-                out[start : start + _AT_ONCE] = (
-                    incident_intensity(part, self.light, self.optics).reshape(len(part), -1).astype(np.float64) @ wide
-                )
+        detectors = max(1, _VALUES_AT_ONCE // n_pixels)
+        objects = min(_IMAGES_AT_ONCE, max(1, _VALUES_AT_ONCE // n_pixels))
+        for first in range(0, len(self.matrix), detectors):
+            part = self.matrix[first : first + detectors]
+            wide = part.T.astype(np.complex128 if np.iscomplexobj(part) else np.float64)
+            for start in range(0, len(images), objects):
+                seen = images[start : start + objects]
+                out[start : start + objects, first : first + detectors] = self._through(seen, wide)
         return out * self.full_scale_photoelectrons
+
+    def _through(self, images: NDArray[np.uint8], wide: NDArray[Any]) -> NDArray[np.float64]:
+        """Light of images behind the columns of `wide` (pixels, detectors), where 1 is full scale."""
+        if self.kind == "coherent":
+            field = incident_field(images, self.light, self.optics).reshape(len(images), -1) @ wide
+            return np.asarray(field.real**2 + field.imag**2)
+        light = incident_intensity(images, self.light, self.optics).reshape(len(images), -1).astype(np.float64)
+        return np.asarray(light @ wide)
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 (hex) of everything that decides on the light: two sensors that agree in it measure the same."""
         facts = (self.kind, self.light, self.optics, repr(self.full_scale_photoelectrons), str(self.matrix.dtype))
         digest = hashlib.sha256("\n".join(facts).encode())
-        digest.update(np.ascontiguousarray(self.matrix).tobytes())
+        digest.update(np.ascontiguousarray(self.matrix).data)
         return digest.hexdigest()
 
 

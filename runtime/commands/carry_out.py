@@ -6,6 +6,7 @@ Owns the order of these; arguments are run.py's, the run itself is live/loop.py'
 from __future__ import annotations
 
 import argparse
+import hashlib
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
-from pans.runtime.errors import PansError
+from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
 
@@ -202,21 +203,29 @@ def _traced(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
 
 
 def _recorded(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
-    from pans.runtime.container import read_file
     from pans.runtime.live import Recovery
     from pans.runtime.live.continuous import open_recorder
 
-    bundle_bytes = read_file(job.bundle_path)
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
     if job.recording is None:
         result = _watched(job, ready, link, None, recovery, ending)
         return _conclude(job, ready, result, _summary(job, ready, result))
     limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
-    with open_recorder(job.recording, header, bundle_bytes, limits, force=job.force) as recorder:
+    with open_recorder(job.recording, header, _same_bundle(job, ready), limits, force=job.force) as recorder:
         result = _watched(job, ready, link, recorder, recovery, ending)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
     return _conclude(job, ready, result, summary)
+
+
+def _same_bundle(job: Job, ready: _Prepared) -> bytes:
+    """Return the bundle's file once more, for the recording; DamagedFileError if it is no longer the one that decides."""
+    from pans.runtime.container import read_file
+
+    data = read_file(job.bundle_path)
+    if hashlib.sha256(data).hexdigest() != ready.bundle_sha256:
+        raise DamagedFileError(f"{job.bundle_path}: changed while the run began", remedy="run it again")
+    return data
 
 
 def _watched(

@@ -158,12 +158,19 @@ def bundle_layers(bundle: Bundle) -> tuple[Layer, ...]:
 def pad_float(chain: tuple[Layer, ...]) -> Padded:
     """Return the layers as the kernel reads them, padded with zeros."""
     sizes = _padded_sizes([chain[0].weights.shape[0], *(layer.weights.shape[1] for layer in chain)])
-    weights = _laid_out([_pad(layer.weights, size) for size, layer in zip(pairwise(sizes), chain)])
-    biases = [_pad(layer.bias, (n_out,)) for n_out, layer in zip(sizes[1:], chain)]
-    numbers = np.concatenate([*weights, *biases])
     bits, groups = _groups(chain[0], sizes[1])
-    meta = np.array([len(chain), *sizes, *(layer.relu for layer in chain), bits, len(numbers)], np.int64)
-    return Padded(meta, np.concatenate([numbers, groups]))
+    n_weights = sum(n_in * n_out for n_in, n_out in pairwise(sizes))
+    numbers = np.zeros(
+        n_weights + sum(sizes[1:]) + len(groups), np.float32
+    )  # large heads stand in memory once more, not thrice
+    _lay_out([layer.weights for layer in chain], sizes, numbers)
+    start = n_weights
+    for n_out, layer in zip(sizes[1:], chain):
+        numbers[start : start + len(layer.bias)] = layer.bias
+        start += n_out
+    numbers[start:] = groups
+    meta = np.array([len(chain), *sizes, *(layer.relu for layer in chain), bits, start], np.int64)
+    return Padded(meta, numbers)
 
 
 def _groups(layer: Layer, width: int) -> tuple[int, NDArray[np.float32]]:
@@ -194,10 +201,11 @@ def pad_int8(head: Int8Head) -> Padded:
     """Return the quantised layers as the kernel reads them, padded with zeros."""
     matrices = head.matrices()
     sizes = _padded_sizes(head.sizes.tolist())
-    weights = _laid_out([_pad(matrix, size) for size, (matrix, _, _) in zip(pairwise(sizes), matrices)])
+    weights = np.zeros(sum(n_in * n_out for n_in, n_out in pairwise(sizes)), np.int8)
+    _lay_out([matrix for matrix, _, _ in matrices], sizes, weights)
     affine = [np.stack([_pad(scale, (n,)), _pad(bias, (n,))]) for n, (_, scale, bias) in zip(sizes[1:], matrices)]
     meta = np.array([len(matrices), *sizes, *[1] * (len(matrices) - 1), 0], np.int64)
-    return Padded(meta, (np.concatenate(weights), np.concatenate(affine, axis=1)))
+    return Padded(meta, (weights, np.concatenate(affine, axis=1)))
 
 
 def make_room(meta: NDArray[np.int64], dtype: Any) -> tuple[NDArray[Any], ...]:
@@ -218,9 +226,14 @@ def _padded_sizes(sizes: list[int]) -> list[int]:
     return [sizes[0], *hidden, sizes[-1] + sizes[-1] % 2]
 
 
-def _laid_out(matrices: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """The first matrix row by row, since clicks select rows; the others column by column, for dot products."""
-    return [matrices[0].ravel(), *(matrix.T.ravel() for matrix in matrices[1:])]
+def _lay_out(matrices: list[NDArray[Any]], sizes: list[int], out: NDArray[Any]) -> None:
+    """Write matrices into zeros: the first row by row, since clicks select rows; the others column by column, for dot products."""
+    start = 0
+    for number, (matrix, (n_in, n_out)) in enumerate(zip(matrices, pairwise(sizes))):
+        room = out[start : start + n_in * n_out]
+        wide = room.reshape(n_in, n_out) if number == 0 else room.reshape(n_out, n_in).T
+        wide[: matrix.shape[0], : matrix.shape[1]] = matrix
+        start += n_in * n_out
 
 
 def _pad(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

@@ -22,7 +22,7 @@ from pans.runtime.image_quality import likeness
 from pans.runtime.npz_file import read_arrays
 from pans.runtime.outputs import write_file
 
-TRUTH_MAX_BYTES = 1 << 29  # as a scene file
+TRUTH_MAX_BYTES = 1 << 26  # as a scene file
 
 
 class PictureLog:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle, parse_bundle
+from pans.runtime.bundle.model import Bundle, read_bundle
 from pans.runtime.container import (
     FILE_PROLOGUE,
     MIB,
@@ -49,6 +49,9 @@ class Recording:
     end_offset: int  # bytes up to the last whole block
     summary: Mapping[str, Any]  # of END; empty if incomplete
     damage: str  # "" or what is wrong behind end_offset (salvage only)
+    bundle_place: (
+        tuple[int, int] | None
+    )  # where in the file the bundle begins, and how many bytes it has; None without one
 
     @property
     def simulated(self) -> bool:
@@ -92,6 +95,10 @@ class Recording:
         """Return the host times of all decisions, TIMING_DTYPE (n,)."""
         return self._rows(Kind.TIMINGS, TIMING_DTYPE)
 
+    def iter_timings(self) -> Iterator[NDArray[np.void]]:
+        """Yield the host times block by block, TIMING_DTYPE (n,); memory holds one block."""
+        return self._iter_rows(Kind.TIMINGS, TIMING_DTYPE)
+
     def clock_samples(self) -> NDArray[np.void]:
         """Return all clock samples, CLOCK_DTYPE (n,)."""
         return self._rows(Kind.CLOCK, CLOCK_DTYPE)
@@ -108,10 +115,12 @@ class Recording:
 
     def bundle(self) -> Bundle:
         """Return the bundle that the run used; UsageError if it was not recorded."""
-        data = self.bundle_data()
-        if not data:
+        if self.bundle_place is None:
             raise UsageError(f"{self.path}: the recording holds no bundle", remedy="name the bundle with --bundle")
-        return parse_bundle(data, f"{self.path}: the bundle inside")
+        begin, size = self.bundle_place
+        with open_regular(self.path) as file:
+            file.seek(begin)
+            return read_bundle(file, size, f"{self.path}: the bundle inside")[0]
 
     def _pairs(self, kind: Kind) -> Iterator[tuple[int, bytes]]:
         for block in self.iter_blocks(kind):
@@ -125,8 +134,11 @@ class Recording:
                 position = start + length
 
     def _rows(self, kind: Kind, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        parts = [np.frombuffer(_whole_rows(block, dtype, self.path), dtype=dtype) for block in self.iter_blocks(kind)]
+        parts = list(self._iter_rows(kind, dtype))
         return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
+
+    def _iter_rows(self, kind: Kind, dtype: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
+        return (np.frombuffer(_whole_rows(block, dtype, self.path), dtype=dtype) for block in self.iter_blocks(kind))
 
 
 def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
@@ -163,6 +175,7 @@ class _Scan:
         self.end_offset = 0
         self.n_decisions = 0
         self.version = 0
+        self.bundle_place: tuple[int, int] | None = None
         self.log = LogReader()
 
     def take(self, block: Block) -> None:
@@ -177,6 +190,7 @@ class _Scan:
             if self.header.get("bundle_sha256") != found:
                 wanted = ascii(self.header.get("bundle_sha256"))[:80]
                 raise DamagedFileError(f"{where}: the bundle has the SHA-256 {found}, the header says {wanted}")
+            self.bundle_place = block.begin, len(block.payload)
         elif kind == Kind.END:
             self.end = self._check_end(block, where)
         elif kind == Kind.DECISIONS:
@@ -231,4 +245,5 @@ def read_recording(path: str | Path, *, salvage: bool = False) -> Recording:
         end_offset=scan.end_offset,
         summary=scan.end["summary"] if scan.end is not None else {},
         damage=damage,
+        bundle_place=scan.bundle_place,
     )

@@ -37,7 +37,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
         raise UsageError(f"{folder} is a file", remedy="name a folder: csv is several files")
     make_folder(folder)
     us = 1e6 / int(recording.header["config"]["tick_hz"])
-    classes = recording.bundle().classes if recording.bundle_data() else ()
+    classes = recording.bundle().classes if recording.bundle_place else ()
     tables: dict[str, tuple[Sequence[str], Iterable[Sequence[Any]]]] = {
         "decisions.csv": (
             DECISIONS,

@@ -109,8 +109,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "header": header,
         "summary": dict(recording.summary),
     }
-    data = recording.bundle_data()
-    facts["bundle"] = recording.bundle().name if data else None
+    facts["bundle"] = recording.bundle().name if recording.bundle_place else None
     return facts
 
 

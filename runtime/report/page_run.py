@@ -56,7 +56,7 @@ _SHOWN_ELSEWHERE = {
 def recording_page(recording: Recording) -> bytes:
     """Return the page of `recording`; a cut one is shown as far as it goes, and says so."""
     summary = recording.summary
-    bundle = recording.bundle() if recording.bundle_data() else None
+    bundle = recording.bundle() if recording.bundle_place else None
     name = bundle.name if bundle is not None else "a bundle that is not in the recording"
     page = Page(f"Run of {name}", simulated=recording.simulated)
     _verdict(page, recording)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.facts import GOLDEN_WORK_MAX
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
-from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, parse_bundle, word_means
+from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, word_means
 from pans.runtime.container import open_regular
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
@@ -180,7 +180,7 @@ def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
     if len(dark) and bundle.analyser is None:
         yield f"{len(dark)} of {bundle.n_features} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
     if bundle.table is not None:
-        never = set(range(bundle.n_classes)) - set(bundle.table.argmax(axis=1).tolist())
+        never = set(range(bundle.n_classes)) - set(np.unique(bundle.table.argmax(axis=1)).tolist())
         if never:
             names = ", ".join(bundle.classes[label] for label in sorted(never)[:5])
             yield f"{len(never)} classes are never decided by any click word: {names}"
@@ -194,20 +194,29 @@ def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:
         )
     n_classes = _verify_inner_bundle(recording, verdict)
     _verify_inner_profile(recording, verdict)
-    decisions = recording.decisions()
     first = first_decision(recording)
-    verdict.violations += _decision_violations(decisions, n_classes, first)
-    verdict.violations += _timing_violations(recording.timings(), first + len(decisions))
+    verdict.violations += _decision_violations(recording, n_classes, first)
+    verdict.violations += _timing_violations(recording, first + recording.n_decisions)
     for _ in recording.events():
         pass  # reading them is the check
     verdict.violations += _answer_violations(recording)
     streams = {"messages": recording.messages(), "commands": recording.commands(), "answers": recording.answers()}
     for stream, items in streams.items():
-        times = np.fromiter((host_ns for host_ns, _ in items), dtype=np.int64)
-        if (np.diff(times) < 0).any():
-            verdict.alerts.append(f"the host times of the {stream} go back at {int(np.argmax(np.diff(times) < 0)) + 1}")
-    if recording.complete and recording.bundle_data() and not verdict.violations:
+        place = _first_step_back(items)
+        if place is not None:
+            verdict.alerts.append(f"the host times of the {stream} go back at {place}")
+    if recording.complete and recording.bundle_place and not verdict.violations:
         verdict.violations += replay_faults(recording, recording.bundle())
+
+
+def _first_step_back(items: Iterator[tuple[int, bytes]]) -> int | None:
+    """Return the place of the first item whose host time is less than the one before; all items are read."""
+    before, found = -(1 << 63), None
+    for place, (host_ns, _) in enumerate(items):
+        if host_ns < before and found is None:
+            found = place
+        before = host_ns
+    return found
 
 
 def _answer_violations(recording: Recording) -> Iterator[str]:
@@ -225,11 +234,10 @@ def _answer_violations(recording: Recording) -> Iterator[str]:
 
 def _verify_inner_bundle(recording: Recording, verdict: FileVerdict) -> int:
     """Check the bundle inside; return its number of classes (the most there can be, if it is not there)."""
-    data = recording.bundle_data()
-    if not data:
+    if recording.bundle_place is None:
         verdict.alerts.append("the recording holds no bundle: it can only be replayed beside it")
         return NO_LABEL
-    bundle = parse_bundle(data, f"{recording.path}: the bundle inside")
+    bundle = recording.bundle()
     inner = FileVerdict(verdict.path, "bundle")
     _verify_bundle(bundle, inner)
     verdict.violations += [f"the bundle inside: {text}" for text in inner.violations]
@@ -251,14 +259,29 @@ def _verify_inner_profile(recording: Recording, verdict: FileVerdict) -> None:
         verdict.violations.append(error.message)
 
 
-def _decision_violations(decisions: NDArray[np.void], n_classes: int, first: int) -> Iterator[str]:
+def _decision_violations(recording: Recording, n_classes: int, first: int) -> Iterator[str]:
+    """What no decision of ours can be, block by block."""
+    found: dict[str, tuple[int, int]] = {}  # what is wrong -> the first such decision, how many there are
+    place = 0
+    for rows in recording.iter_decisions():
+        for what, bad in _impossible(rows, n_classes, first + place).items():
+            if bad.any():
+                at, count = found.get(what, (place + int(np.argmax(bad)), 0))
+                found[what] = at, count + int(bad.sum())
+        place += len(rows)
+    for what, (at, count) in found.items():
+        yield f"decision {at} {what} ({count} of {place})"
+
+
+def _impossible(decisions: NDArray[np.void], n_classes: int, first: int) -> dict[str, NDArray[np.bool_]]:
+    """Which of these decisions, the first of which has the number `first`, break which rule."""
     known = DecisionFlag(0)
     for flag in DecisionFlag:
         known |= flag
     flags, labels, probability = decisions["flags"], decisions["label"], decisions["probability"]
     abstained = (flags & int(DecisionFlag.ABSTAINED)) != 0
     finite = np.isfinite(probability) & (probability >= 0) & (probability <= 1)
-    checks = {
+    return {
         "is not numbered in sequence": decisions["index"] != first + np.arange(len(decisions), dtype=np.uint64),
         "has flags that this version does not know": (flags & ~np.uint32(int(known))) != 0,
         "abstained, but has a label": abstained & (labels != NO_LABEL),
@@ -266,16 +289,21 @@ def _decision_violations(decisions: NDArray[np.void], n_classes: int, first: int
         "has a label despite a gap or a wrong pattern": ~abstained & ((flags & int(_ABSTAIN_CAUSES)) != 0),
         "has a probability outside [0, 1]": ~finite,
     }
-    for what, bad in checks.items():
+
+
+def _timing_violations(recording: Recording, n_decisions: int) -> Iterator[str]:
+    """What no timing of ours can be, block by block; of each kind the first."""
+    found: dict[str, str] = {}
+    before, place = -1, 0
+    for rows in recording.iter_timings():
+        indices = np.concatenate(([before], rows["index"].astype(np.int64)))
+        if (np.diff(indices) <= 0).any():
+            found.setdefault("order", "the timings are not in the order of the decisions")
+        if len(rows) and (top := int(rows["index"].max())) >= n_decisions:
+            found.setdefault("beyond", f"a timing belongs to decision {top}, but there are {n_decisions}")
+        bad = (rows["decided_ns"] < rows["arrival_ns"]) | (rows["recorded_ns"] < rows["decided_ns"])
         if bad.any():
-            yield f"decision {int(np.argmax(bad))} {what} ({int(bad.sum())} of {len(decisions)})"
-
-
-def _timing_violations(timings: NDArray[np.void], n_decisions: int) -> Iterator[str]:
-    if len(timings) > 1 and (np.diff(timings["index"].astype(np.int64)) <= 0).any():
-        yield "the timings are not in the order of the decisions"
-    if len(timings) and int(timings["index"].max()) >= n_decisions:
-        yield f"a timing belongs to decision {int(timings['index'].max())}, but there are {n_decisions}"
-    bad = (timings["decided_ns"] < timings["arrival_ns"]) | (timings["recorded_ns"] < timings["decided_ns"])
-    if bad.any():
-        yield f"timing {int(np.argmax(bad))}: decided before it arrived, or recorded before it was decided"
+            words = "decided before it arrived, or recorded before it was decided"
+            found.setdefault("times", f"timing {place + int(np.argmax(bad))}: {words}")
+        before, place = int(indices[-1]), place + len(rows)
+    yield from found.values()

@@ -109,7 +109,7 @@ def _within_limits(value: Any, depth: int) -> None:
 
 def read_bundle(data: bytes) -> Bundle:
     """Return the bundle in `data`, every checksum checked."""
-    demand(data[:8] == b"PANSBNDL" and 48 <= len(data) <= 256 * MIB, "no bundle")
+    demand(data[:8] == b"PANSBNDL" and 48 <= len(data) <= 64 * MIB, "no bundle")
     version, length = struct.unpack_from("<II", data, 8)
     demand(version in NEW_KEYS and length <= MIB and 16 + length + 32 <= len(data), "version or header length")
     demand(hashlib.sha256(data[:-32]).digest() == data[-32:], "the closing SHA-256")

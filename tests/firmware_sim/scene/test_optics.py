@@ -50,7 +50,7 @@ def test_uniform_passes_everything_and_dark_nothing() -> None:
 def test_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     profile = load_profile("oled-qcmos")
     whole = expected_photoelectrons(profile, SCENE, LEVELS, 1000.0)
-    monkeypatch.setattr(optics, "_OBJECTS_PER_BLOCK", 2)
+    monkeypatch.setattr(optics, "_VALUES_PER_BLOCK", 2)
     assert np.array_equal(whole, expected_photoelectrons(profile, SCENE, LEVELS, 1000.0))
 
 

@@ -1,0 +1,145 @@
+"""The largest files that are accepted, of every kind of content that can make one large."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bundles import made_bundle
+from models import model
+
+from pans.runtime.bundle.model import Bundle, write_bundle
+from pans.runtime.bundle.optics import Analyser
+from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
+from pans.runtime.record import Recorder
+
+ROOM = FILE_MAX_BYTES - MIB  # for the arrays, beside header and golden vectors
+LIGHT: dict[str, Any] = {"levels": 65536, "photons_per_level": 1e-5}
+
+
+def many_patterns() -> Bundle:
+    """As many patterns as there may be, as large as fits."""
+    d_f = 4096
+    pixels = 100 * 74
+    levels = np.random.default_rng(1).integers(0, 65536, (d_f, pixels)).astype(np.uint16)
+    head = chain_head([d_f, 64, 2])
+    return made_bundle(d_f, pattern_levels=levels, image_shape=(100, 74), **LIGHT, head_onnx=head)
+
+
+def large_patterns() -> Bundle:
+    """Few patterns of as many pixels as there may be."""
+    pixels = 1 << 22
+    levels = np.random.default_rng(2).integers(0, 65536, (7, pixels)).astype(np.uint16)
+    return made_bundle(7, pattern_levels=levels, image_shape=(2048, 2048), **LIGHT, table=np.eye(128, 2))
+
+
+def large_table() -> Bundle:
+    """A table for as many patterns as it may have."""
+    n_classes = ROOM // 4 >> 20
+    table = np.random.default_rng(3).standard_normal((1 << 20, n_classes), dtype=np.float32)
+    return made_bundle(20, n_classes, **LIGHT, table=table)
+
+
+def large_head() -> Bundle:
+    """A head as large as it may be, and the rest of the file filled with a table."""
+    table = np.zeros((1 << 18, 28), np.float32)
+    head = chain_head([18, 2866, 2866, 28], last=0.0)
+    return made_bundle(18, 28, **LIGHT, head_onnx=head, table=table)
+
+
+def wide_results() -> Bundle:
+    """A head with as many intermediate values as there may be, and large golden pictures."""
+    side = 512
+    return made_bundle(
+        16, 0, **LIGHT, head_onnx=chain_head([16, 16, side * side]), picture_shape=(side, side), classes=()
+    )
+
+
+def large_matrix() -> Bundle:
+    """The optics of a passive sensor, complex."""
+    d_f, pixels = 64, ROOM // 8 // 64
+    rng = np.random.default_rng(4)
+    matrix = (rng.normal(size=(d_f, pixels)) + 1j * rng.normal(size=(d_f, pixels))).astype(np.complex64) / 1000
+    optics = Analyser("coherent", matrix, "field", "none", 10.0, 100.0)
+    return passive_bundle(optics, pixels)
+
+
+BUNDLES: dict[str, Callable[[], Bundle]] = {
+    one.__name__: one for one in (many_patterns, large_patterns, large_table, large_head, wide_results, large_matrix)
+}
+
+
+def chain_head(sizes: list[int], last: float = 1.0) -> bytes:
+    """A chain of dense layers with random weights, those of the last one times `last`."""
+    from onnx import helper
+
+    rng, nodes, weights, current = np.random.default_rng(5), [], {}, "means"
+    for number, (n_in, n_out) in enumerate(pairwise(sizes)):
+        ends = number == len(sizes) - 2
+        matrix = rng.standard_normal((n_in, n_out), dtype=np.float32) / np.float32(n_in)
+        weights[f"w{number}"] = matrix * np.float32(last if ends else 1.0)
+        nodes.append(helper.make_node("MatMul", [current, f"w{number}"], ["scores" if ends else f"s{number}"]))
+        if not ends:
+            nodes.append(helper.make_node("Relu", [f"s{number}"], [f"x{number}"]))
+        current = f"x{number}"
+    return bytes(model(nodes, weights, d_f=sizes[0], n_out=sizes[-1]).SerializeToString())
+
+
+def passive_bundle(optics: Analyser, pixels: int) -> Bundle:
+    """A bundle with these optics and a small head."""
+    from pans.runtime.bundle.model import BackEnd, make_bundle
+
+    head = BackEnd(head_onnx=chain_head([len(optics.matrix), 8, 2]))
+    return make_bundle(
+        name="passive",
+        task="test",
+        classes=("a", "b"),
+        image_shape=(1, pixels),
+        optics=optics,
+        back_end=head,
+        provenance={},
+    )
+
+
+def write_large_bundle(name: str, path: Path) -> Path:
+    """Write one of BUNDLES."""
+    write_bundle(BUNDLES[name](), path)
+    return path
+
+
+def large_scene(path: Path, shape: tuple[int, int, int]) -> Path:
+    """Pictures, which a few bytes may stand for."""
+    np.savez_compressed(path, images=np.full(shape, 200, np.uint8), labels=(np.arange(shape[0]) % 2).astype(np.int16))
+    return path
+
+
+def scene_bundle(shape: tuple[int, int]) -> Bundle:
+    """Patterns of as many pixels as the pictures of a scene, as many as the simulator's table and the file have room for."""
+    d_f = min(48, ROOM // 2 // (shape[0] * shape[1]))
+    levels = np.random.default_rng(6).integers(0, 65536, (d_f, shape[0] * shape[1])).astype(np.uint16)
+    head = chain_head([d_f, 8, 2])
+    return made_bundle(d_f, **LIGHT, pattern_levels=levels, image_shape=shape, head_onnx=head)
+
+
+def long_recording(path: Path, decisions: int) -> Path:
+    """A recording of many decisions with their timings."""
+    with Recorder(path, {"config": {"shots": 1, "tick_hz": 1000}}) as recorder:
+        for number in range(decisions):
+            recorder.add_decision((number, number, number, 0, 0, 1, 0, -1, 0, 0.5, 0))
+            recorder.add_timing((number, number, number, number, number))
+        recorder.close({})
+    return path
+
+
+def large_json(path: Path) -> Path:
+    """An index of parts with as many values as it may have, each as large in memory as it can be."""
+    entry = (
+        '{"name":"run-%04d.pansrec","bytes":1,"first_decision":0,"decisions":0,"decisions_sha256":"","chain_sha256":""}'
+    )
+    parts = ",".join(entry % number for number in range(1, JSON_VALUES_MAX // 8))
+    deleted = '{"parts":0,"bytes":0,"decisions":0}'
+    path.write_text(f'{{"format":"pans-parts 1","run":"x","deleted":{deleted},"parts":[{parts}]}}')
+    return path
