@@ -237,8 +237,9 @@ def _read_parts(header: Mapping[str, Any], version: int, source: _Source, header
     parts: dict[str, Any] = {}
     offset, room = 0, source.size - _DIGEST_BYTES - header_end
     for row in rows:
-        _check_row(row, known, offset, room)
-        demand(row["name"] not in parts, f"the part {row['name']} stands twice")
+        _check_row(row, known, parts)
+        inside = row["offset"] == offset and offset + row["length"] <= room
+        demand(inside, f"{row['name']} lies outside the file or over another part")
         parts[row["name"]] = _read_part(row, source, header_end + offset)
         offset += row["length"]
     demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
@@ -257,17 +258,17 @@ def _demand_fixed_parts(header: Mapping[str, Any], parts: Mapping[str, NDArray[A
         demand(np.ndim(parts.get(name, 0)) == 2, f"the part {name} is missing or not a matrix")
 
 
-def _check_row(row: Any, known: Mapping[str, str], offset: int, room: int) -> None:
-    """Check what the header says of one part, of those that are `known`; it begins at `offset` of `room` bytes."""
+def _check_row(row: Any, known: Mapping[str, str], before: Mapping[str, Any]) -> None:
+    """Check what the header says of one part, of those that are `known`, behind the parts `before`."""
     demand(isinstance(row, dict) and set(row) == _PART_KEYS, f"a part needs the keys {_quoted(_PART_KEYS)}")
     name, shape, length = row["name"], row["shape"], row["length"]
     demand(isinstance(name, str) and name in known, f"unknown part {ascii(name)[:40]}, allowed: {_quoted(known)}")
+    demand(name not in before, f"the part {name} stands twice")
     demand(row["dtype"] == known[name], f"{name} has dtype {ascii(row['dtype'])[:40]}, allowed: {known[name]}")
     good_shape = isinstance(shape, list) and len(shape) in (1, 2) and all(_is_count(n) for n in shape)
     demand(good_shape and _is_count(length), f"{name} has shape {ascii(shape)[:80]}, allowed: one or two sizes")
     wanted = math.prod(shape) * np.dtype(known[name]).itemsize
     demand(length == wanted, f"{name} has {length} bytes, its shape {shape} needs {wanted}")
-    demand(row["offset"] == offset and offset + length <= room, f"{name} lies outside the file or over another part")
 
 
 def _read_part(row: Mapping[str, Any], source: _Source, at: int) -> NDArray[Any] | bytes:
