@@ -8,9 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 METHODS = {  # of each paradigm, the default first
-    "direct": ("bayes", "cnn", "clean-cnn"),
+    "direct": ("bayes", "cnn", "clean-cnn", "stopping"),
     "compressive": ("mlp", "clean-mlp", "bayes"),
     "e2e": ("qat", "plain"),
+    "fsi": ("deep", "pca"),
+    "hadamard": ("differences", "counts"),
 }
 
 

@@ -9,33 +9,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from pans.trainer.tasks.registry import Task
 
-from .common import Decide, Measurement, Report, detect, measure, run_trials
+from .common import Decide, Measurement, Report, Trials, detect, measure, run_trials
 from .options import BaselineOptions
 
 FIRST = 200  # test objects, those of the paper's tables
 
 At = Callable[[float], tuple[Decide, dict[str, Any]]]  # photons per object -> the decision, and facts about it
+AtLevel = Callable[[float], tuple[Measurement, Decide, dict[str, Any]]]  # the same, and the measurement
 
 
 def baseline_rows(
     task: Task, options: BaselineOptions, levels: Iterable[float], report: Report
 ) -> Iterator[dict[str, Any]]:
-    """Yield one row of figures per photon level, in the order of `levels` (photoelectrons per decision)."""
-    measurement, at = _paradigm(task, options, report)
-    trials = options.trials or (2 if options.method == "bayes" else 10)
-    for photons in levels:
-        started = time.perf_counter()
-        decide, extra = at(photons)
-        done = run_trials(
-            measurement, photons, options.detector, decide, trials=trials, seed=options.seed, dark=options.dark
-        )
+    """Yield one row of figures per photon level, in the order of `levels` (photoelectrons per decision).
+
+    Of `stopping` levels out of reach are left out.
+    """
+    walk = _stopping if options.method == "stopping" else _by_level
+    started = time.perf_counter()
+    for photons, n_readouts, done, extra in walk(task, options, levels, report):
         yield {
             **asdict(done.measured()),
             "first_200": asdict(done.measured(FIRST)),
@@ -43,17 +42,48 @@ def baseline_rows(
             "detector": options.detector,
             "brightness": options.brightness,
             "dark": options.dark,
-            "features": measurement.train.shape[1],
+            "features": n_readouts,
             "train_objects": len(task.train),
             **extra,
             "seconds": time.perf_counter() - started,
         }
+        started = time.perf_counter()
 
 
-def _paradigm(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
-    """The measurement, and what gives the decision at a photon level, with facts about it."""
-    if options.paradigm == "e2e":
-        return _end_to_end(task, options, report)
+Level = tuple[float, int, Trials, dict[str, Any]]  # photons asked for, readouts per object, what was decided, facts
+
+
+def _stopping(task: Task, options: BaselineOptions, levels: Iterable[float], report: Report) -> Iterator[Level]:
+    from .stopping import stopping
+
+    if options.detector != "counting" or options.dark:
+        raise ValueError("stopping hears every photon: allowed with a counting detector without dark counts only")
+    measurement = measure(task, None, options.brightness)
+    found = stopping(measurement, list(levels), seed=options.seed, trials=options.trials or 1, report=report)
+    for rule, done in found:
+        yield rule.photons, measurement.train.shape[1], done, {"floor": rule.floor, "confidence": 1 - rule.doubt}
+
+
+def _by_level(task: Task, options: BaselineOptions, levels: Iterable[float], report: Report) -> Iterator[Level]:
+    at_level = _paradigm(task, options, report)
+    trials = options.trials or (2 if options.method == "bayes" else 10)
+    shared: dict[str, Any] = {"trials": trials, "seed": options.seed, "dark": options.dark}
+    for photons in levels:
+        measurement, decide, extra = at_level(photons)
+        done = run_trials(measurement, photons, options.detector, decide, **shared)
+        yield photons, measurement.train.shape[1], done, extra
+
+
+def _paradigm(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
+    """What gives measurement and decision at a photon level, with facts about them."""
+    if options.paradigm == "fsi":
+        return _masks(task, options, report)
+    makers = {"e2e": _end_to_end, "hadamard": _hadamard}
+    measurement, at = makers.get(options.paradigm, _patterns)(task, options, report)
+    return lambda photons: (measurement, *at(photons))
+
+
+def _patterns(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
     from .bayes import bayes
 
     patterns, facts = None, {}
@@ -124,3 +154,24 @@ def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[M
     )
     measurement, of_level = measured_by(model, task, options.brightness)
     return measurement, lambda photons: (of_level(photons, options.detector), {"bits": bits})
+
+
+def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
+    from .hadamard import EPOCHS, pair_net, pairs
+
+    measurement = measure(task, pairs(options.features, task.image_shape), options.brightness)
+    shared: dict[str, Any] = {"seed": options.seed, "dark": options.dark, "report": report}
+    shared |= {"epochs": options.epochs or EPOCHS, "differences": options.method == "differences"}
+    return measurement, lambda photons: (pair_net(measurement, photons, options.detector, **shared), {})
+
+
+def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
+    """Masks are trained anew for every level: the measurement is of the level too."""
+    from .fsi import EPOCHS, FsiOptions, measured_by, train_masks
+
+    def at(photons: float) -> tuple[Measurement, Decide, dict[str, Any]]:
+        how = FsiOptions(options.features, photons, options.seed, options.epochs or EPOCHS, options.method == "pca")
+        model = train_masks(task, replace(how, detector=options.detector, dark=options.dark), report)
+        return *measured_by(model, task, options.brightness), {}
+
+    return at

@@ -1,4 +1,4 @@
-"""`pans baseline direct|compressive|e2e`: the alternatives to PANS, at equal photons.
+"""`pans baseline direct|compressive|e2e|fsi|hadamard`: the alternatives to PANS, at equal photons.
 
 Owns the arguments and how the answer looks; the rows come from the package baselines. All figures are SIMULATED.
 """
@@ -38,7 +38,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="photoelectrons per decision, averaged over the test objects (default: 5 10 17 30 100 300)",
     )
     parser.add_argument("--method", metavar="M", help="; ".join(f"{k}: {', '.join(v)}" for k, v in METHODS.items()))
-    parser.add_argument("--features", type=int, default=32, metavar="D", help="patterns, unless direct (default 32)")
+    parser.add_argument(
+        "--features", type=int, default=32, metavar="D", help="patterns, masks or pairs, unless direct (default 32)"
+    )
     parser.add_argument("--patterns", choices=("binary", "hadamard"), default="binary", help="of compressive sensing")
     parser.add_argument(
         "--detector", choices=("counting", "binary"), default="counting", help="Poisson counts, or one click at most"
@@ -52,10 +54,17 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--floor", type=float, metavar="F", help="of bayes: least transmission (default: chosen)")
     parser.add_argument("--dark", type=float, default=0.0, metavar="R", help="dark photoelectrons per readout")
     parser.add_argument("--bits", type=int, default=4, metavar="B", help="of qat: bits of a detected value (default 4)")
-    parser.add_argument("--epochs", type=int, metavar="E", help="of a network (default: 5 CNN, 10 MLP, 15 end-to-end)")
+    parser.add_argument(
+        "--epochs",
+        type=int,
+        metavar="E",
+        help="of a network (default: 5 CNN, 10 MLP and pairs, 15 end-to-end and masks)",
+    )
     parser.add_argument("--objects", type=int, metavar="N", help="only the first N test objects (default: all)")
     parser.add_argument("--train-objects", type=int, metavar="N", help="only the first N training objects")
-    parser.add_argument("--trials", type=int, metavar="N", help="readouts per object (default: bayes 2, others 10)")
+    parser.add_argument(
+        "--trials", type=int, metavar="N", help="readouts per object (default: bayes 2, stopping 1, others 10)"
+    )
     parser.add_argument(
         "--information",
         action="store_true",
@@ -71,7 +80,7 @@ def _run(args: argparse.Namespace) -> int:
     from pans.trainer.tasks.registry import load_task
 
     _check(args)
-    if not (args.paradigm == "direct" and args.method == "bayes"):
+    if not (args.paradigm == "direct" and args.method in ("bayes", "stopping")):
         torch_with(args.threads, "a trained baseline")
     whole = load_task(args.task, args.data_dir)
     task = replace(whole, train=whole.train.first(args.train_objects), test=whole.test.first(args.objects))
@@ -89,6 +98,10 @@ def _run(args: argparse.Namespace) -> int:
         shared = {"task": task.name, "paradigm": args.paradigm, "method": args.method, "seed": args.seed}
         payload = rows[0] | shared | {"rows": rows, "interrupted": code != EXIT_FINE, "simulated": True}
         emit(args, payload, _table(task, args, rows))
+    elif code == EXIT_FINE:
+        raise UsageError(
+            f"--photons {args.photons}: none can be reached by stopping", remedy="ask for fewer, from 1 on"
+        )
     return code
 
 
@@ -172,5 +185,7 @@ def _lines_of_progress() -> Report:
 
 
 BASELINE = Command(
-    "direct imaging, compressive sensing and conventional end-to-end, at equal photons", _configure, _run
+    "direct imaging, compressive sensing, conventional end-to-end, trained masks and Hadamard pairs, at equal photons",
+    _configure,
+    _run,
 )

@@ -341,6 +341,10 @@ def called(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dic
         ("compressive", "--features", 8, "--method", "bayes", "--patterns", "hadamard"),
         ("e2e", "--features", 4, "--epochs", 1),
         ("e2e", "--features", 4, "--epochs", 1, "--method", "plain", "--detector", "binary"),
+        ("fsi", "--features", 4, "--epochs", 1),
+        ("fsi", "--features", 4, "--epochs", 1, "--method", "pca", "--detector", "binary"),
+        ("hadamard", "--features", 6, "--epochs", 1),
+        ("hadamard", "--features", 6, "--epochs", 1, "--method", "counts", "--brightness", "object"),
     ],
 )
 def test_every_way_answers_with_the_keys_of_evaluate(

@@ -1,0 +1,155 @@
+"""Feature-specific imaging: a few masks trained together with a network on photon counts, through Poisson noise.
+
+Owns masks, training and the decision; light, detector and score are those of common.py. SIMULATED, ideal shot noise.
+
+- `deep`: after DeepFSI (Lu and Velten, arXiv 2508.01981). Taken from its abstract: masks that begin as principal components are
+  "unfrozen" and learnt together with the network, by gradients computed under Poisson noise; one single-pixel measurement per mask. Assumed
+  here, as nothing else was at hand: masks are intensities (positive and negative parts of a component are masks of their own, learnt as
+  squares), the photon budget is shared freely among the masks and held exactly on average over the training objects, the network is the
+  paper's back end (512 hidden units), and the gradient passes a Poisson number as lambda + sqrt(lambda) x noise does (`spread` "scaled")
+  or as lambda alone ("plain").
+- `pca`: the same with the masks frozen, conventional feature-specific imaging, the network trained on noisy counts.
+
+A training is of one photon level.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from pans.trainer.tasks.registry import Task
+
+from .common import Decide, Measurement, Report, measure, named, silent
+from .nets import decider, feature_net, fit, seeded
+
+EPOCHS = 15
+MASK_RATE = 1e-2
+START_LIGHT = 0.03  # of a mask's largest value, on all its pixels: the square of 0 has no gradient
+SPREADS = ("scaled", "plain")
+_LEAST = 0.05  # photoelectrons, below which the gradient of the noise's spread is cut: it grows as 1 / lambda
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class FsiOptions:
+    """One training: `features` masks, from principal components or (`start` "random") by chance; `frozen` ones are not learnt."""
+
+    features: int
+    photons: float
+    seed: int = 0
+    epochs: int = EPOCHS
+    frozen: bool = False
+    start: str = "pca"
+    spread: str = "scaled"
+    detector: str = "counting"
+    dark: float = 0.0
+
+
+def principal_masks(images: NDArray[np.uint8], n_masks: int) -> F64:
+    """Return masks (n_masks, pixels), at least 0: positive and negative parts of the first principal components of images (n, pixels).
+
+    The parts come in the order of their components' variance, each with its largest value 1; empty parts are passed over.
+    """
+    x = images.astype(np.float32) / np.float32(255)
+    x -= x.mean(axis=0)
+    _, vectors = np.linalg.eigh((x.T @ x).astype(np.float64))
+    parts: list[F64] = []
+    for vector in vectors.T[::-1]:
+        parts += [part for part in (np.maximum(vector, 0), np.maximum(-vector, 0)) if part.max() > 1e-9]
+        if len(parts) >= n_masks:
+            return np.array([part / part.max() for part in parts[:n_masks]])
+    raise ValueError(f"features is {n_masks}, allowed: at most {len(parts)} for {images.shape[1]} pixels")
+
+
+class FeatureSpecific(nn.Module):
+    """Masks, a Poisson detector behind each, and the network that sees the counts."""
+
+    mean_image: Tensor
+
+    def __init__(self, masks: F64, mean_image: NDArray[np.float32], n_classes: int, options: FsiOptions) -> None:
+        super().__init__()
+        start = masks if options.frozen else masks + START_LIGHT
+        self.weight = nn.Parameter(
+            torch.from_numpy(np.sqrt(start).astype(np.float32)), requires_grad=not options.frozen
+        )
+        self.register_buffer("mean_image", torch.from_numpy(mean_image))
+        self.head = feature_net(len(masks), n_classes)
+        self.options = options
+
+    def masks(self) -> Tensor:
+        """Return the masks (features, pixels), scaled so that the mean training object gives the photons asked for."""
+        light = self.weight**2
+        return light * (self.options.photons / (light.sum(dim=0) @ self.mean_image).clamp(min=1e-12))
+
+    def forward(self, transmission: Tensor) -> Tensor:
+        """Return scores (n, classes) of fresh counts of objects (n, pixels); random numbers are those of torch's own generator."""
+        expected = transmission @ self.masks().T + self.options.dark
+        scores: Tensor = self.head(noisy(expected, self.options.spread, self.options.detector))
+        return scores
+
+
+def noisy(expected: Tensor, spread: str, detector: str = "counting") -> Tensor:
+    """Return Poisson numbers of mean `expected` (or with a `binary` detector whether there was one) that carry its gradient.
+
+    "scaled": as lambda + sqrt(lambda) x noise, the noise held fixed. "plain", and every binary detector: as the mean readout alone.
+    """
+    with torch.no_grad():
+        counts = torch.poisson(expected)
+    if detector == "binary":
+        mean = -torch.expm1(-expected)
+        return mean + ((counts > 0).to(mean.dtype) - mean).detach()
+    if spread == "plain":
+        return expected + (counts - expected).detach()
+    root = expected.clamp(min=_LEAST).sqrt()
+    carried = expected + root * ((counts - expected) / root).detach()
+    return carried + (counts - carried).detach()  # the value is the number itself, whatever was rounded or cut
+
+
+def train_masks(task: Task, options: FsiOptions, report: Report = silent) -> FeatureSpecific:
+    """Return masks and network trained on fresh counts of the training objects of `task`; ValueError for what is no training."""
+    _check(options)
+    n_pixels = math.prod(task.image_shape)
+    images = task.train.images.reshape(len(task.train), n_pixels)
+    mean_image = (images.mean(axis=0) / 255).astype(np.float32)
+    if options.start == "pca":
+        masks = principal_masks(images, options.features)
+    else:
+        masks = np.random.default_rng([options.seed, 5]).random((options.features, n_pixels)) ** 2
+    model = seeded(lambda: FeatureSpecific(masks, mean_image, len(task.classes), options), options.seed)
+    assert isinstance(model, FeatureSpecific)
+
+    def objects(which: Tensor, _generator: torch.Generator) -> Tensor:
+        return torch.from_numpy(images[which.numpy()].astype(np.float32)) / 255
+
+    told = named(f"{options.features} masks at {options.photons:g} photons", report)
+    labels = torch.from_numpy(task.train.labels)
+    rates = {"weight": MASK_RATE}
+    fit(model, objects, labels, epochs=options.epochs, seed=options.seed, batch=256, rates=rates, report=told)
+    return model
+
+
+def _check(options: FsiOptions) -> None:
+    if options.features < 1 or options.epochs < 1 or not 0 < options.photons < math.inf:
+        raise ValueError(
+            f"{options.features} masks, {options.epochs} epochs, {options.photons:g} photons, allowed: above 0"
+        )
+    if options.start not in ("pca", "random") or options.spread not in SPREADS:
+        raise ValueError(
+            f"start is {options.start!r}, spread is {options.spread!r}, allowed: pca or random; {', '.join(SPREADS)}"
+        )
+
+
+def measured_by(model: FeatureSpecific, task: Task, brightness: str) -> tuple[Measurement, Decide]:
+    """Return the measurement by the model's masks, and the decision of its network on counts."""
+    with torch.no_grad():
+        shown: NDArray[np.float32] = model.masks().numpy()
+    to_scores: Callable[[Tensor], Tensor] = model.head
+    return measure(task, shown, brightness), decider(to_scores)
