@@ -1,0 +1,110 @@
+"""An upload over real links: what the device then holds, with and without the extension, and a device that knows no automata."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from bundles import automaton_bundle, made_bundle, six_states
+from lab_bench import SCENE, VirtualLab
+from lab_firmware import Firmware
+from lab_light import Light
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import load_scene
+from pans.firmware_sim.trials.fields import tcp_link
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.plan import build_plan
+from pans.runtime.errors import DeviceError
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.link.connection import Connection, check_device
+from pans.runtime.link.upload import check_automaton, upload_commands
+from pans.runtime.wire.automata import Extension, announcement
+from pans.runtime.wire.messages import Opcode
+
+DMD = load_profile("dmd-spad")
+PROFILE = replace(DMD, projector=replace(DMD.projector, automaton_states=60_000, dwell_steps=4))
+LIGHT = 50e-6 * PROFILE.projector.peak_photoelectrons_hz
+BUNDLE = automaton_bundle(six_states(), photons=LIGHT)
+
+
+def grey_bundle(profile: Profile) -> Bundle:
+    levels = profile.projector.levels
+    masks = np.random.default_rng(1).integers(0, levels, (3, 6))
+    top = 50e-6 * profile.projector.peak_photoelectrons_hz
+    return automaton_bundle(six_states(), photons=top / (levels - 1), levels=levels, pattern_levels=masks)
+
+
+@contextmanager
+def connected(profile: Profile, over: str) -> Any:
+    clock = DeviceClock(profile.clock.tick_hz)
+    start_ns = START_NS if over == "virtual" else time.perf_counter_ns()
+    device = Instrument(profile, load_scene("uniform"), power_on_tick=clock.tick_at(start_ns))
+    if over == "virtual":
+        yield device, Connection(VirtualLink(device, clock, "upload"))
+        return
+    with tcp_link(device, clock) as link:
+        connection = Connection(link)
+        yield device, connection
+        connection.close()
+
+
+@pytest.mark.parametrize("over", ["virtual", "tcp"])
+@pytest.mark.parametrize("levels", [2, 100])
+def test_the_device_holds_what_the_bundle_has(over: str, levels: int) -> None:
+    profile = replace(PROFILE, projector=replace(PROFILE.projector, levels=levels))
+    bundle = BUNDLE if levels == 2 else grey_bundle(profile)
+    plan = build_plan(profile, bundle)
+    with connected(profile, over) as (device, connection):
+        facts = connection.handshake().facts
+        check_device(facts, plan, bundle, profile.clock.tick_hz)
+        connection.upload(plan, bundle)
+        assert np.array_equal(device._patterns.stack(3), bundle.pattern_levels)
+        held = device._states.states
+        assert np.array_equal(held.successors, six_states().successors)
+        assert np.array_equal(held.light, six_states().dwell / 4)
+        opcodes = {opcode for opcode, _ in upload_commands(plan, bundle, facts)}
+        assert (Opcode.LOAD_MASKS in opcodes) is (levels == 2)
+
+
+def test_an_older_device_gets_fixed_patterns_as_before() -> None:
+    fixed = made_bundle(photons_per_level=LIGHT, table=np.zeros((4, 2)))
+    plan = build_plan(PROFILE, fixed)
+    opcodes = [opcode for opcode, _ in upload_commands(plan, fixed, {})]
+    assert opcodes == [Opcode.LOAD_PATTERN, Opcode.LOAD_PATTERN, Opcode.LOAD_PLAN]
+
+
+def test_a_device_that_knows_no_automata_is_refused_before_anything_is_sent() -> None:
+    """The firmware in tests/independent was written before there were automata."""
+    connection = Connection(VirtualLab(Firmware(Light.of_scene(SCENE, 1e5, 2, 0))))
+    facts = connection.handshake().facts
+    plan = build_plan(PROFILE, BUNDLE)
+    with pytest.raises(DeviceError, match="announces no automata, needed 0xd00a27ff") as refused:
+        check_automaton(facts, plan)
+    assert "fixed patterns" in refused.value.remedy
+    connection.session.submit(Opcode.LOAD_STATES, b"", may_be_refused=True)  # and if one were sent all the same
+    connection.settle()
+    assert connection.session.refusals[0].status == 1
+
+
+@pytest.mark.parametrize(
+    ("facts", "drive", "words"),
+    [
+        ({"automaton_schema": 1}, "device", "automata of schema 0x00000001"),
+        (announcement(Extension(5, 4)), "device", "up to 5 states, needed 6"),
+        (announcement(Extension(0, 6)), "host", "into 6 dwell steps, needed a multiple of 4"),
+    ],
+)
+def test_a_device_that_cannot_run_the_automaton_is_refused_with_the_numbers(facts, drive, words) -> None:
+    with pytest.raises(DeviceError, match=words):
+        check_automaton(facts, build_plan(PROFILE, BUNDLE, drive=drive))
+
+
+def test_a_device_without_states_can_be_driven_by_the_host() -> None:
+    check_automaton(announcement(Extension(0, 4)), build_plan(PROFILE, BUNDLE, drive="host"))
