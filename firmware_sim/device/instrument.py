@@ -7,6 +7,7 @@ sent. Whatever arrives, it answers, refuses or counts; it never raises over byte
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -92,7 +93,8 @@ class Instrument:
         pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
         self._plan = PlanMemory(self.profile, adaptive=self.extension is not None)
-        self._states = StateMemory(self.extension or Extension(0, 1))
+        turn_ticks = math.ceil(self.profile.timing.device_turn_us * self._tick_hz / 1e6)
+        self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks)
         self._shows: ShowList | None = None  # of a run that the host drives
         self._light: tuple[tuple[int, int, int, bool], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")

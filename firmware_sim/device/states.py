@@ -28,6 +28,7 @@ class StateMemory:
     """The states that belong to the plan in memory; `states` is None until the last one has come and all of them can be followed."""
 
     extension: Extension
+    turn_ticks: int = 0  # from the end of an exposure until the projector shows what its click chose
     states: States | None = None
     _head: StateChunk | None = None
     _chunks: list[NDArray[Any]] = field(default_factory=list)
@@ -70,6 +71,16 @@ class StateMemory:
         if longest > slots:
             self.forget()
             raise Refused(AckStatus.OUT_OF_RANGE, f"walks of {longest} exposures: a cycle has {slots} adaptive slots")
+        closest = (
+            int(np.diff(program.offsets, append=program.offsets[0] + program.cycle_ticks).min())
+            - program.exposure_ticks
+        )
+        if closest < self.turn_ticks - 1:  # a tick less is forgiven for rounding
+            self.forget()
+            raise Refused(
+                AckStatus.OUT_OF_RANGE,
+                f"{closest} ticks between exposures: the device needs {self.turn_ticks} to choose",
+            )
         self.states = States(rows["pattern"].astype(np.int64), rows["dwell"] / head.dwell_steps, successors)
 
 

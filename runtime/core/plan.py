@@ -226,14 +226,13 @@ def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks
 def _walks(
     profile: Profile, bundle: Bundle, automaton: Automaton, drive: str, walks: int, dark: int, ticks: Ticks
 ) -> Plan:
-    """One exposure of every cycle for each step of the longest walk; the host's turn comes between them where it names the states."""
+    """One exposure of every cycle for each step of the longest walk; the turn of whoever chooses the patterns comes between them."""
     drive = _checked_drive(profile, automaton, drive)
-    turn = profile.timing.host_turn_us * profile.clock.tick_hz / 1e6 if drive == "host" else 0.0
-    period = max(ticks.spacing + up(turn), up(ticks.refresh))
+    turn_us = profile.timing.host_turn_us if drive == "host" else profile.timing.device_turn_us
+    turn = up(turn_us * profile.clock.tick_hz / 1e6)
+    period = max(ticks.spacing, ticks.exposure + turn, up(ticks.refresh))
     if period > U32_MAX:
-        raise PlanError(
-            f"an exposure, its readout and the host's turn take {period} ticks, the protocol counts up to {U32_MAX}"
-        )
+        raise PlanError(f"an exposure and the {drive}'s turn take {period} ticks, the protocol counts up to {U32_MAX}")
     slots = interleave(np.full(automaton.n_slots, ADAPTIVE_PATTERN), dark)
     check_slots(len(slots), "fewer dark slots")
     cycle = Cycle(

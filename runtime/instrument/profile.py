@@ -90,11 +90,13 @@ class Clock:
 class Timing:
     """A decision follows the last exposure within the deadline; the device goes dark when the lease is not renewed.
 
-    `host_turn_us`: from the end of an exposure until the projector knows the next pattern, where the host names it.
+    `device_turn_us` and `host_turn_us`: from the end of an exposure until the projector can show the pattern that its click chose, where
+    the device chooses it and where the host does.
     """
 
     decision_deadline_us: float
     lease_ms: int
+    device_turn_us: float = 0.0
     host_turn_us: float = 1000.0
 
 

@@ -64,6 +64,7 @@ _SCHEMA: dict[str, dict[str, Key]] = {
     "timing": {
         "decision_deadline_us": Key("number", 0, 1e9, above=True),
         "lease_ms": Key("whole", 1, 3_600_000),
+        "device_turn_us": Key("number", 0, 1e9, required=False),
         "host_turn_us": Key("number", 0, 1e9, required=False),
     },
 }

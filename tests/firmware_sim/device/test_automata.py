@@ -48,7 +48,7 @@ def instrument(**changes: Any) -> Profile:
     profile = load_profile("dmd-spad")
     projector = replace(profile.projector, automaton_states=100, dwell_steps=4)
     detector = replace(profile.detector, dark_rate_hz=2000.0, afterpulse_probability=0.3)
-    timing = replace(profile.timing, host_turn_us=200.0)
+    timing = replace(profile.timing, device_turn_us=0.0, host_turn_us=200.0)
     clock = replace(profile.clock, tick_hz=1_000_000)
     return replace(profile, projector=projector, detector=replace(detector, **changes), timing=timing, clock=clock)
 

@@ -23,7 +23,7 @@ DMD = load_profile("dmd-spad")
 
 def instrument(states: int = 100, steps: int = 4, turn_us: float = 500.0) -> Profile:
     projector = replace(DMD.projector, automaton_states=states, dwell_steps=steps)
-    return replace(DMD, projector=projector, timing=replace(DMD.timing, host_turn_us=turn_us))
+    return replace(DMD, projector=projector, timing=replace(DMD.timing, device_turn_us=0.0, host_turn_us=turn_us))
 
 
 def bundle_for(automaton: Automaton, exposure: float = 50.0) -> Bundle:
@@ -62,7 +62,10 @@ def test_the_hosts_turn_is_part_of_the_slot_where_the_host_drives() -> None:
         drive: build_plan(instrument(turn_us=750.0), bundle_for(six_states()), drive=drive).slot_period_ticks
         for drive in ("device", "host")
     }
-    assert periods == {"device": 5300, "host": 5300 + 75000}  # 50 us and 3 us of readout at 100 MHz
+    assert periods == {"device": 5300, "host": 5000 + 75000}  # 50 us, and 3 us of readout or 750 us, at 100 MHz
+    prompt = instrument()
+    prompt = replace(prompt, timing=replace(prompt.timing, device_turn_us=44.0))
+    assert build_plan(prompt, bundle_for(six_states())).slot_period_ticks == 5000 + 4400
     slow = build_plan(instrument(turn_us=0.0), bundle_for(six_states(), 40.0), drive="host")
     assert slow.slot_period_ticks == 4330  # then the projector is what takes longest: 23.1 kHz
 
@@ -84,7 +87,7 @@ def test_the_device_drives_where_it_can() -> None:
             {},
             "3 patterns, the pattern memory of dmd-spad holds 2",
         ),
-        (instrument(turn_us=5e7), {"drive": "host"}, "5000005300 ticks, the protocol counts up to 4294967295"),
+        (instrument(turn_us=5e7), {"drive": "host"}, "5000005000 ticks, the protocol counts up to 4294967295"),
         (instrument(), {"order": "pattern-major"}, "no order pattern-major"),
     ],
 )
