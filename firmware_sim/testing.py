@@ -22,6 +22,13 @@ N_PATTERNS = 4
 EXPOSURE_US = 100.0
 
 
+def following_profile() -> Profile:
+    """Return the ideal instrument as one that follows automata of up to 16 states, with four dwell steps."""
+    profile = load_profile("ideal")
+    projector = replace(profile.projector, automaton_states=16, dwell_steps=4)
+    return replace(profile, projector=projector, timing=replace(profile.timing, host_turn_us=50.0))
+
+
 def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
     """Return an instrument, a bundle and a plan that put many small frames on the wire; `mode` is sequential or parallel."""
     profile = load_profile("ideal")

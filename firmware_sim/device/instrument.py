@@ -365,7 +365,8 @@ class Instrument:
         if self._states.begun:
             raise Refused(AckStatus.WRONG_STATE, "some states of the automaton have not come")
         shows = ShowList(self._states.extension) if program.adaptive and self._states.states is None else None
-        self._run = self.view.run(program, arm, self._light_table(program), self._draws, shows or self._states.states)
+        drive = self._states.states if shows is None else shows
+        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive)
         self._shows = shows
         self.stream.restart()
         self._exposures_ended = 0

@@ -166,6 +166,9 @@ class ShowList:
         _require(not full, lambda: f"{MAX_SHOWS} exposures are named already")
         self._shown[show.exposure_index] = Shown(show.state, show.pattern, show.dwell / show.dwell_steps)
 
+    def __len__(self) -> int:
+        return len(self._shown)
+
     def take(self, exposure_index: int) -> Shown | None:
         """Return what was named for an exposure and forget it; None if nothing was."""
         return self._shown.pop(exposure_index, None)

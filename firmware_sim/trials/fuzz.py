@@ -18,19 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from pans.firmware_sim.checks.strange import StrangeCommands
 from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
 from pans.firmware_sim.options import option
 from pans.firmware_sim.resealed import fuzz_files
 from pans.firmware_sim.scene.still import Scene, load_scene
-from pans.firmware_sim.testing import small_setup
+from pans.firmware_sim.testing import following_profile, small_setup
 from pans.runtime.cli import say
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
-from pans.runtime.instrument.profile import load_profile
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
@@ -42,9 +42,6 @@ BATCH_FRAMES = 200
 # Of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second.
 MAX_CALL_S = 5.0
 NONCE = 0x5EED
-EDGES = (
-    0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 62, (1 << 64) - 1,
-)  # fmt: skip
 HOST_TYPES = (MessageType.HELLO, MessageType.PING, MessageType.COMMAND, MessageType.GRANT)
 DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
 
@@ -52,11 +49,14 @@ DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
 class CountingInstrument(Instrument):
     """An instrument that counts what it has carried out."""
 
-    executed = 0
+    executed = armed = automata_armed = 0
 
     def _execute(self, command: wire.CommandMessage) -> None:
         super()._execute(command)
         self.executed += 1
+        if command.opcode == Opcode.ARM:
+            self.armed += 1
+            self.automata_armed += self._plan.program is not None and self._plan.program.adaptive
 
 
 class LimitBroken(AssertionError):
@@ -73,6 +73,7 @@ class FuzzCounts:
     commands_executed: int = 0
     commands_refused: int = 0
     runs_armed: int = 0
+    automata_armed: int = 0
     blocks_accepted: int = 0
     slowest_call_s: float = 0.0
 
@@ -84,9 +85,9 @@ class Fuzzer:
         self.seed = seed
         self.counts = FuzzCounts()
         self._dice = random.Random(seed)
-        self._profile = load_profile("ideal")
+        self._strange = StrangeCommands(self._dice)
+        self._profile = following_profile()
         self._scene: Scene = load_scene("uniform")
-        self._command_id = 0
         self._decoder, self._compiled = wire.FrameDecoder(), wire.FrameDecoder()
         self._compiled.use_kernels()
         self._fresh_device()
@@ -131,7 +132,6 @@ class Fuzzer:
     def _fresh_device(self) -> None:
         self._device = CountingInstrument(self._profile, self._scene, seed=self.seed, buffer_messages=16)
         self._device.step(0, wire.encode_hello(NONCE))
-        self._command_id = 0
 
     def _fresh_host(self) -> None:
         self._session = HostSession(NONCE)
@@ -188,14 +188,20 @@ class Fuzzer:
         if len(device.gates.pulses) > MAX_KEPT_PULSES or len(device.stream._held) > device.stream.capacity:
             raise LimitBroken("the instrument remembers more than its limits allow")
         held = sum(pattern.levels.nbytes for pattern in device._patterns._patterns.values())
-        if held > MAX_UPLOAD_BYTES:
-            raise LimitBroken(f"the instrument holds {held} bytes of patterns")
+        if held > MAX_UPLOAD_BYTES or held != device._patterns.held_bytes:
+            raise LimitBroken(
+                f"the instrument holds {held} bytes of patterns, and counts {device._patterns.held_bytes}"
+            )
+        if device._shows is not None and len(device._shows) > MAX_SHOWS:
+            raise LimitBroken(f"the instrument remembers {len(device._shows)} names of exposures")
         if max(len(self._session.pongs), len(self._session.refusals)) > MAX_KEPT or len(self._core.marks) > 4096:
             raise LimitBroken("the host remembers more than its limits allow")
 
     def _count_device(self) -> None:
         self.counts.commands_refused += self._device.counters.refused
         self.counts.commands_executed += self._device.executed
+        self.counts.runs_armed += self._device.armed
+        self.counts.automata_armed += self._device.automata_armed
 
     # -- strange input -------------------------------------------------------------------------------------------------
 
@@ -216,84 +222,38 @@ class Fuzzer:
             frames += frame
         return bytes(frames[:size])
 
-    def _number(self, bits: int) -> int:
-        dice = self._dice
-        if dice.random() < 0.5:
-            return dice.choice(EDGES) & ((1 << bits) - 1)
-        return dice.getrandbits(dice.randint(1, bits))
-
     def _frame_for_device(self) -> bytes:
         dice = self._dice
         kind = dice.choices((*HOST_TYPES, dice.randrange(256)), (1, 10, 60, 10, 2))[0]
-        session = self._device.session if dice.random() < 0.97 else self._number(32)
+        session = self._device.session if dice.random() < 0.97 else self._strange.number(32)
         if kind == MessageType.HELLO and dice.random() < 0.5:
             return wire.encode_hello(NONCE + dice.randrange(2))
         if kind == MessageType.PING:
-            return wire.encode_ping(self._number(32), self._number(64), session)
+            return wire.encode_ping(self._strange.number(32), self._strange.number(64), session)
         if kind == MessageType.GRANT:
-            return wire.encode_grant(wire.Grant(self._number(32), self._number(32)), session)
+            return wire.encode_grant(wire.Grant(self._strange.number(32), self._strange.number(32)), session)
         if kind == MessageType.COMMAND:
-            return self._command(session)
+            return self._strange.command(self._device, session)
         return wire.encode_frame(kind, dice.randbytes(dice.choice((0, 1, 8, 36, 300))), session)
-
-    def _command(self, session: int) -> bytes:
-        dice = self._dice
-        expected = self._device._ack.last_id + 1
-        number = expected if dice.random() < 0.9 else self._number(32)
-        opcode = dice.choice((*Opcode, *Opcode, dice.randrange(256)))
-        body = dice.randbytes(dice.choice((0, 1, 12, 24, 36, 100))) if dice.random() < 0.2 else self._body(opcode)
-        return wire.encode_command(number, opcode, body, session)
-
-    def _body(self, opcode: int) -> bytes:
-        dice, tick = self._dice, self._device.tick
-        if opcode == Opcode.LOAD_PATTERN:
-            levels = np.array([self._number(16) for _ in range(dice.choice((1, 4)))], np.uint16)
-            small = dice.random() < 0.8
-            whole = len(levels) if small else self._number(32)
-            return pack_pattern(PatternChunk(dice.randrange(3) if small else self._number(16), 0, whole, levels))
-        if opcode == Opcode.LOAD_PLAN:
-            return self._plan()
-        if opcode == Opcode.ARM:
-            self.counts.runs_armed += 1
-            start = tick + dice.randrange(1, 100) if dice.random() < 0.8 else self._number(64)
-            cycles = dice.randrange(4) if dice.random() < 0.8 else self._number(64)
-            return pack_arm(Arm(start, cycles, dice.randrange(1, 2000) if dice.random() < 0.8 else self._number(32)))
-        if opcode == Opcode.GATE:
-            near = tick + dice.randrange(1000)
-            return pack_gate(
-                Gate(near if dice.random() < 0.8 else self._number(64), self._number(32), dice.randrange(9))
-            )
-        return b""
-
-    def _plan(self) -> bytes:
-        dice = self._dice
-        n_slots = dice.choice((1, 2, 5))
-        slots = np.zeros(n_slots, wire.SLOT_DTYPE)
-        slots["offset_ticks"] = np.arange(n_slots) * 100
-        slots["pattern"] = [dice.choice((0, 1, 0xFFFF)) for _ in range(n_slots)]
-        chunk = PlanChunk(0, 2, n_slots, 0, 80, 100, 100 * n_slots, dice.choice((1, 16)), 1, slots)
-        for _ in range(dice.choice((0, 0, 0, 1, 2))):
-            name, bits = dice.choice(
-                (("mode", 8), ("n_patterns", 16), ("n_slots", 32), ("first_slot", 32), ("exposure_ticks", 32),
-                 ("slot_period_ticks", 32), ("cycle_ticks", 64), ("block_exposures", 16), ("cycles_per_object", 32))
-            )  # fmt: skip
-            changes: dict[str, Any] = {name: self._number(bits)}
-            chunk = chunk._replace(**changes)
-        if dice.random() < 0.1:
-            slots["offset_ticks"][dice.randrange(n_slots)] = self._number(64)
-        return pack_plan(chunk)
 
     def _frame_for_host(self) -> bytes:
         dice = self._dice
         kind = dice.choice((*DEVICE_TYPES, MessageType.CLICKS, MessageType.CLICKS, dice.randrange(256)))
-        session = NONCE if dice.random() < 0.97 else self._number(32)
+        session = NONCE if dice.random() < 0.97 else self._strange.number(32)
         tracker = self._core.tracker
         if kind in (MessageType.CLICKS, MessageType.FRAMES) and dice.random() < 0.8:
             count = dice.randrange(1, 6)
             good = dice.random() < 0.7
-            seq = tracker.next_seq if good else self._number(32)
-            first = tracker.next_exposure + dice.choice((0, 0, 0, 1, 50)) if good else self._number(64)
-            head = (seq, self._number(32), self._number(63), first, self._number(32), self._number(32))
+            seq = tracker.next_seq if good else self._strange.number(32)
+            first = tracker.next_exposure + dice.choice((0, 0, 0, 1, 50)) if good else self._strange.number(64)
+            head = (
+                seq,
+                self._strange.number(32),
+                self._strange.number(63),
+                first,
+                self._strange.number(32),
+                self._strange.number(32),
+            )
             if good and dice.random() < 0.7:  # as the plan has it, so that some get as far as the windows
                 cycle, slot = divmod(first, self._host_plan.slots_per_cycle)
                 tick = cycle * self._host_plan.cycle_ticks + int(self._host_plan.slot_offset_ticks[slot])
