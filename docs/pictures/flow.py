@@ -15,22 +15,21 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from pans.runtime.core.decision import NO_LABEL
-from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.flow.make import recorded_flow_core
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record import read_recording
-from pans.runtime.record.sent_plan import sent_plan
+from pans.runtime.record.sent_plan import sent_to_device
 from pans.runtime.wire.messages import MessageType, decode_frames, decode_mark, unpack_body
 
 recording = read_recording(Path(sys.argv[1]))
 first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
 count = int(sys.argv[3]) if len(sys.argv) > 3 else 2400
 config, bundle = recording.header["config"], recording.bundle()
-chunks, arms = sent_plan(recording)
-plan = plan_from_chunks(chunks, int(config["tick_hz"]))
+sent = sent_to_device(recording)
+plan = sent.plan(int(config["tick_hz"]), None)
 decider = make_decider(bundle)
-arm = arms[0][1]
+arm = next(iter(sent.arms.values()))
 core = recorded_flow_core(config["flow"], plan, decider, bundle, 1, arm.n_cycles)
 core.begin(arm.start_tick, arm.n_cycles)
 stop = first + count

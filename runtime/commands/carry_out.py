@@ -143,7 +143,7 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.live.gates import open_actuator
 
     bundle, bundle_sha256 = load_bundle(job.bundle_path)
-    decider = make_decider(bundle, shots=job.shots, backend=job.backend)
+    decider = make_decider(bundle, shots=job.shots, backend=job.backend, confidence=job.confidence)
     dark = DarkRun.of(job.dark, job.profile)
     n_objects, flow_run, seconds = -(-job.decisions // job.trials), None, job.seconds
     core: LiveCore
@@ -158,12 +158,14 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
             shots_per_object=job.shots * job.trials,
             dark_slots_per_cycle=job.dark_slots,
             order=job.order,
+            drive=job.drive,
+            automaton=getattr(decider, "automaton", None),
         )
         n_cycles = n_objects * plan.cycles_per_object
         core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
     config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
-    header = recording_header(job, bundle_sha256, decider, n_objects)
+    header = recording_header(job, bundle_sha256, decider, n_objects, plan.drive)
     header["config"]["dark"] = dark.header()
     if flow_run is not None:
         header["config"]["flow"] = flow_run.header()

@@ -45,6 +45,8 @@ class Job:
     order: str = "auto"
     dark_slots: int = 1
     backend: str = "auto"
+    drive: str = "auto"  # of an automaton
+    confidence: float = 0.0  # at which an automaton decides; 0: where its walk ends
     realtime: bool = True
     core: int | None = None
     reconnect_s: float = 10.0
@@ -92,8 +94,8 @@ def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary:
     }
 
 
-def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int) -> dict[str, Any]:
-    """What a recording must say to be understood alone; units are in the keys."""
+def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int, drive: str) -> dict[str, Any]:
+    """What a recording must say to be understood alone; units are in the keys. `drive` is the plan's, "" of fixed patterns."""
     import numba
     import numpy
     import onnxruntime
@@ -117,6 +119,7 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "backend_choice": dict(choice_of(decider)),
             "tick_hz": job.profile.clock.tick_hz,
             "realtime_requested": job.realtime,
+            **({"drive": drive, "confidence": job.confidence} if drive else {}),
         },
         "versions": {
             "pans": __version__,

@@ -32,8 +32,27 @@ RANGES = {
     "calibration_max_age_h": Range(1e-9, 1e6),
     "rotate_mb": Range(0, 1e6),
     "keep_mb": Range(0, 1e9),
+    "confidence": Range(0.0, 1.0),
     "seed": Range(0, (1 << 63) - 1, whole=True),
 }
+
+
+def add_walk_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an automaton to `pans run` and `pans demo`."""
+    group = parser.add_argument_group("automata (docs/how-to/automata.md)")
+    group.add_argument(
+        "--drive",
+        default="auto",
+        choices=("auto", "device", "host"),
+        help="who chooses the next pattern by the clicks: the device where it can (auto), the device, or the host",
+    )
+    group.add_argument(
+        "--confidence",
+        type=RANGES["confidence"].option,
+        default=0.0,
+        metavar="C",
+        help="decide as soon as a class is this probable, and abstain where none is at the end (default: walk to the end)",
+    )
 
 
 def add_flow_options(parser: argparse.ArgumentParser) -> None:

@@ -21,7 +21,16 @@ from pans.runtime.timing.cpu import check_core
 
 from .carry_out import carry_out
 from .job import Job
-from .options import RANGES, add_continuous_options, add_dark_options, add_flow_options, continuous_of, dark_of, flow_of
+from .options import (
+    RANGES,
+    add_continuous_options,
+    add_dark_options,
+    add_flow_options,
+    add_walk_options,
+    continuous_of,
+    dark_of,
+    flow_of,
+)
 
 DEMO_BUNDLE = "fashion10.pans"
 DEMO_PROFILE = "oled-qcmos"
@@ -54,6 +63,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     parser.add_argument(
         "--dark-slots", type=RANGES["dark_slots"].option, default=1, help="dark displays per cycle (default 1)"
     )
+    add_walk_options(parser)
     parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
     parser.add_argument(
@@ -145,6 +155,8 @@ def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, deci
         order=args.order,
         dark_slots=args.dark_slots,
         backend=args.backend,
+        drive=args.drive,
+        confidence=args.confidence,
         realtime=not args.no_realtime,
         core=args.core,
         record=record,

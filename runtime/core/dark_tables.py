@@ -47,6 +47,11 @@ class Adapter(Protocol):
 
 def make_adapter(bundle: Bundle, shots: int) -> Adapter:
     """Return what adapts `bundle`'s decisions over `shots` shots; UsageError for a bundle that gives pictures."""
+    if bundle.automaton is not None:
+        raise UsageError(
+            f"{bundle.name} is an automaton: a dark click has already led to another pattern, so that no table mends it afterwards",
+            remedy="use --on-dark abstain, or train for the present dark rate",
+        )
     if bundle.picture_shape is not None:
         raise UsageError("a bundle that gives pictures decides nothing", remedy="use --on-dark abstain")
     if shots == 1 and bundle.table is not None:

@@ -41,13 +41,17 @@ DECISION_DTYPE = np.dtype(
         ("truth", "<i2"),  # -1: unknown
         ("flags", "<u4"),  # DecisionFlag
         ("probability", "<f4"),  # softmax of the winner
-        ("counts_crc", "<u4"),  # CRC-32 of the clicks per pattern as int64 little-endian
+        ("counts_crc", "<u4"),  # CRC-32 of the clicks per pattern (of a walk: per slot) as int64 little-endian
+        ("exposures", "<u4"),  # of the walk; 0 where the patterns are fixed, and every decision takes the same
     ]
 )
 
 
 class Decision(NamedTuple):
-    """One row of the decision log, in the order of DECISION_DTYPE; `probability` is the winning class's softmax."""
+    """One row of the decision log, in the order of DECISION_DTYPE; `probability` is the winning class's softmax.
+
+    `exposures` are those with light of an automaton's walk, 0 where the patterns are fixed.
+    """
 
     number: int
     tick: int
@@ -60,6 +64,7 @@ class Decision(NamedTuple):
     flags: int
     probability: float
     counts_crc: int
+    exposures: int = 0
 
 
 class Action(NamedTuple):

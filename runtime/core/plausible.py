@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
+from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
 from pans.runtime.wire.tracker import MAX_GAP_EXPOSURES
 
 from .plan import Plan
@@ -41,6 +41,7 @@ class PlanRules:
         self._period, self._cycle_ticks, self._slots = plan.slot_period_ticks, plan.cycle_ticks, plan.slots_per_cycle
         self._visit = plan.slots_per_cycle * plan.cycles_per_object
         self._n_classes, self._moving = n_classes, moving
+        self._n_states = 0 if plan.automaton is None else plan.automaton.n_states
 
     def planned(self, exposure_index: int) -> int:
         """Ticks from the start of the run to the start of an exposure."""
@@ -55,7 +56,10 @@ class PlanRules:
         return cycle * self._slots + int(np.searchsorted(self._offsets, rest, "right"))
 
     def of_block(self, block: ClickBlock | FrameBlock, start_tick: int) -> Contradiction | None:
-        """Spacing, object and time of a block: an exposure may be late, but never a whole period early."""
+        """Spacing, object, time and stamps of a block: an exposure may be late, but never a whole period early.
+
+        With an automaton an exposure is dark or shows one of its states; whether it is the right one, the walk says (window_kernels.py).
+        """
         first = block.exposure_index
         if block.period_ticks != self._period:
             return Contradiction("period", first, block.period_ticks, self._period)
@@ -65,6 +69,10 @@ class PlanRules:
         earliest = start_tick + self.planned(first) - self._period
         if block.tick < earliest:
             return Contradiction("early", first, block.tick, earliest)
+        if self._n_states and isinstance(block, ClickBlock):
+            strange = (block.patterns >= self._n_states) & (block.patterns != DARK_PATTERN)
+            if strange.any():
+                return Contradiction("stamp", first, int(block.patterns[strange.argmax()]), self._n_states - 1)
         return None
 
     def of_mark(self, mark: Mark, next_exposure: int, end_exposure: int) -> Contradiction | None:

@@ -28,7 +28,8 @@ class Core(Follower):
     """Stream tracker, windows and back end joined up, for objects that stand still."""
 
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
-        super().__init__(plan, n_cycles, decider.n_classes or ANY_CLASS)  # 0: pictures
+        self.n_classes = decider.n_classes or ANY_CLASS  # 0: pictures
+        super().__init__(plan, n_cycles, self.n_classes)
         self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots
@@ -108,6 +109,9 @@ class Core(Follower):
                 flags |= DecisionFlag.NOT_FINITE | DecisionFlag.ABSTAINED
                 label, probability = NO_LABEL, 0.0
                 self.n_abstained += 1
+            elif label == NO_LABEL:
+                flags |= DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED
+                self.n_abstained += 1
         mark = self.marks.get(window.object_index)
         decision = Decision(
             number=self.n_decisions,
@@ -121,6 +125,7 @@ class Core(Follower):
             flags=int(flags),
             probability=probability,
             counts_crc=zlib.crc32(window.counts.tobytes()),
+            exposures=window.exposures,
         )
         self.n_decisions += 1
         return decision

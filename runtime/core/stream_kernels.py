@@ -1,7 +1,8 @@
-"""The compiled kernel of the streaming core: decoded FRAMES and MARK bodies in, rows of the decision log out.
+"""The compiled kernel of the core: decoded CLICKS, FRAMES and MARK bodies in, rows of the decision log out.
 
-Owns the ordinary case of parallel measurements: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves
-untouched and says so: `stream.StreamCore` gives it to `core.Core`, whose state this kernel continues. Never allocates.
+Owns the ordinary case: messages in order, nothing lost, blocks that fit the plan. Whatever else comes it leaves untouched and says so: its
+caller gives it to `still.Core`, whose state this kernel continues (bulk_steps.py joins them). What exposures of one detector mean is
+window_kernels.py's. Never allocates.
 """
 
 from __future__ import annotations
@@ -14,27 +15,42 @@ from numba import njit
 
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.kernels import load4, load8
-from pans.runtime.wire.schema import NO_OBJECT, UNKNOWN_TRUTH
+from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
-from .window import DARK_CLICKS, DARK_EXPOSURES
+from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, Walks, add_exposures, add_walks
 
 # state, int64 (N_STATE,): where the stream stands (stream.N_PLACE columns), where the walk stands, and what it continues of Core and
 # DecisionWindows
 MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, LAST_TICK = range(
     stream.N_PLACE, stream.N_PLACE + 10
 )
-EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES, N_STATE = range(
-    LAST_TICK + 1, LAST_TICK + 9
-)
-ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_frames` returns
+(
+    EXPOSURE_TICKS,
+    VISIT_EXPOSURES,
+    SHOTS,
+    START_TICK,
+    PERIOD_TICKS,
+    CYCLE_TICKS,
+    N_CLASSES,
+    JITTER,
+    STEPS,
+    KIND,
+    N_STATE,
+) = range(
+    LAST_TICK + 1, LAST_TICK + 12
+)  # STEPS: blocks that may be taken before the kernel returns, 0: any number; KIND: of the plan's blocks
+ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_messages` returns
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64
 _LANE = _U(0xFF)
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
 _GAP = int(DecisionFlag.GAP) | _ABSTAINED
+_WRONG = int(DecisionFlag.WRONG_PATTERN) | _ABSTAINED
 _NOT_FINITE = int(DecisionFlag.NOT_FINITE) | _ABSTAINED
+_AMBIGUOUS = int(DecisionFlag.AMBIGUOUS) | _ABSTAINED
+_DARK = DARK_PATTERN
 _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
 ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
@@ -45,24 +61,32 @@ class WindowArrays(NamedTuple):
 
     `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, from plausible.py's rules.
     `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
+    `stamps` uint16 and `bits` uint8 (65535,) are the patterns shown and the clicks of the latest CLICKS block.
     """
 
+    feature_at: npt.NDArray[np.int32]
     window_at: npt.NDArray[np.int32]
     last: npt.NDArray[np.int64]
     counts: npt.NDArray[np.int64]
     seen: npt.NDArray[np.int64]
     tallies: npt.NDArray[np.int64]
+    walks: Walks
+    longest: npt.NDArray[np.int64]
     lanes: npt.NDArray[np.uint64]
     whole: npt.NDArray[np.int64]
     offsets: npt.NDArray[np.int64]
+    stamps: npt.NDArray[np.uint16]
+    bits: npt.NDArray[np.uint8]
 
 
 class DecisionTables(NamedTuple):
     """From clicks per pattern to label, probability and checksum; without `labels` (size 0) the counts go to `counts_out`.
 
-    `radix` int64 (d_f,): the row of a table is the sum of counts * radix. `crc` uint32 (bytes of a count, d_f, 256) and `crc_zero`
-    uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte. For K = 1 with a
-    table, `word_rows` int64 and `word_crc` uint32 (bytes of a word, 256) say the same of a byte of the click word; else they are empty.
+    A label NO_LABEL abstains: its probability is below what was asked for, or 0 where the scores were not finite. `radix` int64 (d_f,):
+    the row of a table is the sum of counts * radix; of an automaton it is the leaf. `crc` uint32 (bytes of a count, d_f, 256) and
+    `crc_zero` uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte. For
+    K = 1 with a table, `word_rows` int64 and `word_crc` uint32 (bytes of a word, 256) say the same of a byte of the click word; else
+    they are empty.
     """
 
     labels: npt.NDArray[np.uint16]
@@ -83,7 +107,8 @@ class MarkArrays(NamedTuple):
 
 
 class Block(NamedTuple):
-    """An accepted block: its frames from `at` on in the buffer, the first one exposure `first`, `relative` to the visit's first.
+    """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, the first one exposure `first`, `relative` to the
+    visit's first.
 
     `end_tick` is that of the first exposure's end. `truth` is that of `object`, -1 where it is not known. `top_mask` are the bits of the
     last byte of a word that are channels.
@@ -102,17 +127,20 @@ class Block(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
 
-    buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows WindowArrays, tables DecisionTables, rows
-    DECISION_DTYPE (m,), counts_out int64 (m, d_f).
+    Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows
+    WindowArrays, tables DecisionTables, rows DECISION_DTYPE (m,), counts_out int64 (m, d_f).
     """
+    blocks = 0
     while state[MESSAGE] < spans.shape[0]:
+        if state[STEPS] and blocks == state[STEPS]:
+            return ALL_DONE
         if state[N_ROWS] == rows.size:
             return ROWS_FULL
         start, stop = _U(spans[state[MESSAGE], 0]), _U(spans[state[MESSAGE], 1])
-        if load4(buffer, start + _U(4)) != _U(state[SESSION]):
+        if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[SESSION]):
             return ODD
         kind = buffer[start]
         payload = start + _U(stream.BODY_HEADER)
@@ -130,6 +158,15 @@ def walk_frames(buffer, spans, state, marks, windows, tables, rows, counts_out):
             if state[FRAME] < block.frames:
                 return ROWS_FULL
             state[FRAME] = 0
+            blocks += 1
+        elif kind == stream.CLICKS:
+            if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
+                return ODD
+            block = _block_of(buffer, payload, state, marks, windows)
+            if not _settle(block, state, windows, tables, rows, counts_out):
+                return ROWS_FULL
+            state[FRAME] = 0
+            blocks += 1
         else:
             return ODD
         state[MESSAGE] += 1
@@ -158,11 +195,42 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True)
 def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
-    """Account for a block that is the next one and fits the plan; else False, and nothing done."""
+    """Account for a block of frames that is the next one and fits the plan; else False, and nothing done."""
     count, word_bytes = stream.next_block(buffer, payload, stop, state)
-    first = state[stream.NEXT_EXPOSURE]
-    if count == 0 or word_bytes < windows.lanes.size:
+    if count == 0 or state[KIND] != stream.FRAMES or word_bytes < windows.lanes.size:
         return False
+    return _accept(buffer, payload, count, state, windows)
+
+
+@njit(cache=True, nogil=True)
+def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
+    """Count a block of one detector's exposures, if it is the next one and fits the plan; else False, and nothing done."""
+    count = stream.next_clicks(buffer, payload, stop, state)
+    if count == 0 or state[KIND] != stream.CLICKS:
+        return False
+    stamps, bits = windows.stamps[:count], windows.bits[:count]
+    stream.unpack_clicks(buffer, payload, count, stamps, bits)
+    n_states = windows.walks.successors.shape[0]
+    if n_states:
+        for i in range(count):
+            if stamps[i] >= n_states and stamps[i] != _DARK:
+                return False
+    if not _accept(buffer, payload, count, state, windows):
+        return False
+    relative = state[stream.NEXT_EXPOSURE] - count - state[VISIT] * state[VISIT_EXPOSURES]
+    counts, seen, tallies, maps = windows.counts, windows.seen, windows.tallies, (windows.feature_at, windows.window_at)
+    if n_states:
+        add_walks(relative, stamps, bits, maps, windows.walks, counts, seen, tallies)
+    else:
+        add_exposures(relative, stamps, bits, windows.feature_at, windows.window_at, counts, seen, tallies)
+    state[FRAME] = count
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-def]
+    """Account for the next block, of `count` exposures, if it fits the plan; else False, and nothing done."""
+    first = state[stream.NEXT_EXPOSURE]
     visit = first // state[VISIT_EXPOSURES]
     if first + count > (visit + 1) * state[VISIT_EXPOSURES]:
         return False
@@ -175,17 +243,35 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
         or tick < planned - period
     ):
         return False
+    if not _is_due(visit, first - visit * state[VISIT_EXPOSURES], state, windows):
+        return False
     if visit != state[VISIT]:
-        if state[NEXT_WINDOW] != windows.counts.shape[0]:
-            return False
         windows.counts[:] = 0
         windows.seen[:] = 0
+        windows.walks.nodes[:] = 0
+        windows.walks.need[:] = windows.longest[0]
+        windows.last[:] = windows.longest[1]
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
     state[OBJECT] = number
     state[LAST_TICK] = tick + (count - 1) * period + state[EXPOSURE_TICKS]
+    final = first + count - 1 - cycle * windows.offsets.size  # may lie in the next cycle of this visit
+    due = (
+        planned - windows.offsets[first - cycle * windows.offsets.size] + windows.offsets[final % windows.offsets.size]
+    )
+    due += final // windows.offsets.size * state[CYCLE_TICKS] + state[EXPOSURE_TICKS]
+    state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
     stream.go_on(state, count)
     return True
+
+
+@njit(cache=True, nogil=True)
+def _is_due(visit, relative, state, windows):  # type: ignore[no-untyped-def]
+    """Whether no window waits that ended before exposure `relative` of `visit`: a block before this one may have been left out."""
+    n_windows = windows.last.size
+    if visit == state[VISIT]:
+        return state[NEXT_WINDOW] == n_windows or windows.last[state[NEXT_WINDOW]] >= relative
+    return visit == state[VISIT] + 1 and state[NEXT_WINDOW] == n_windows and windows.longest[1, 0] >= relative
 
 
 @njit(cache=True, nogil=True)
@@ -296,12 +382,41 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
 
 
 @njit(cache=True, nogil=True)
+def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Rows of the windows that CLICKS `block`, whose exposures are counted, settles; False while some wait for room."""
+    need, last, counts, seen = windows.walks.need, windows.last, windows.counts, windows.seen
+    end, n_states = block.relative + block.frames, windows.walks.successors.shape[0]
+    while state[NEXT_WINDOW] < counts.shape[0]:
+        index = state[NEXT_WINDOW]
+        right, wrong = seen[index, 0], seen[index, 1]
+        if right < need[index] and last[index] >= end:
+            return True
+        if state[N_ROWS] == rows.size:
+            return False
+        clicks, row, crc = _sum_up(counts[index], tables.radix, tables.crc, tables.crc_zero[0])
+        label, probability = np.int64(_NO_LABEL), np.float32(0.0)
+        flags = (_WRONG if wrong else 0) | (_GAP if right + wrong < need[index] else 0)
+        if flags == 0 and tables.labels.size:
+            row = windows.walks.nodes[index] - n_states if n_states else row
+            label, probability, flags = _look_up(tables.labels, tables.probabilities, row)
+        elif flags == 0:
+            counts_out[state[N_ROWS]] = counts[index]
+        decided = (clicks, label, flags, probability, crc)
+        here = rows[state[N_ROWS]]
+        _put_row(here, state, block, last[index] - block.relative, index * state[SHOTS], decided)
+        here["exposures"] = right if n_states else 0
+        state[N_ROWS] += 1
+        state[NEXT_WINDOW] += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
 def _look_up(labels, probabilities, index):  # type: ignore[no-untyped-def]
     """Label, probability and flags of a row of the table."""
-    probability = probabilities[index]
-    if probability > 0:
-        return np.int64(labels[index]), probability, 0
-    return np.int64(_NO_LABEL), np.float32(0.0), _NOT_FINITE
+    label, probability = np.int64(labels[index]), probabilities[index]
+    if label != _NO_LABEL:
+        return label, probability, 0
+    return label, probability, _AMBIGUOUS if probability > 0 else _NOT_FINITE
 
 
 @njit(cache=True, nogil=True)
@@ -319,6 +434,7 @@ def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-de
     row["flags"] = flags
     row["probability"] = probability
     row["counts_crc"] = crc
+    row["exposures"] = 0
     state[N_DECISIONS] += 1
     state[N_ABSTAINED] += flags != 0
 

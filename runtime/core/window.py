@@ -1,27 +1,33 @@
 """Exposures -> windows: the K-shot click counts of each object, complete or reported incomplete, in a fixed order.
 
 Owns which exposure belongs to which window; never decides. `DecisionWindows.push` returns the windows that a block completes or
-that can no longer become complete; each exposure is counted once, in a compiled kernel, and dark slots are tallied apart.
+that can no longer become complete; each exposure is counted once, in a kernel of window_kernels.py, and dark slots are tallied apart.
 
-A *visit* is the time one object stands before the detector (`cycles_per_object` cycles); its shots are grouped by K into windows.
+A *visit* is the time one object stands before the detector (`cycles_per_object` cycles); its shots are grouped by K into windows. With an
+automaton a window is one walk, and a cycle holds one: its clicks so far say which state each exposure must have shown.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.errors import PlanError
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
-from .plan import Plan
+from .plan import ADAPTIVE_PATTERN, Plan
+from .window_kernels import DARK_CLICKS as DARK_CLICKS
+from .window_kernels import DARK_EXPOSURES as DARK_EXPOSURES
+from .window_kernels import LATE_SLOTS as LATE_SLOTS
+from .window_kernels import N_TALLIES as N_TALLIES
+from .window_kernels import WRONG_PATTERNS as WRONG_PATTERNS
+from .window_kernels import Walks, add_exposures, add_frames, add_walks
 
 MAX_VISIT_EXPOSURES = 1 << 24
-DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, N_TALLIES = 0, 1, 2, 3
 
+I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 
 
@@ -29,7 +35,8 @@ class Window(NamedTuple):
     """One object's K shots: `counts` int64 (d_f,) clicks per pattern, a view that is valid until the next `push`.
 
     `first_shot` counts within the visit. `missing` exposures never came, `wrong` ones showed another pattern than planned: with
-    either above 0 no decision may be made from it.
+    either above 0 no decision may be made from it. Of a walk: `counts` are the clicks per slot, `exposures` how many it took (0 where
+    the patterns are fixed), and of the exposures that may be `missing` nobody knows how many the walk would have had.
     """
 
     object_index: int
@@ -38,52 +45,7 @@ class Window(NamedTuple):
     counts: I64
     missing: int
     wrong: int
-
-
-@numba.njit(cache=True, nogil=True)
-def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Add exposures `relative`... of a visit to its windows; see tests/naive_window.py for the meaning in plain loops.
-
-    patterns uint16 (n,), bits uint8 (n,), feature_at int32 and window_at int32 (visit,), counts int64 (windows, d_f),
-    seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
-    """
-    for i in range(patterns.shape[0]):
-        feature = feature_at[relative + i]
-        shown = patterns[i]
-        if feature < 0:
-            if shown == DARK_PATTERN:
-                tallies[DARK_EXPOSURES] += 1
-                tallies[DARK_CLICKS] += bits[i]
-            else:
-                tallies[WRONG_PATTERNS] += 1
-            continue
-        window = window_at[relative + i]
-        if shown == feature:
-            counts[window, feature] += bits[i]
-            seen[window, 0] += 1
-        else:
-            tallies[WRONG_PATTERNS] += 1
-            seen[window, 1] += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def add_frames(relative, words, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Add frames of all channels `relative`... of a visit: words uint8 (n, bytes), bit c of a word is channel c.
-
-    window_at int32 (visit,), -1 for a dark frame; counts int64 (windows, d_f), seen int64 (windows, 2), tallies int64 (3,).
-    """
-    n_features = counts.shape[1]
-    for i in range(words.shape[0]):
-        window = window_at[relative + i]
-        for feature in range(n_features):
-            bit = (words[i, feature >> 3] >> (feature & 7)) & 1
-            if window < 0:
-                tallies[DARK_EXPOSURES] += 1
-                tallies[DARK_CLICKS] += bit
-            else:
-                counts[window, feature] += bit
-        if window >= 0:
-            seen[window, 0] += n_features
+    exposures: int = 0
 
 
 class DecisionWindows:
@@ -106,9 +68,12 @@ class DecisionWindows:
         self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
         self._out: I64 = np.zeros_like(self._counts)
         self._seen: I64 = np.zeros((self.n_windows, 2), np.int64)
-        self._need = shots * n_features
         self._feature_at, self._window_at = _visit_maps(plan, shots)
         self._last = _last_exposures(self._window_at, self.n_windows, self.visit_exposures)
+        self.walks = _make_walks(plan, n_features, shots, self._last)
+        self._need, self._last = self.walks.need, self.walks.last
+        self._adaptive = bool(len(self.walks.nodes))
+        self._longest: I64 = np.stack([self._need, self._last])  # at the beginning of a visit
         self._visit = 0
         self._next_window = 0
         self._object = NO_OBJECT
@@ -135,11 +100,18 @@ class DecisionWindows:
             add_frames(relative, block.words, self._window_at, self._counts, self._seen, self.tallies)
         else:
             n_exposures = len(block.patterns)
-            add_exposures(
-                relative, block.patterns, block.bits, self._feature_at, self._window_at, self._counts, self._seen, self.tallies
-            )  # fmt: skip
+            self._add_clicks(relative, block.patterns, block.bits)
         settled += self._settle(relative + n_exposures)
         return settled
+
+    def _add_clicks(self, relative: int, patterns: npt.NDArray[np.uint16], bits: npt.NDArray[np.uint8]) -> None:
+        if self._adaptive:
+            maps = (self._feature_at, self._window_at)
+            add_walks(relative, patterns, bits, maps, self.walks, self._counts, self._seen, self.tallies)
+        else:
+            add_exposures(
+                relative, patterns, bits, self._feature_at, self._window_at, self._counts, self._seen, self.tallies
+            )
 
     def skip_to(self, exposure_index: int) -> list[Window]:
         """Report every window before `exposure_index` that will never be complete (a gap, or the end of the stream)."""
@@ -153,16 +125,24 @@ class DecisionWindows:
 
     @position.setter
     def position(self, value: tuple[int, int, int]) -> None:
-        self._visit, self._next_window, self._object = value
+        self.go_on(value)
+        self.walks.nodes[: self._next_window] = len(
+            self.walks.successors
+        )  # at a leaf: what is left of the cycle is dark
+
+    def go_on(self, position: tuple[int, int, int]) -> None:
+        """Take over a `position` to which a kernel has brought the same arrays."""
+        self._visit, self._next_window, self._object = position
 
     @property
     def half_seen(self) -> bool:
         """Whether a window that is not settled holds exposures already."""
         return bool(self._seen[self._next_window :].any())
 
-    def arrays(self) -> tuple[npt.NDArray[np.int32], I64, I64, I64, I64]:
-        """Return the arrays that hold the visit under way: window and last exposure, counts, seen, tallies."""
-        return self._window_at, self._last, self._counts, self._seen, self.tallies
+    def arrays(self) -> tuple[I32, I32, I64, I64, I64, I64, Walks, I64]:
+        """Return the arrays that hold the visit under way, the first eight of stream_kernels.WindowArrays."""
+        visit = self._counts, self._seen, self.tallies
+        return self._feature_at, self._window_at, self._last, *visit, self.walks, self._longest
 
     @property
     def visits_begun(self) -> int:
@@ -182,10 +162,7 @@ class DecisionWindows:
             no_words = np.frombuffer(b"", np.uint8).reshape(0, 1)
             add_frames(0, no_words, self._window_at, self._counts, self._seen, self.tallies)
         else:
-            add_exposures(
-                0, np.zeros(0, np.uint16), np.zeros(0, np.uint8),
-                self._feature_at, self._window_at, self._counts, self._seen, self.tallies,
-            )  # fmt: skip
+            self._add_clicks(0, np.zeros(0, np.uint16), np.zeros(0, np.uint8))
 
     def _advance_to(self, visit: int) -> list[Window]:
         settled: list[Window] = []
@@ -196,6 +173,8 @@ class DecisionWindows:
             self._object = NO_OBJECT
             self._counts[:] = 0
             self._seen[:] = 0
+            self.walks.nodes[:] = 0
+            self._need[:], self._last[:] = self._longest
         return settled
 
     def _settle(self, relative_end: int) -> list[Window]:
@@ -204,20 +183,50 @@ class DecisionWindows:
         while self._next_window < self.n_windows:
             index = self._next_window
             right, wrong = int(self._seen[index, 0]), int(self._seen[index, 1])
-            if right < self._need and self._last[index] >= relative_end:
+            need = int(self._need[index])
+            if right < need and self._last[index] >= relative_end:
                 break
             self._out[index] = self._counts[index]
             last = self._visit * self.visit_exposures + int(self._last[index])
-            missing = self._need - right - wrong
-            settled.append(Window(self._object, index * self.shots, last, self._out[index], missing, wrong))
+            exposures = right if self._adaptive else 0
+            settled.append(
+                Window(
+                    self._object,
+                    index * self.shots,
+                    last,
+                    self._out[index],
+                    need - right - wrong,
+                    wrong,
+                    exposures,
+                )
+            )
             self._next_window += 1
         return settled
 
 
+def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
+    """Return what the windows of `plan` need and, of an automaton, its walks; PlanError if they cannot be followed."""
+    automaton = plan.automaton
+    if automaton is None:
+        none = np.zeros((0, 2), np.uint32), np.zeros(0, np.int64)
+        return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, np.zeros(0, np.int64))
+    slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
+    if shots != 1 or automaton.successors.shape[1] != 2:
+        raise PlanError(
+            f"{shots} walks of {automaton.successors.shape[1]} outcomes per exposure make one decision; allowed: 1 of 2",
+            remedy="one walk is one decision: --shots 1, and --trials N for more of them",
+        )
+    if not automaton.n_slots <= slots <= n_features:
+        raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for clicks of {n_features}")
+    nodes, shown = np.zeros(len(last), np.int64), np.zeros(automaton.n_states, np.int64)
+    return Walks(automaton.successors, nodes, np.full(len(last), slots, np.int64), last, shown)
+
+
 def _visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Return, for each exposure of a visit, its pattern (-1: dark) and its window, both int32 (visit,)."""
+    """Return, for each exposure of a visit, its pattern or its slot in the walk (-1: dark) and its window, both int32 (visit,)."""
     pattern = plan.slot_pattern.astype(np.int32)
-    feature = np.where(pattern == DARK_PATTERN, -1, pattern)
+    adaptive = pattern == ADAPTIVE_PATTERN
+    feature = np.where(adaptive, np.cumsum(adaptive) - 1, np.where(pattern == DARK_PATTERN, -1, pattern))
     cycles = np.arange(plan.cycles_per_object, dtype=np.int64)[:, None]
     shot = cycles * plan.shots_per_cycle + plan.slot_shot.astype(np.int64)[None, :]
     window = np.where(feature[None, :] < 0, -1, shot // shots)

@@ -7,7 +7,9 @@ core/decision.py, the bytes are in docs/reference/formats.md.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,8 @@ from pans.runtime.container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
 FORMAT_VERSION = 3
-READABLE_VERSIONS = (2, 3)  # 2 has no ANSWERS
+WALKS_VERSION = 4  # of runs with an automaton: verdicts have exposures
+READABLE_VERSIONS = (2, 3, 4)  # 2 has no ANSWERS
 MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
 RUN_ROWS_MAX = 1 << 31
@@ -39,6 +42,12 @@ class Kind(IntEnum):
 
 LIMITS = {int(kind): 2 * MIB for kind in Kind} | {int(Kind.HEADER): 4 * MIB, int(Kind.BUNDLE): FILE_MAX_BYTES}
 _LIMITS_2 = {kind: limit for kind, limit in LIMITS.items() if kind != Kind.ANSWERS}
+
+
+def version_for(header: Mapping[str, Any]) -> int:
+    """Return the lowest format version that holds what a run with this `header` records."""
+    config = header.get("config")
+    return WALKS_VERSION if isinstance(config, Mapping) and config.get("drive") else FORMAT_VERSION
 
 
 def limits_of(version: int) -> dict[int, int]:

@@ -25,17 +25,18 @@ _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spre
 
 
 @njit(cache=True, nogil=True)
-def encode_rows(rows, state, keys, slots, runs, verdicts, codes):  # type: ignore[no-untyped-def]
+def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
     """Encode rows, DECISION_DTYPE (n,), behind those before; return how many runs and how many verdicts were written.
 
     state uint64 (N_STATE,), keys uint64 (LONG_VERDICT, 3) and slots uint16 (LONG_VERDICT: free) are the known verdicts;
-    runs RUN_DTYPE, verdicts VERDICT_DTYPE and codes uint16 have room for n.
+    runs RUN_DTYPE, verdicts VERDICT_DTYPE with `lengths` uint32 of walks, and codes uint16 have room for n.
     """
     n_runs, n_new = 0, 0
     # Columns are taken out of the rows once: a row at a time would count references for each.
     indices, ticks, exposures, objects = rows["index"], rows["tick"], rows["exposure_index"], rows["object"]
     shots, truths, labels, flags = rows["shot"], rows["truth"], rows["label"], rows["flags"]
     clicks, probabilities, checksums = rows["clicks"], rows["probability_bits"], rows["counts_crc"]
+    walked = rows["exposures"]
     count, truth, number = state[RUN_ROWS], state[TRUTH], state[OBJECT]
     index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
     tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
@@ -66,7 +67,7 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, codes):  # type: ignor
             tick, exposure, shot = tick + tick_step, exposure + exposure_step, shot + shot_step
         first = _U(clicks[i]) << _HALF_LEFT | _U(labels[i])
         second = _U(probabilities[i]) << _HALF_LEFT | _U(flags[i])
-        third = _U(checksums[i])
+        third = _U(walked[i]) << _HALF_LEFT | _U(checksums[i])
         at = _slot_of(first, second, third) & mask
         known = _U(slots[at])
         while known != _LONG and (keys[known, 2] != third or keys[known, 1] != second or keys[known, 0] != first):
@@ -77,6 +78,7 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, codes):  # type: ignor
             continue
         codes[i] = n_known  # the next number, while there is room: LONG_VERDICT afterwards
         _keep(rows[i], verdicts[n_new])
+        lengths[n_new] = walked[i]
         n_new += 1
         if n_known < _LONG:
             keys[n_known, 0], keys[n_known, 1], keys[n_known, 2] = first, second, third
@@ -139,6 +141,26 @@ def _keep(row, verdict):  # type: ignore[no-untyped-def]
     verdict["flags"] = row["flags"]
     verdict["probability_bits"] = row["probability_bits"]
     verdict["counts_crc"] = row["counts_crc"]
+
+
+@njit(cache=True, nogil=True)
+def message_spans(payload, at, spans):  # type: ignore[no-untyped-def]
+    """Find the bodies of a block of messages from byte `at` on; put where they begin and end into spans int64 (n, 2).
+
+    Return how many, and the place of the first that was not looked at: the end of the payload, where the spans are full, or a message that
+    reaches past its block.
+    """
+    n = 0
+    while n < spans.shape[0] and at + _MESSAGE_HEAD <= payload.size:
+        length = np.int64(0)
+        for i in range(4):
+            length |= np.int64(payload[at + 8 + i]) << 8 * i
+        if at + _MESSAGE_HEAD + length > payload.size:
+            break
+        spans[n, 0], spans[n, 1] = at + _MESSAGE_HEAD, at + _MESSAGE_HEAD + length
+        at += _MESSAGE_HEAD + length
+        n += 1
+    return n, at
 
 
 @njit(cache=True, nogil=True)

@@ -2,15 +2,18 @@
 
 Owns the form of DECISIONS blocks (docs/reference/formats.md). Never touches a file and never decides. Each different verdict stands once
 and is named by its number; what else a row holds goes up in equal steps, so that a run of decisions needs its first row and the steps:
-2 bytes for a decision of a fast, regular stream, not 52. Nothing is left out: the rows come back bit for bit. The hash does not depend
+2 bytes for a decision of a fast, regular stream, not 56. Nothing is left out: the rows come back bit for bit. The hash does not depend
 on how the rows were cut into blocks.
+
+The exposures of walks belong to the verdicts. They stand in an array of their own, which neither a block nor the hash has where all are
+0, as with fixed patterns.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,7 @@ from .format import LONG_VERDICT
 BLOCK_ROWS = 1 << 14  # of one block of ours: 1.2 MB when nothing repeats
 ROWS_MAX = 1 << 18  # of one block that is read, so that a small file cannot ask for much memory
 VERDICT_FIELDS = ("clicks", "label", "flags", "probability", "counts_crc")
+EXPOSURES_DTYPE = DECISION_DTYPE["exposures"]
 VERDICT_DTYPE = np.dtype([(name, DECISION_DTYPE[name]) for name in VERDICT_FIELDS])
 # The same layouts for the kernel, which compares probabilities by their bits.
 _ROW_BITS, _VERDICT_BITS = (
@@ -50,6 +54,15 @@ _HEAD = struct.Struct("<III")  # runs, verdicts, decisions
 _FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # for record_kernels.SLOTS_PER_VERDICT
 
 
+class _Parts(NamedTuple):
+    """What a block is made of; `exposures` (verdicts,) are those of their walks, 0 where the patterns are fixed."""
+
+    runs: NDArray[np.void]
+    verdicts: NDArray[np.void]
+    exposures: NDArray[np.uint32]
+    codes: NDArray[np.uint16]
+
+
 class LogEncoder:
     """Rows in, blocks and their hash out; all memory is allocated here, before arming."""
 
@@ -64,14 +77,16 @@ class LogEncoder:
         self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
         self._runs: NDArray[np.void] = np.zeros(BLOCK_ROWS, RUN_DTYPE)
         self._verdicts: NDArray[np.void] = np.zeros(BLOCK_ROWS, VERDICT_DTYPE)
+        self._exposures = np.zeros(BLOCK_ROWS, EXPOSURES_DTYPE)
         self._codes = np.zeros(BLOCK_ROWS, np.uint16)
         self._take(np.zeros(0, DECISION_DTYPE))  # compiles the kernel, or loads it
 
     def block(self, rows: NDArray[np.void]) -> bytes:
         """Take the next rows, DECISION_DTYPE (n,), n at most BLOCK_ROWS, and return the payload that holds them."""
-        runs, verdicts, codes = self._take(rows)
+        runs, verdicts, exposures, codes = self._take(rows)
         head = _HEAD.pack(len(runs), len(verdicts), len(codes))
-        return b"".join((head, runs.tobytes(), verdicts.tobytes(), codes.tobytes()))
+        walked = exposures.tobytes() if exposures.any() else b""
+        return b"".join((head, runs.tobytes(), verdicts.tobytes(), codes.tobytes(), walked))
 
     def update(self, rows: NDArray[np.void]) -> None:
         """Take the next rows, DECISION_DTYPE (n,), for their hash alone."""
@@ -82,13 +97,16 @@ class LogEncoder:
         """Return the SHA-256 (hex) of all rows so far."""
         return self._hash.hexdigest()
 
-    def _take(self, rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.uint16]]:
+    def _take(self, rows: NDArray[np.void]) -> _Parts:
         bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
+        verdicts = self._verdicts.view(_VERDICT_BITS)
         n_runs, n_verdicts = self._encode(
-            bits, self._state, self._keys, self._slots, self._runs, self._verdicts.view(_VERDICT_BITS), self._codes
+            bits, self._state, self._keys, self._slots, self._runs, verdicts, self._exposures, self._codes
         )
-        parts = self._runs[:n_runs], self._verdicts[:n_verdicts], self._codes[: len(rows)]
-        self._hash.update(*parts)
+        parts = _Parts(
+            self._runs[:n_runs], self._verdicts[:n_verdicts], self._exposures[:n_verdicts], self._codes[: len(rows)]
+        )
+        self._hash.update(parts)
         return parts
 
 
@@ -97,23 +115,27 @@ class LogReader:
 
     def __init__(self) -> None:
         self._known: NDArray[np.void] = np.zeros(LONG_VERDICT, VERDICT_DTYPE)
+        self._known_exposures = np.zeros(LONG_VERDICT, EXPOSURES_DTYPE)
         self._n_known = 0
         self._hash = _LogHash()
 
     def rows(self, payload: bytes, where: str) -> NDArray[np.void]:
         """Return the rows of the next block, DECISION_DTYPE (n,); DamagedFileError when its parts do not fit together."""
-        runs, verdicts, codes = _parts(payload, where)
+        parts = _parts(payload, where)
+        runs, verdicts, exposures, codes = parts
         long = codes == LONG_VERDICT
         n_new = len(verdicts) - int(long.sum())
         n_known = self._n_known + n_new
         if n_new < 0 or n_known > LONG_VERDICT or (codes[~long] >= n_known).any():
             raise DamagedFileError(f"{where}: its {len(verdicts)} verdicts do not fit its decisions")
         self._known[self._n_known : n_known] = verdicts[:n_new]
+        self._known_exposures[self._n_known : n_known] = exposures[:n_new]
         self._n_known = n_known
-        self._hash.update(runs, verdicts, codes)
-        found = self._known[np.where(long, 0, codes)]
-        found[long] = verdicts[n_new:]
-        return _expand(runs, found)
+        self._hash.update(parts)
+        numbers = np.where(long, 0, codes)
+        found, walked = self._known[numbers], self._known_exposures[numbers]
+        found[long], walked[long] = verdicts[n_new:], exposures[n_new:]
+        return _expand(runs, found, walked)
 
     def hexdigest(self) -> str:
         """Return the SHA-256 (hex) of all rows so far."""
@@ -128,16 +150,23 @@ def decision_log_sha256(records: NDArray[np.void]) -> str:
 
 
 class _LogHash:
-    """SHA-256 over the three hashes of verdicts, codes and whole runs; a run that goes on in the next block is hashed when it ends."""
+    """SHA-256 over the hashes of verdicts, codes and whole runs, and of exposures where there are any.
+
+    A run that goes on in the next block is hashed when it ends.
+    """
 
     def __init__(self) -> None:
         self._verdicts, self._codes, self._runs = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+        self._exposures, self._walks = hashlib.sha256(), False
         self._open: NDArray[np.void] = np.zeros(0, RUN_DTYPE)  # the last run, which may go on
 
-    def update(self, runs: NDArray[np.void], verdicts: NDArray[np.void], codes: NDArray[np.uint16]) -> None:
+    def update(self, parts: _Parts) -> None:
+        runs, verdicts, exposures, codes = parts
         if not len(runs):
             return
         self._verdicts.update(verdicts.tobytes())
+        self._exposures.update(exposures.tobytes())
+        self._walks = self._walks or bool(exposures.any())
         self._codes.update(codes.tobytes())
         start = 0
         if runs["continues"][0] and len(self._open):
@@ -153,18 +182,20 @@ class _LogHash:
     def hexdigest(self) -> str:
         runs = self._runs.copy()
         runs.update(self._open.tobytes())
-        return hashlib.sha256(self._verdicts.digest() + self._codes.digest() + runs.digest()).hexdigest()
+        walked = self._exposures.digest() if self._walks else b""
+        return hashlib.sha256(self._verdicts.digest() + self._codes.digest() + runs.digest() + walked).hexdigest()
 
 
-def _parts(payload: bytes, where: str) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.uint16]]:
-    """Runs, verdicts and codes of one block, checked as far as they stand alone."""
+def _parts(payload: bytes, where: str) -> _Parts:
+    """The parts of one block, checked as far as they stand alone."""
     if len(payload) < _HEAD.size:
         raise DamagedFileError(f"{where} has {len(payload)} bytes, allowed: {_HEAD.size} or more")
     n_runs, n_verdicts, n_rows = _HEAD.unpack_from(payload)
     verdicts_at = _HEAD.size + n_runs * RUN_DTYPE.itemsize
     codes_at = verdicts_at + n_verdicts * VERDICT_DTYPE.itemsize
     wanted = codes_at + 2 * n_rows
-    if len(payload) != wanted or n_rows > ROWS_MAX:
+    walked = len(payload) == wanted + EXPOSURES_DTYPE.itemsize * n_verdicts
+    if (len(payload) != wanted and not walked) or n_rows > ROWS_MAX:
         what = f"{n_runs} runs, {n_verdicts} verdicts and {n_rows} decisions"
         raise DamagedFileError(
             f"{where} has {len(payload)} bytes for {what}, allowed: {wanted}, and {ROWS_MAX} decisions at most"
@@ -173,15 +204,18 @@ def _parts(payload: bytes, where: str) -> tuple[NDArray[np.void], NDArray[np.voi
     counts, later = runs["count"].astype(np.int64), runs["continues"][1:]
     if int(counts.sum()) != n_rows or not counts.all() or later.any() or int(runs["continues"].max(initial=0)) > 1:
         raise DamagedFileError(f"{where}: its runs do not add up to its {n_rows} decisions")
-    return (
+    return _Parts(
         runs,
         np.frombuffer(payload, VERDICT_DTYPE, n_verdicts, verdicts_at),
+        np.frombuffer(payload, EXPOSURES_DTYPE, n_verdicts, wanted)
+        if walked
+        else np.zeros(n_verdicts, EXPOSURES_DTYPE),
         np.frombuffer(payload, "<u2", n_rows, codes_at),
     )
 
 
-def _expand(runs: NDArray[np.void], verdicts: NDArray[Any]) -> NDArray[np.void]:
-    """Rows from runs and one verdict each. What goes beyond a field counts on from 0 there, as the sums in the kernel do."""
+def _expand(runs: NDArray[np.void], verdicts: NDArray[Any], exposures: NDArray[np.uint32]) -> NDArray[np.void]:
+    """Rows from runs, a verdict and exposures each. What goes beyond a field counts on from 0 there, as the sums in the kernel do."""
     counts = runs["count"].astype(np.int64)
     n_rows = len(verdicts)
     run = np.repeat(np.arange(len(counts)), counts)
@@ -194,4 +228,5 @@ def _expand(runs: NDArray[np.void], verdicts: NDArray[Any]) -> NDArray[np.void]:
     rows["object"], rows["truth"] = firsts["object"], firsts["truth"]
     for name in VERDICT_FIELDS:
         rows[name] = verdicts[name]
+    rows["exposures"] = exposures
     return rows

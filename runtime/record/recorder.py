@@ -26,7 +26,7 @@ from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
 from .buffers import BUFFER_ROWS, ByteBuffer, RowBuffer
-from .format import FORMAT_VERSION, LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind
+from .format import LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind, version_for
 from .log import BLOCK_ROWS, LogEncoder
 
 _MESSAGE_BUFFER_BYTES = MIB // 4
@@ -65,14 +65,15 @@ class Recorder:
         pack_messages(self._messages.array, np.zeros((0, 2), np.int64), 0, 0, 0, self._messages.array, 0)
         self._n_decisions = 0
         self._n_blocks = 0
-        facts = {"format_version": FORMAT_VERSION, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
+        version = version_for(header)
+        facts = {"format_version": version, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
         facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
         text = canonical_json({**facts, **header})
         if not overwrite and os.path.lexists(self.path):
             raise refuse_existing(self.path)
         beside = beside_name(self.path)
         self._file = _create(beside, self.path)
-        start, self._chain = file_prologue(MAGIC, FORMAT_VERSION)
+        start, self._chain = file_prologue(MAGIC, version)
         self._end = 0
         try:
             self._write(start)

@@ -29,9 +29,12 @@ from pans.runtime.container import (
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.timing.clock import CLOCK_DTYPE
+from pans.runtime.wire.frame import Messages
 
 from .format import MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind, limits_of
 from .log import LogReader
+
+MESSAGES_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +125,19 @@ class Recording:
             file.seek(begin)
             return read_bundle(file, size, f"{self.path}: the bundle inside")[0]
 
+    def iter_messages(self) -> Iterator[Messages]:
+        """Yield the device's messages in order, many at once: bodies in one block of the file, valid until the next ones."""
+        from .kernels import message_spans  # numba is loaded only by who replays
+
+        spans = np.zeros((MESSAGES_AT_ONCE, 2), np.int64)
+        for block in self.iter_blocks(Kind.MESSAGES):
+            payload, at = np.frombuffer(block.payload, np.uint8), 0
+            while at < len(payload):
+                count, at = message_spans(payload, at, spans)
+                if not count:
+                    raise _past_block(self.path, block)
+                yield Messages(payload, spans[:count])
+
     def _pairs(self, kind: Kind) -> Iterator[tuple[int, bytes]]:
         for block in self.iter_blocks(kind):
             position, payload = 0, block.payload
@@ -129,7 +145,7 @@ class Recording:
                 start = position + MESSAGE.size
                 host_ns, length = MESSAGE.unpack_from(payload, position) if start <= len(payload) else (0, len(payload))
                 if start + length > len(payload):
-                    raise DamagedFileError(f"{self.path}: block {block.index}: a message reaches past its block")
+                    raise _past_block(self.path, block)
                 yield host_ns, payload[start : start + length]
                 position = start + length
 
@@ -139,6 +155,10 @@ class Recording:
 
     def _iter_rows(self, kind: Kind, dtype: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
         return (np.frombuffer(_whole_rows(block, dtype, self.path), dtype=dtype) for block in self.iter_blocks(kind))
+
+
+def _past_block(path: Path, block: Block) -> DamagedFileError:
+    return DamagedFileError(f"{path}: block {block.index}: a message reaches past its block")
 
 
 def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:

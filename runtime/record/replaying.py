@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.dark_guard import recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.follower import Follower, Place
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
@@ -34,7 +34,7 @@ from .log import LogEncoder
 from .parts import place_of
 from .pictures import PictureLog
 from .recording import Recording
-from .sent_plan import TICK_HZ, never_armed, sent_plan
+from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device
 
 SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
@@ -81,8 +81,8 @@ class _Log:
         self._encoder = LogEncoder()
         self.take([])
 
-    def take(self, decisions: list[Any]) -> None:
-        rows = np.array(decisions, DECISION_DTYPE)
+    def take(self, decisions: list[Any] | NDArray[np.void]) -> None:
+        rows = np.asarray(decisions, DECISION_DTYPE)
         here = self._n_recorded - self.decisions  # rows up to the last recorded one
         if 0 <= here <= len(rows) and not self.sha256_as_far:
             self._encoder.update(rows[:here])
@@ -91,7 +91,7 @@ class _Log:
         else:
             self._encoder.update(rows)
         self.decisions += len(rows)
-        if self._pictures is not None:
+        if self._pictures is not None and isinstance(decisions, list):
             self._pictures.note(decisions)
 
     def sha256(self) -> str:
@@ -111,9 +111,11 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
 
 def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, _Log]:
     """Drive a core through `recording`; return it and the log of its decisions."""
-    core, arms = _rebuilt(recording, bundle, pictures)
+    core, steps, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
-    for decisions in _decisions(core, arms, recording):
+    arms = list(sent.arms.items())
+    found = _decisions(core, arms, recording) if steps is None else _bulk_decisions(steps, arms, recording)
+    for decisions in found:
         log.take(decisions)
     went_on = "part_ended" in recording.summary  # in the next part
     was_cut = not recording.complete and log.decisions >= recording.n_decisions  # the run did not end there
@@ -124,17 +126,23 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None)
 
 def _rebuilt(
     recording: Recording, bundle: Bundle, pictures: PictureLog | None
-) -> tuple[Core | FlowCore, list[tuple[int, Arm]]]:
-    """Return the core of the run and its ARM commands; DamagedFileError if the header or the commands do not tell."""
+) -> tuple[Core | FlowCore, BulkSteps | None, Sent]:
+    """Return the core of the run, its compiled steps where they give all that is asked for, and what the device was sent.
+
+    DamagedFileError if the header or the commands do not tell.
+    """
     try:
         config = recording.header["config"]
-        chunks, arms = sent_plan(recording)
+        sent = sent_to_device(recording)
         tick_hz, shots = TICK_HZ.checked(config["tick_hz"], "tick_hz"), SHOTS.checked(config["shots"], "shots")
-        plan = plan_from_chunks(chunks, tick_hz)
-        decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")))
+        automaton, confidence = automaton_of(config, bundle), float(config.get("confidence", 0.0))
+        decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")), confidence=confidence)
+        plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton))
         if pictures is not None:
             decider = pictures.over(decider)
-        return _core(config, plan, decider, bundle, shots, arms[0][1].n_cycles), arms
+        core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)
+        in_bulk = pictures is None and isinstance(core, Core) and (core.guard is None or core.guard.policy == "warn")
+        return core, BulkSteps(core, plan, decider, shots) if in_bulk and isinstance(core, Core) else None, sent
     except _NOT_REBUILT as error:
         raise DamagedFileError(
             f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"
@@ -149,11 +157,11 @@ def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
     if not {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys() or never_armed(recording):
         return []
     try:
-        _, arms = _rebuilt(recording, bundle, None)
+        _, _, sent = _rebuilt(recording, bundle, None)
         place = place_of(recording)
         if place is not None:
             Place.of(place)
-        later, session = iter(arms), 0
+        later, session = iter(sent.arms.items()), 0
         for _, body in recording.messages():
             frame = unpack_body(body)
             while frame.session != session:
@@ -180,32 +188,67 @@ def _core(
     return core
 
 
-def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
-    """Drive `core` as the live loop did: each ARM begins a stream, which has the session of its frames; a later part goes on in one."""
-    following = iter(arms)
-    session, place = 0, place_of(recording)
+class _Streams:
+    """The streams of a run in their order: each ARM begins one, which has the session of its frames; a later part goes on in one."""
 
-    def begin_next() -> list[Any]:
-        nonlocal session, place
-        session, arm = next(following)
-        output = core.begin(arm.start_tick, arm.n_cycles)
-        if place is not None:
-            core.resume(Place.of(place))
-            place = None
+    def __init__(self, core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> None:
+        self.session = 0
+        self._core, self._following = core, iter(arms)
+        self._place, self._path = place_of(recording), recording.path
+
+    def begin_up_to(self, session: int) -> list[Any]:
+        """Begin streams until that of `session`, and return the decisions; DamagedFileError if there is none."""
+        decisions: list[Any] = []
+        while session != self.session:
+            if (begun := self._begin_next()) is None:
+                raise DamagedFileError(f"{self._path}: a message of a session that never armed the device")
+            decisions += begun
+        return decisions
+
+    def begin_rest(self) -> Iterator[list[Any]]:
+        """Begin the streams that gave no message at all, and yield the decisions."""
+        while (begun := self._begin_next()) is not None:
+            yield begun
+
+    def _begin_next(self) -> list[Any] | None:
+        self.session, arm = next(self._following, (0, None))
+        if arm is None:
+            return None
+        output = self._core.begin(arm.start_tick, arm.n_cycles)
+        if self._place is not None:
+            self._core.resume(Place.of(self._place))
+            self._place = None
         return output.decisions
 
+
+def _decisions(core: Follower, arms: list[tuple[int, Arm]], recording: Recording) -> Iterator[list[Any]]:
+    """Drive `core` as the live loop did, message by message."""
+    streams = _Streams(core, arms, recording)
     for _, body in recording.messages():
         frame = unpack_body(body)
-        while frame.session != session:
-            try:
-                yield begin_next()
-            except StopIteration:
-                raise DamagedFileError(
-                    f"{recording.path}: a message of a session that never armed the device"
-                ) from None
+        if frame.session != streams.session:
+            yield streams.begin_up_to(frame.session)
         yield core.step(frame).decisions
-    for _ in range(len(arms)):  # streams that gave no message at all
-        try:
-            yield begin_next()
-        except StopIteration:
-            break
+    yield from streams.begin_rest()
+
+
+def _bulk_decisions(
+    steps: BulkSteps, arms: list[tuple[int, Arm]], recording: Recording
+) -> Iterator[list[Any] | NDArray[np.void]]:
+    """Drive the core of `steps` as the live loop did, many messages at once; rows are valid until the next ones."""
+    streams = _Streams(steps.core, arms, recording)
+    for messages in recording.iter_messages():
+        place = 0
+        while place < len(messages.spans):
+            place, rows, odd = steps.take(messages, place)
+            yield rows
+            if not odd:
+                continue
+            frame = messages.frame(place)
+            if frame.session != streams.session:
+                yield streams.begin_up_to(frame.session)
+                steps.begin(frame.session)
+            else:
+                place += 1
+                yield steps.step(frame).decisions
+    yield from streams.begin_rest()

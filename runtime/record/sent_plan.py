@@ -5,12 +5,27 @@ Owns the way back from recorded commands; a plan's own form is core/plan_codec.p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pans.runtime.bundle.automaton import Automaton, stopped
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_from_chunks
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range
+from pans.runtime.wire.automata import StateChunk, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
-from pans.runtime.wire.messages import FrameDecoder, MalformedMessage, MessageType, Opcode, decode_command
+from pans.runtime.wire.messages import (
+    CommandMessage,
+    Frame,
+    FrameDecoder,
+    MalformedMessage,
+    MessageType,
+    Opcode,
+    decode_command,
+)
 
 from .recording import Recording
 
@@ -29,30 +44,73 @@ def never_armed(recording: Recording) -> bool:
     )
 
 
-def sent_plan(recording: Recording) -> tuple[list[PlanChunk], list[tuple[int, Arm]]]:
-    """Return the plan and the ARM commands with their sessions, as they were sent to the device (repetitions left out)."""
-    decoder = FrameDecoder()
-    chunks: dict[int, PlanChunk] = {}
-    arms: dict[int, Arm] = {}
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What a device was sent: plan, states of an automaton, what each state named by the host showed, and ARM by session."""
+
+    chunks: dict[int, PlanChunk] = field(default_factory=dict)  # by first slot
+    states: dict[int, StateChunk] = field(default_factory=dict)  # by first state
+    shown: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # state: pattern, dwell, dwell steps
+    arms: dict[int, Arm] = field(default_factory=dict)
+
+    def plan(self, tick_hz: int, automaton: Automaton | None) -> Plan:
+        """Return the plan, which ran `automaton`; MalformedMessage when it is not whole, or another one was sent."""
+        chunks = [self.chunks[first] for first in sorted(self.chunks)]
+        plan = plan_from_chunks(chunks, tick_hz, automaton, [self.states[first] for first in sorted(self.states)])
+        for state, shown in self.shown.items():
+            if automaton is None or state >= automaton.n_states:
+                raise MalformedMessage(f"state {state} was shown, which the automaton does not have")
+            known = (int(automaton.pattern[state]), int(automaton.dwell[state]), automaton.dwell_steps)
+            if shown != known:
+                raise MalformedMessage(f"state {state} was shown as {shown} (pattern, dwell, steps), it is {known}")
+        return plan
+
+    def take(self, frame: Frame, command: CommandMessage) -> None:
+        """Take one command; MalformedMessage when it cannot be read, or a state was shown in two ways."""
+        if command.opcode == Opcode.LOAD_PLAN:
+            chunk = unpack_plan(command.body)
+            self.chunks[chunk.first_slot] = chunk
+        elif command.opcode == Opcode.LOAD_STATES:
+            states = unpack_states(command.body)
+            self.states[states.first_state] = states
+        elif command.opcode == Opcode.SHOW:
+            show = unpack_show(command.body)
+            seen = (show.pattern, show.dwell, show.dwell_steps)
+            if self.shown.setdefault(show.state, seen) != seen:
+                raise MalformedMessage(f"state {show.state} was shown in two ways")
+        elif command.opcode == Opcode.ARM:
+            self.arms[frame.session] = unpack_arm(command.body)
+
+
+def sent_to_device(recording: Recording) -> Sent:
+    """Return what was sent to the device (repetitions left out); MalformedMessage if it was never armed."""
+    decoder, sent = FrameDecoder(), Sent()
     for _, data in recording.commands():
         for frame in decoder.feed(data):
-            if frame.type != MessageType.COMMAND:
-                continue
-            command = decode_command(frame.payload)
-            if command.opcode == Opcode.LOAD_PLAN:
-                chunk = unpack_plan(command.body)
-                chunks[chunk.first_slot] = chunk
-            elif command.opcode == Opcode.ARM:
-                arms[frame.session] = unpack_arm(command.body)
-    if not arms:
+            if frame.type == MessageType.COMMAND:
+                sent.take(frame, decode_command(frame.payload))
+    if not sent.arms:
         raise MalformedMessage("the device was never armed")
-    return [chunks[first] for first in sorted(chunks)], list(arms.items())
+    return sent
+
+
+def automaton_of(config: Mapping[str, Any], bundle: Bundle | None) -> Automaton | None:
+    """Return the automaton that a run with this `config` followed, None of fixed patterns; KeyError or ValueError if it does not tell."""
+    if not config.get("drive"):
+        return None
+    automaton = None if bundle is None else bundle.automaton
+    if automaton is None:
+        raise ValueError("the run followed an automaton, which is not in the recording")
+    confidence = float(config["confidence"])
+    return stopped(automaton, confidence) if confidence else automaton
 
 
 def recorded_plan(recording: Recording) -> Plan:
     """Return the plan that the device was sent; DamagedFileError if the recording does not hold it whole."""
     try:
-        chunks, _ = sent_plan(recording)
-        return plan_from_chunks(chunks, TICK_HZ.checked(recording.header["config"]["tick_hz"], "tick_hz"))
-    except (KeyError, TypeError, ValueError, MalformedMessage) as error:
+        config = recording.header["config"]
+        bundle = recording.bundle() if recording.bundle_data() else None
+        sent, automaton = sent_to_device(recording), automaton_of(config, bundle)
+        return sent.plan(TICK_HZ.checked(config["tick_hz"], "tick_hz"), automaton)
+    except (KeyError, TypeError, ValueError, AttributeError, MalformedMessage) as error:
         raise DamagedFileError(f"{recording.path}: its plan cannot be rebuilt: {error}") from error

@@ -1,4 +1,4 @@
-"""What compiled walks through a stream ask of decoded FRAMES and MARK messages: what they hold, and whether they come next.
+"""What compiled walks through a stream ask of decoded CLICKS, FRAMES and MARK messages: what they hold, and whether they come next.
 
 Owns the offsets of these messages (docs/reference/protocol.md) and the account of the stream's place for kernels; never allocates and
 keeps no state of its own. A walk takes messages that are in order and without loss and leaves all others to `StreamTracker`.
@@ -16,7 +16,7 @@ from .tracker import MAX_GAP_EXPOSURES
 # Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
 # and what the walk has taken.
 NEXT_SEQ, NEXT_EXPOSURE, DROPS, END_EXPOSURE, MESSAGES, EXPOSURES, N_PLACE = range(7)
-FRAMES, MARK = int(MessageType.FRAMES), int(MessageType.MARK)
+CLICKS, FRAMES, MARK = int(MessageType.CLICKS), int(MessageType.FRAMES), int(MessageType.MARK)
 BODY_HEADER, BLOCK_HEADER, MARK_BYTES = HEADER.size, BLOCK_HEADER_BYTES, STRUCTS["MARK"].size
 LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Python's integers
 _INFINITE = np.uint64(0x7F800000)  # float32's bits: numbers from 0 on lie below, NaN above once the sign is taken away
@@ -34,17 +34,44 @@ def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
         return 0, 0
     shape = load4(buffer, payload + _U(28))
     count, width = np.int64(shape & _U(0xFFFF)), np.int64(shape >> _U(16))
-    if (
-        np.int64(stop - payload) != BLOCK_HEADER + count * width
-        or load4(buffer, payload) != _U(place[NEXT_SEQ])
+    if np.int64(stop - payload) != BLOCK_HEADER + count * width or not _follows(buffer, payload, count, place):
+        return 0, 0
+    return count, width
+
+
+@njit(cache=True, nogil=True)
+def next_clicks(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
+    """Exposures of the CLICKS payload from `payload` to `stop`; 0 where `next_block` would say so."""
+    if stop - payload <= _U(BLOCK_HEADER):
+        return 0
+    count = np.int64(load4(buffer, payload + _U(28)) & _U(0xFFFF))
+    length = BLOCK_HEADER + 2 * count + (count + 7) // 8
+    if np.int64(stop - payload) != length or not _follows(buffer, payload, count, place):
+        return 0
+    return count
+
+
+@njit(cache=True, nogil=True)
+def unpack_clicks(buffer, payload, count, stamps, bits):  # type: ignore[no-untyped-def]
+    """Put the patterns shown and the clicks of a CLICKS payload of `count` exposures into uint16 and uint8 (count or more,)."""
+    at = payload + _U(BLOCK_HEADER)
+    first_byte = at + _U(2 * count)
+    for i in range(count):
+        stamps[i] = np.uint16(buffer[at + _U(2 * i)]) | np.uint16(buffer[at + _U(2 * i + 1)]) << np.uint16(8)
+        bits[i] = buffer[first_byte + _U(i >> 3)] >> np.uint8(i & 7) & np.uint8(1)
+
+
+@njit(cache=True, nogil=True)
+def _follows(buffer, payload, count, place):  # type: ignore[no-untyped-def]
+    """Whether a block of `count` exposures is the next one, without loss, within the plan and the range of its fields."""
+    return not (
+        load4(buffer, payload) != _U(place[NEXT_SEQ])
         or load4(buffer, payload + _U(4)) != _U(place[DROPS])
         or load8(buffer, payload + _U(8)) >= LARGEST
         or load8(buffer, payload + _U(16)) != _U(place[NEXT_EXPOSURE])
         or load4(buffer, payload + _U(24)) == _U(0)
         or place[NEXT_EXPOSURE] + count > place[END_EXPOSURE]
-    ):
-        return 0, 0
-    return count, width
+    )
 
 
 @njit(cache=True, nogil=True)

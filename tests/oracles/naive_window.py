@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pans.runtime.core.plan import Plan
+from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
 from pans.runtime.wire.messages import DARK_PATTERN
 
 
@@ -29,3 +29,42 @@ def count_visits(
         else:
             found[visit, window] = (counts, right, wrong + 1)
     return {key: (counts, shots * n_features - right - wrong, wrong) for key, (counts, right, wrong) in found.items()}
+
+
+def follow_walk(plan: Plan, cycle: int, exposures: dict[int, tuple[int, int]]) -> dict[str, Any]:
+    """Return what became of the walk in one cycle of an automaton's plan, from {exposure: (stamped state, bit)} of the run.
+
+    `fate` is "whole", "lost" (an exposure of the walk never came) or "wrong" (one was stamped otherwise); `clicks` are those before that,
+    `states` the states that were shown, `last` the exposure at which the fate of a whole walk was settled, `dark` the clicks of what stood
+    in the dark, and `strange` how many exposures that should have been dark, or another state, were not; `late` of them stayed dark.
+    """
+    automaton = plan.automaton
+    assert automaton is not None
+    clicks = [0] * int((plan.slot_pattern == ADAPTIVE_PATTERN).sum())
+    found: dict[str, Any] = {"fate": "", "clicks": clicks, "states": [], "last": 0, "dark": [], "strange": 0, "late": 0}
+    node, step = 0, 0
+    for slot, planned in enumerate(plan.slot_pattern.tolist()):
+        exposure = cycle * plan.slots_per_cycle + slot
+        here = exposures.get(exposure)
+        walking = planned == ADAPTIVE_PATTERN and not found["fate"]
+        if walking:
+            step += 1
+        if here is None:
+            found["fate"] = found["fate"] or ("lost" if walking else "")
+            continue
+        stamp, bit = here
+        if walking and stamp == node:
+            clicks[step - 1] = bit
+            found["states"].append(node)
+            node = int(automaton.successors[node][bit])
+            if node >= automaton.n_states:
+                found["fate"], found["last"], found["leaf"] = "whole", exposure, node - automaton.n_states
+        elif walking:
+            found["fate"] = "wrong"
+            found["strange"] += 1
+            found["late"] += stamp == DARK_PATTERN
+        elif stamp == DARK_PATTERN:
+            found["dark"].append(bit)
+        elif planned == DARK_PATTERN or found["fate"] == "whole":
+            found["strange"] += 1
+    return found

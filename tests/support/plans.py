@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from pans.runtime.core.plan import NO_SHOT, Plan
+from pans.runtime.bundle import Automaton
+from pans.runtime.core.plan import ADAPTIVE_PATTERN, NO_SHOT, Plan
 from pans.runtime.wire.messages import DARK_PATTERN
 
 
@@ -43,3 +46,35 @@ def _plan(
         block_exposures=4,
         exposure_us=60.0,
     )
+
+
+def walk_plan(automaton: Automaton, walks: int, dark: int = 1, drive: str = "device") -> Plan:
+    """`walks` cycles per object, each of `dark` dark slots, one of them in the middle of the walk, and the walk's."""
+    patterns = [ADAPTIVE_PATTERN] * automaton.n_slots
+    for place in ([0, automaton.n_slots // 2, 0])[:dark]:
+        patterns.insert(place, DARK_PATTERN)
+    slots = np.array(patterns, np.uint16)
+    return replace(
+        shot_major(len(patterns), walks, dark_first=False),
+        n_patterns=4,
+        slot_pattern=slots,
+        slot_shot=np.where(slots == DARK_PATTERN, NO_SHOT, 0).astype(np.uint16),
+        slot_offset_ticks=np.arange(len(slots), dtype=np.int64) * 100,
+        cycle_ticks=100 * len(slots),
+        automaton=automaton,
+        drive=drive,
+    )
+
+
+def walked(plan: Plan, n_cycles: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """(stamp, click) of every exposure of `n_cycles` cycles, as a device without a fault reports them."""
+    automaton = plan.automaton
+    assert automaton is not None
+    found = []
+    for _ in range(n_cycles):
+        node = 0
+        for planned in plan.slot_pattern.tolist():
+            bit, lit = int(rng.integers(2)), planned == ADAPTIVE_PATTERN and node < automaton.n_states
+            found.append((node if lit else DARK_PATTERN, bit))
+            node = int(automaton.successors[node][bit]) if lit else node
+    return found

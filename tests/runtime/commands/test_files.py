@@ -34,7 +34,7 @@ def toy_bundle(**changes: Any) -> Bundle:
 def decision(index: int, **changes: Any) -> tuple[Any, ...]:
     row = {
         **{"index": index, "tick": 10 * index, "exposure_index": index, "object": index, "shot": 0, "clicks": 1},
-        **{"label": 1, "truth": 1, "flags": 0, "probability": 0.75, "counts_crc": 0},
+        **{"label": 1, "truth": 1, "flags": 0, "probability": 0.75, "counts_crc": 0, "exposures": 0},
     }
     return tuple((row | changes).values())
 

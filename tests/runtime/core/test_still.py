@@ -59,7 +59,7 @@ def test_decisions_carry_what_the_log_needs() -> None:
     output = core.step(cycle(1, 0, [1, 1, 0, 1]))
     assert output.block_end_tick == 1000 + 300 + 60
     (decision,) = output.decisions
-    assert decision._replace(counts_crc=0) == (0, 1360, 3, 0, 0, 2, 2, 2, 0, 0.5, 0)
+    assert decision._replace(counts_crc=0) == (0, 1360, 3, 0, 0, 2, 2, 2, 0, 0.5, 0, 0)
     assert decider.asked == [[1, 0, 1]]
     assert np.array([decision], DECISION_DTYPE)["label"][0] == 2
     assert core.marks[0].photons == 4.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,20 +10,18 @@ import pytest
 from heads import head_bundle, random_layers
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plans import parallel, shot_major
+from plans import parallel
+from streams import SESSION, compare, spoilt
 
 from pans.runtime.core import stream
-from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, DecisionFlag
-from pans.runtime.core.still import Core
-from pans.runtime.core.stream import StreamCore, count_crc_tables
+from pans.runtime.core.bulk_steps import count_crc_tables
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
-from pans.runtime.errors import UsageError
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
 
-SESSION = 7
 _DECIDERS: dict[tuple[int, int, str], Any] = {}
 
 
@@ -59,47 +56,6 @@ def frames(plan: Any, n_features: int, n_visits: int, rng: np.random.Generator, 
     return [*sent, wire.encode_status(end, SESSION), wire.encode_status(end, SESSION)]
 
 
-def by_core(
-    plan: Any, decider: Any, shots: int, pieces: list[bytes]
-) -> tuple[np.ndarray, list[Any], Core, FrameDecoder]:
-    core, decoder = Core(plan, decider, shots, 0), FrameDecoder()
-    rows: list[Any] = []
-    events: list[Any] = []
-    for piece in pieces:
-        for frame in decoder.feed(piece):
-            if frame.session == SESSION and frame.type in (0x84, 0x90, 0x91, 0x92):
-                output = core.step(frame)
-                rows += output.decisions
-                events += output.events
-    return np.array([tuple(row) for row in rows], DECISION_DTYPE), events, core, decoder
-
-
-def by_stream(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> tuple[np.ndarray, list[Any], StreamCore]:
-    streamed = StreamCore(plan, decider, shots, 0, SESSION)
-    rows, events = [np.zeros(0, DECISION_DTYPE)], []
-    for piece in pieces:
-        for batch in streamed.feed(piece):
-            rows.append(batch.rows.copy())
-            events += batch.events
-    return np.concatenate(rows), events, streamed
-
-
-def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndarray:
-    expected, expected_events, core, decoder = by_core(plan, decider, shots, pieces)
-    rows, events, streamed = by_stream(plan, decider, shots, pieces)
-    for name in DECISION_DTYPE.names or ():
-        assert rows[name].tolist() == expected[name].tolist(), name
-    assert events == expected_events
-    assert asdict(streamed.core.tracker.counters) == asdict(core.tracker.counters)
-    assert asdict(streamed.decoder.counters) == asdict(decoder.counters)
-    assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
-    for name in ("n_decisions", "n_abstained", "completed", "last_tick"):
-        assert getattr(streamed.core, name) == getattr(core, name), name
-    assert streamed.core.tracker.position == core.tracker.position
-    assert streamed.core.windows.position == core.windows.position
-    return rows
-
-
 @pytest.mark.uncompiled("10-1-4-table", "11-2-3-sparse")
 @pytest.mark.parametrize(("n_features", "shots", "n_windows", "backend"), CASES)
 def test_a_clean_stream(n_features: int, shots: int, n_windows: int, backend: str) -> None:
@@ -119,30 +75,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
     plan, decider = parallel(n_features, shots * n_windows), decider_for(n_features, shots, backend)
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
     clean = frames(plan, n_features, 6, rng, int(rng.integers(1, 9)))
-    foreign = [
-        wire.encode_ping(1, 5, SESSION),
-        wire.encode_mark(Mark(0, 1, 2, 0, 0, 1.0), SESSION + 1),
-        wire.encode_frame(MessageType.FRAMES, bytes(40), SESSION),
-        wire.encode_frame(MessageType.MARK, bytes(5), SESSION),
-        wire.encode_frames(FrameBlock(3, 0, 0, 2**63, 1, 0, np.ones((2, 1), np.uint8)), SESSION),
-        wire.encode_frames(FrameBlock(4, 2, 2**63, 0, 1, 0, np.ones((50, 8), np.uint8)), SESSION),
-    ]
-    sent: list[bytes] = []
-    for message in clean:
-        fate = data.draw(st.sampled_from(["arrives"] * 6 + ["lost", "damaged", "twice", "foreign", "held"]))
-        if fate == "damaged":
-            spoilt = bytearray(message)
-            spoilt[int(rng.integers(len(spoilt)))] ^= 1 << int(rng.integers(8))
-            message = bytes(spoilt)
-        if fate == "foreign":
-            sent.append(foreign[int(rng.integers(len(foreign)))])
-        if fate != "lost":
-            sent += [message] * (2 if fate == "twice" else 1)
-        if fate == "held" and len(sent) > 1:
-            sent[-1], sent[-2] = sent[-2], sent[-1]
-    whole = b"".join(sent)
-    at = sorted(rng.integers(0, len(whole) + 1, int(rng.integers(0, 6))).tolist())
-    compare(plan, decider, shots, [whole[a:b] for a, b in zip([0, *at], [*at, len(whole)])])
+    compare(plan, decider, shots, spoilt(data, clean, rng))
 
 
 @pytest.mark.uncompiled
@@ -223,8 +156,3 @@ def test_the_checksum_of_counts_from_tables(n_features: int, shots: int) -> None
             for feature, count in enumerate(counts.tolist()):
                 crc ^= int(table[byte, feature, (count >> 8 * byte) & 0xFF])
         assert crc == zlib.crc32(counts.astype("<i8").tobytes())
-
-
-def test_sequential_plans_are_refused() -> None:
-    with pytest.raises(UsageError, match="parallel"):
-        StreamCore(shot_major(3, 1), decider_for(3, 1, "table"), 1, 0, SESSION)

@@ -67,7 +67,7 @@ def test_a_refusal_that_ends_the_set_up_is_on_record(tmp_path: Path, capsys: pyt
 
 
 def test_recordings_from_before_the_answers_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.record.recorder.FORMAT_VERSION", 2)
+    monkeypatch.setattr("pans.runtime.record.format.FORMAT_VERSION", 2)
     with pytest.MonkeyPatch.context() as without:
         without.setattr(Recorder, "add_answer", lambda *_: None)
         recording = read_recording(record(tmp_path / "old.pansrec"))

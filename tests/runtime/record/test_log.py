@@ -24,15 +24,17 @@ from pans.runtime.record.log import RUN_DTYPE, VERDICT_DTYPE, LogEncoder, LogRea
 def naive_sha256(rows: np.ndarray) -> str:
     """The hash in plain words: verdicts in the order in which they appear, a code for each row, and runs as long as they can be."""
     known: dict[bytes, int] = {}
-    verdicts, codes = b"", b""
+    verdicts, codes, exposures = b"", b"", b""
     runs: list[list[int]] = []  # first row, count, steps of tick, exposure and shot
     for row in rows:
         verdict = b"".join(row[name].tobytes() for name in record_log.VERDICT_FIELDS)
-        if verdict not in known:
+        walked = row["exposures"].tobytes()
+        if verdict + walked not in known:
             verdicts += verdict
+            exposures += walked
             if len(known) < LONG_VERDICT:
-                known[verdict] = len(known)
-        codes += struct.pack("<H", known.get(verdict, LONG_VERDICT))
+                known[verdict + walked] = len(known)
+        codes += struct.pack("<H", known.get(verdict + walked, LONG_VERDICT))
         values = [int(row[name]) for name in ("index", "object", "truth", "tick", "exposure_index", "shot")]
         if runs and continues(runs[-1], values):
             runs[-1][1] += 1
@@ -41,7 +43,8 @@ def naive_sha256(rows: np.ndarray) -> str:
     packed = b"".join(
         struct.pack("<QQQIIIIIIhH", v[0], v[3], v[4], v[1], v[5], count, *steps, v[2], 0) for v, count, steps in runs
     )
-    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in (verdicts, codes, packed))).hexdigest()
+    parts = (verdicts, codes, packed, *([exposures] if any(exposures) else []))
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
 def continues(run: list[Any], values: list[int]) -> bool:
@@ -65,6 +68,7 @@ small = st.integers(0, 3)
 def logs(draw: st.DrawFn) -> np.ndarray:
     """Rows that go on regularly, break off, stand still, jump back and overflow."""
     rows: list[tuple[Any, ...]] = []
+    walks = draw(st.booleans())
     for _ in range(draw(st.integers(1, 6))):
         index, tick, exposure = draw(edges), draw(edges), draw(edges)
         number, shot, truth = draw(small), draw(st.sampled_from([0, 5, 2**32 - 3])), draw(st.integers(-1, 1))
@@ -84,6 +88,7 @@ def logs(draw: st.DrawFn) -> np.ndarray:
                     0,
                     probability,
                     7 * label,
+                    draw(st.sampled_from([0, 1, 2**32 - 1])) if walks else 0,
                 )
             )
     return np.array(rows, DECISION_DTYPE)
@@ -161,9 +166,26 @@ def test_blocks_whose_parts_do_not_fit_are_refused(payload: bytes, reason: str) 
         LogReader().rows(payload, "block 3")
 
 
-@pytest.mark.parametrize("version", [1, 4])
+def test_exposures_of_walks_stand_in_a_recording_of_their_version_and_cost_others_nothing(tmp_path: Path) -> None:
+    rows = regular(5000, 100)
+    plain = decision_log_sha256(rows)
+    assert (
+        plain == "63f7ea273cb08c6019f7e672c69d2521231946b9d7a9fd99fd01fbf880fbfda0"
+    )  # of before there were exposures: it must not change
+    rows["exposures"] = 1 + rows["counts_crc"] % 28
+    for name, config, version in (("fixed", {}, 3), ("walks", {"drive": "device"}, 4)):
+        with Recorder(tmp_path / name, {"config": config}) as recorder:
+            recorder.add_decisions(rows)
+            recorder.close({})
+        found = read_recording(tmp_path / name)
+        assert found.version == version
+        assert found.decisions().tobytes() == rows.tobytes()
+        assert found.decisions_sha256 == decision_log_sha256(rows) != plain
+
+
+@pytest.mark.parametrize("version", [1, 5])
 def test_a_recording_of_another_version_is_refused(tmp_path: Path, version: int) -> None:
     start = b"PANSRECD" + struct.pack("<I", version)
     (tmp_path / "a.pansrec").write_bytes(start + struct.pack("<I", zlib.crc32(start)))
-    with pytest.raises(DamagedFileError, match=f"format version {version}, allowed: 2, 3"):
+    with pytest.raises(DamagedFileError, match=f"format version {version}, allowed: 2, 3, 4"):
         read_recording(tmp_path / "a.pansrec")

@@ -28,7 +28,7 @@ HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed":
 
 
 def decision(index: int) -> tuple[Any, ...]:
-    return (index, 1000 * index, 9 * index + 8, index, 0, 4, index % 3, -1, 0, 0.5, 12345)
+    return (index, 1000 * index, 9 * index + 8, index, 0, 4, index % 3, -1, 0, 0.5, 12345, 0)
 
 
 def write_recording(path: Path, decisions: int = 5, bundle: bytes = b"") -> str:
@@ -116,7 +116,7 @@ def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:
 
 
 def test_rows_are_packed_as_documented() -> None:
-    assert DECISION_DTYPE.itemsize == 52
+    assert DECISION_DTYPE.itemsize == 56
     assert TIMING_DTYPE.itemsize == 40
     flags = [int(flag) for flag in DecisionFlag]
     assert flags == [1, 2, 4, 8, 16, 32, 64, 128, 256]

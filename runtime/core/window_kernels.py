@@ -1,0 +1,118 @@
+"""The compiled kernels of the windows: exposures in; clicks, and how many exposures were right, out.
+
+Owns the loops, and with them what every exposure of a visit means; never allocates. The arrays are window.DecisionWindows'.
+
+A window is whole when `seen` right exposures are as many as it needs. With fixed patterns that is a number of the plan. A walk of an
+automaton needs as many as it takes to reach a leaf, which is known when it is there: until then it needs those of the longest walk.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pans.runtime.wire.schema import DARK_PATTERN
+
+DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
+BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong state: nobody knows
+
+
+class Walks(NamedTuple):
+    """The walks of the visit under way, one per window; arrays of length 0 where the patterns are fixed.
+
+    `successors` uint32 (states, 2). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN. `need` int64
+    (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs to it. `shown`
+    int64 (states,) counts the exposures of each state in the whole run.
+    """
+
+    successors: npt.NDArray[np.uint32]
+    nodes: npt.NDArray[np.int64]
+    need: npt.NDArray[np.int64]
+    last: npt.NDArray[np.int64]
+    shown: npt.NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
+    """Add exposures `relative`... of a visit to its windows; see tests/naive_window.py for the meaning in plain loops.
+
+    patterns uint16 (n,), bits uint8 (n,), feature_at int32 and window_at int32 (visit,), counts int64 (windows, d_f),
+    seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
+    """
+    for i in range(patterns.shape[0]):
+        feature = feature_at[relative + i]
+        shown = patterns[i]
+        if feature < 0:
+            if shown == DARK_PATTERN:
+                tallies[DARK_EXPOSURES] += 1
+                tallies[DARK_CLICKS] += bits[i]
+            else:
+                tallies[WRONG_PATTERNS] += 1
+            continue
+        window = window_at[relative + i]
+        if shown == feature:
+            counts[window, feature] += bits[i]
+            seen[window, 0] += 1
+        else:
+            tallies[WRONG_PATTERNS] += 1
+            seen[window, 1] += 1
+
+
+@njit(cache=True, nogil=True)
+def add_frames(relative, words, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
+    """Add frames of all channels `relative`... of a visit: words uint8 (n, bytes), bit c of a word is channel c.
+
+    window_at int32 (visit,), -1 for a dark frame; counts int64 (windows, d_f), seen int64 (windows, 2), tallies int64 (3,).
+    """
+    n_features = counts.shape[1]
+    for i in range(words.shape[0]):
+        window = window_at[relative + i]
+        for feature in range(n_features):
+            bit = (words[i, feature >> 3] >> (feature & 7)) & 1
+            if window < 0:
+                tallies[DARK_EXPOSURES] += 1
+                tallies[DARK_CLICKS] += bit
+            else:
+                counts[window, feature] += bit
+        if window >= 0:
+            seen[window, 0] += n_features
+
+
+@njit(cache=True, nogil=True)
+def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # type: ignore[no-untyped-def]
+    """Follow the walks of a visit through exposures `relative`...; tests/oracles/naive_window.py has the meaning in plain loops.
+
+    patterns uint16 (n,) are the states that the device says it showed, bits uint8 (n,); maps is int32 (visit,) slots of the walk (-1: dark)
+    and int32 (visit,) windows; walks Walks, counts int64 (windows, slots) the clicks, seen int64 (windows, 2) right and wrong exposures,
+    tallies int64 (N_TALLIES,). What stands in a walk behind its leaf must be dark, and so counts for the dark counts. Behind a lost or
+    a wrong exposure nothing is known of a walk: there, what says that it was dark counts as dark, and all else for nothing.
+    """
+    slot_at, window_at = maps
+    successors, nodes, need, last, shown = walks
+    n_states = successors.shape[0]
+    for i in range(patterns.shape[0]):
+        slot, window, stamp = slot_at[relative + i], window_at[relative + i], patterns[i]
+        node = nodes[window] if slot >= 0 else n_states
+        if 0 <= node < n_states and seen[window, 0] != slot:
+            node = nodes[window] = BROKEN
+        if 0 <= node < n_states and stamp == node:
+            counts[window, slot] = bits[i]
+            seen[window, 0] += 1
+            shown[node] += 1
+            nodes[window] = np.int64(successors[node, bits[i]])
+            if nodes[window] >= n_states:
+                need[window], last[window] = seen[window, 0], relative + i
+        elif 0 <= node < n_states:
+            nodes[window] = BROKEN
+            seen[window, 1] += 1
+            need[window] = seen[window, 0] + seen[window, 1]
+            tallies[WRONG_PATTERNS] += 1
+            tallies[LATE_SLOTS] += stamp == DARK_PATTERN
+        elif stamp == DARK_PATTERN:
+            tallies[DARK_EXPOSURES] += 1
+            tallies[DARK_CLICKS] += bits[i]
+        elif node != BROKEN:
+            tallies[WRONG_PATTERNS] += 1

@@ -1,0 +1,107 @@
+"""The streaming core and the plain one over the same bytes, and the faults that a link may add to them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.core.still import Core
+from pans.runtime.core.stream import StreamCore
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.messages import ClickBlock, DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
+
+SESSION = 7
+
+
+def by_core(
+    plan: Any, decider: Any, shots: int, pieces: list[bytes]
+) -> tuple[np.ndarray, list[Any], Core, FrameDecoder]:
+    core, decoder = Core(plan, decider, shots, 0), FrameDecoder()
+    rows: list[Any] = []
+    events: list[Any] = []
+    for piece in pieces:
+        for frame in decoder.feed(piece):
+            if frame.session == SESSION and frame.type in (0x84, 0x90, 0x91, 0x92):
+                output = core.step(frame)
+                rows += output.decisions
+                events += output.events
+    return np.array([tuple(row) for row in rows], DECISION_DTYPE), events, core, decoder
+
+
+def by_stream(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> tuple[np.ndarray, list[Any], StreamCore]:
+    streamed = StreamCore(plan, decider, shots, 0, SESSION)
+    rows, events = [np.zeros(0, DECISION_DTYPE)], []
+    for piece in pieces:
+        for batch in streamed.feed(piece):
+            rows.append(batch.rows.copy())
+            events += batch.events
+    return np.concatenate(rows), events, streamed
+
+
+def compare(plan: Any, decider: Any, shots: int, pieces: list[bytes]) -> np.ndarray:
+    expected, expected_events, core, decoder = by_core(plan, decider, shots, pieces)
+    rows, events, streamed = by_stream(plan, decider, shots, pieces)
+    for name in DECISION_DTYPE.names or ():
+        assert rows[name].tolist() == expected[name].tolist(), name
+    assert events == expected_events
+    assert asdict(streamed.core.tracker.counters) == asdict(core.tracker.counters)
+    assert asdict(streamed.decoder.counters) == asdict(decoder.counters)
+    assert streamed.core.windows.tallies.tolist() == core.windows.tallies.tolist()
+    for name in ("n_decisions", "n_abstained", "completed", "last_tick", "jitter_ticks"):
+        assert getattr(streamed.core, name) == getattr(core, name), name
+    assert streamed.core.windows.walks.shown.tolist() == core.windows.walks.shown.tolist()
+    assert streamed.core.tracker.position == core.tracker.position
+    assert streamed.core.windows.position == core.windows.position
+    return rows
+
+
+def spoilt(data: st.DataObject, clean: list[bytes], rng: np.random.Generator) -> list[bytes]:
+    """Frames lost, damaged, repeated, held back, and others among them; cut into pieces anywhere."""
+    foreign = [
+        wire.encode_ping(1, 5, SESSION),
+        wire.encode_mark(Mark(0, 1, 2, 0, 0, 1.0), SESSION + 1),
+        wire.encode_frame(MessageType.FRAMES, bytes(40), SESSION),
+        wire.encode_frame(MessageType.MARK, bytes(5), SESSION),
+        wire.encode_frames(FrameBlock(3, 0, 0, 2**63, 1, 0, np.ones((2, 1), np.uint8)), SESSION),
+        wire.encode_frames(FrameBlock(4, 2, 2**63, 0, 1, 0, np.ones((50, 8), np.uint8)), SESSION),
+    ]
+    sent: list[bytes] = []
+    for message in clean:
+        fate = data.draw(st.sampled_from(["arrives"] * 6 + ["lost", "damaged", "twice", "foreign", "held"]))
+        if fate == "damaged":
+            spoilt = bytearray(message)
+            spoilt[int(rng.integers(len(spoilt)))] ^= 1 << int(rng.integers(8))
+            message = bytes(spoilt)
+        if fate == "foreign":
+            sent.append(foreign[int(rng.integers(len(foreign)))])
+        if fate != "lost":
+            sent += [message] * (2 if fate == "twice" else 1)
+        if fate == "held" and len(sent) > 1:
+            sent[-1], sent[-2] = sent[-2], sent[-1]
+    whole = b"".join(sent)
+    at = sorted(rng.integers(0, len(whole) + 1, int(rng.integers(0, 6))).tolist())
+    return [whole[a:b] for a, b in zip([0, *at], [*at, len(whole)])]
+
+
+def click_frames(plan: Any, sent: list[tuple[int, int]], rng: np.random.Generator, block: int) -> list[bytes]:
+    """A clean sequential stream of (stamp, click): a mark and blocks for every visit, which end with a cycle."""
+    messages: list[bytes] = []
+    slots, visit_exposures = plan.slots_per_cycle, plan.slots_per_cycle * plan.cycles_per_object
+    for first in range(0, len(sent), slots):
+        visit, within = divmod(first, visit_exposures)
+        if not within:
+            truth = int(rng.integers(-1, 3))
+            mark = Mark(len(messages), visit, truth, first, 1000 + 100 * first, 2.5)
+            messages.append(wire.encode_mark(mark, SESSION))
+        for at in range(first, first + slots, block):
+            stamps, bits = zip(*sent[at : min(at + block, first + slots)])
+            facts = len(messages), 0, 1000 + 100 * at + int(rng.integers(3)), at, 100, visit
+            clicks = ClickBlock(*facts, np.array(stamps, np.uint16), np.array(bits, np.uint8))
+            messages.append(wire.encode_clicks(clicks, SESSION))
+    end = Status(DeviceState.IDLE, StateReason.COMPLETED, 0, 0, 10**6, len(sent))
+    return [*messages, wire.encode_status(end, SESSION), wire.encode_status(end, SESSION)]
