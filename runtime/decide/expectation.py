@@ -58,7 +58,7 @@ def expected_walk(
     shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level
     for start in range(0, n, step):
         here = slice(start, min(start + step, n))
-        light = _light(patterns, transmission[here], photons_per_level)
+        light = pattern_light(patterns, transmission[here], photons_per_level)
         _walk_block(automaton, slots, light, shown, law, found, here)
     return found
 
@@ -83,8 +83,8 @@ def _states_by_slot(automaton: Automaton) -> list[NDArray[np.int64]]:
     return [order[ends[slot] : ends[slot + 1]] for slot in range(automaton.n_slots)]
 
 
-def _light(patterns: NDArray[Any], transmission: NDArray[Any], scale: float) -> F64:
-    """Photoelectrons (objects, patterns) at full dwell."""
+def pattern_light(patterns: NDArray[Any], transmission: NDArray[Any], scale: float) -> F64:
+    """Return photoelectrons, float64 (objects, patterns), with the light on all the time; arguments as in `expected_walk`."""
     wide = transmission.astype(np.float64)
     light = np.empty((len(wide), len(patterns)))
     for start in range(0, len(patterns), _PATTERNS_AT_ONCE):

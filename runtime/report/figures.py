@@ -65,6 +65,22 @@ def confusion(counts: NDArray[np.int64], classes: Sequence[str]) -> bytes:
     return _done(figure)
 
 
+def reliability(bins: Sequence[tuple[float, float, float]], title: str) -> bytes:
+    """Draw accuracy against the probability that was stated, and how many decisions stated it: (probability, accuracy, share) per bin."""
+    figure, axes = _new(5.0, 5.4, 2)
+    (upper,), (lower,) = axes
+    axes[0, 0].get_gridspec().set_height_ratios([3, 1])
+    probability, accuracy, share = (np.array(column) for column in zip(*bins)) if bins else (np.zeros(0),) * 3
+    upper.plot([0, 1], [0, 1], color="0.6", lw=1, label="as sure as right")
+    upper.plot(probability, accuracy, "o-", color="C0", ms=4, label="decisions")
+    upper.set(xlim=(0, 1), ylim=(0, 1), ylabel="accuracy")
+    upper.set_title(title, fontsize=9)
+    upper.legend(fontsize=8)
+    lower.bar(probability, share, width=0.04, color="C0")
+    lower.set(xlim=(0, 1), xlabel="probability of the decision", ylabel="share")
+    return _done(figure, "png")
+
+
 def latencies(stages: Mapping[str, F64], deadline_us: float | None) -> bytes:
     """Draw the distribution of every stage, microseconds on a logarithmic axis; times below 0.1 us stand in the first bin."""
     figure, axes = _new(9.0, 1.5 * len(stages) + 0.5, len(stages))

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
+from pans.runtime.bundle.automaton import CONFIDENCE_RANGE
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
@@ -22,9 +25,10 @@ if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
     from pans.trainer.evaluate.held_out import Conditions, HeldOut
+    from pans.trainer.evaluate.walks import MeasuredWalks
 
 
-PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png")
+PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png", "reliability.png")
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -33,16 +37,30 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="P", help="default: what the bundle was trained for")
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="exposures of every pattern (default 1)")
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--trials", type=int, metavar="N", help="sampled decisions per object (default 30)")
-    way.add_argument("--exact", action="store_true", help="enumerate all click words: no trials, no sampling error")
+    way.add_argument(
+        "--trials", type=int, metavar="N", help="sampled decisions per object (default 30; of an automaton: exact)"
+    )
+    way.add_argument(
+        "--exact", action="store_true", help="sum over all click words or walks: no trials, no sampling error"
+    )
     parser.add_argument("--objects", type=int, metavar="N", help="only the first N held-out objects (default: all)")
     parser.add_argument(
         "--dark", type=float, metavar="R", help="dark photoelectrons per exposure, instead of the profile's"
     )
     parser.add_argument("--eta", type=float, default=1.0, metavar="E", help="all light times E (default 1)")
+    parser.add_argument(
+        "--confidence",
+        type=CONFIDENCE_RANGE.option,
+        default=0.0,
+        metavar="C",
+        help="of an automaton: decide as soon as a class is that sure, abstain at the end below it",
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trials (default 0)")
     parser.add_argument(
-        "--pictures", type=Path, metavar="DIR", help="draw confusion, a map of the clicks, patterns (extra plot)"
+        "--pictures",
+        type=Path,
+        metavar="DIR",
+        help="draw confusion, a map of the clicks, patterns, reliability (extra plot)",
     )
     add_force(parser)
     parser.add_argument(
@@ -53,7 +71,8 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import load_bundle
-    from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, measure
+    from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, measure, walks_on
+    from pans.trainer.evaluate.walks import measured_walks, walk_payload
 
     if args.objects is not None and args.objects < 1:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
@@ -65,14 +84,27 @@ def _evaluate(args: argparse.Namespace) -> int:
     bundle, digest = load_bundle(args.bundle)
     if args.exact and bundle.picture_shape is not None:
         raise UsageError("--exact: pictures are compared by trials", remedy="use --trials")
-    conditions = Conditions(args.profile, args.eta, args.dark, args.seed, args.data_seed)
-    trials = None if args.exact else default_trials(bundle) if args.trials is None else args.trials
+    conditions = Conditions(args.profile, args.eta, args.dark, args.seed, args.data_seed, args.confidence)
+    trials = args.trials
+    if trials is None and not args.exact and bundle.automaton is None:
+        trials = default_trials(bundle)
+    more: dict[str, Any] = {}
     with usage_errors():
         held_out = held_out_of(bundle, args.task, args.objects, args.data_dir, conditions)
         started = time.perf_counter()
-        measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
+        if bundle.automaton is None:
+            measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
+        else:
+            walks = walks_on(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
+            measured = measured_walks(walks)
+            more = {
+                "confidence": args.confidence or None,
+                **walk_payload(walks),
+                **_compared(bundle, measured, held_out, args),
+            }
     payload = {
         **asdict(measured),
+        **more,
         "task": held_out.task.name,
         "profile": held_out.profile.name,
         "sha256": digest,
@@ -81,17 +113,34 @@ def _evaluate(args: argparse.Namespace) -> int:
     }
     if args.pictures:
         payload["pictures"] = _draw(args, bundle, held_out, conditions)
-    emit(args, payload, words_of(measured))
-    return EXIT_FINE
+    differences = more.get("expected_differences") or []
+    emit(args, payload, "\n".join([words_of(measured, more), *differences]))
+    return EXIT_ALERT if differences else EXIT_FINE
+
+
+def _compared(bundle: Bundle, measured: MeasuredWalks, held_out: HeldOut, args: argparse.Namespace) -> dict[str, Any]:
+    """What the bundle says that it achieves, and where that is not what was found under the same conditions."""
+    from pans.trainer.evaluate.walks import expected_differences, expected_figures
+
+    same = args.eta == 1 and args.dark is None and not args.confidence and not measured.trials
+    kept = bundle.expected
+    if kept is None or not same:
+        return {"expected": None if kept is None else dict(kept), "expected_differences": None}
+    found = expected_figures(measured, held_out.profile.name, held_out.task.name, str(kept["split"]))
+    return {"expected": dict(kept), "expected_differences": expected_differences(kept, found)}
 
 
 def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> list[str]:
     from pans.trainer.evaluate.accuracy import light_of
+    from pans.trainer.evaluate.held_out import walks_on
 
     with needing("--pictures", "plot"):
-        from pans.trainer.evaluate.pictures import write_pictures
+        from pans.trainer.evaluate.pictures import write_pictures, write_walk_pictures
 
         objects = held_out.objects
+        if bundle.automaton is not None:
+            walks = walks_on(bundle, held_out, conditions=conditions)
+            return [str(path) for path in write_walk_pictures(args.pictures, bundle, walks, force=args.force)]
         light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
         written = write_pictures(
             args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed, force=args.force
@@ -99,9 +148,13 @@ def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, condition
     return [str(path) for path in written]
 
 
-def words_of(measured: Measured | MeasuredPictures) -> str:
-    """Return the figures in words."""
+def words_of(
+    measured: Measured | MeasuredPictures | MeasuredWalks, more: Mapping[str, Any] = MappingProxyType({})
+) -> str:
+    """Return the figures in words; `more` is `walk_payload` of an automaton."""
     figures: dict[str, Any] = asdict(measured)
+    if "exposures_mean" in figures:
+        return _walk_words(figures, more)
     light = f"  clicks {measured.clicks_mean:.3f}   photons {measured.photons_mean:.2f}   illumination {measured.illumination:.1f}"
     if "ssim_mean" in figures:
         return (
@@ -115,6 +168,34 @@ def words_of(measured: Measured | MeasuredPictures) -> str:
         f"SIMULATED accuracy {100 * figures['accuracy_mean']:.2f} %  ({measured.objects} objects, {how}, K = {measured.shots})\n"
         f"  spread over trials      {100 * figures['accuracy_std']:.2f} points\n"
         f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}"
+    )
+
+
+def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:
+    how = f"{figures['trials']} trials" if figures["trials"] else "exact expectation"
+    lines = [
+        f"SIMULATED accuracy {_percent(figures['accuracy_mean'])} %  ({figures['objects']} objects, {how}, automaton)",
+        f"  spread over trials      {_percent(figures['accuracy_std'])} points",
+        f"  error from the objects  {_percent(figures['accuracy_se_objects'])} points",
+        f"  calibration error       {_percent(figures['expected_calibration_error'])} points",
+        _light_words(figures),
+    ]
+    if figures["abstained"]:
+        lines.append(f"  abstained {100 * figures['abstained']:.2f} %; the accuracy is that of what was decided")
+    for name, first in more.items():
+        if name.startswith("first_") and first is not None:
+            lines.append(f"  the first {first['objects']}: {_percent(first['accuracy_mean'])} %\n{_light_words(first)}")
+    return "\n".join(lines)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.2f}"
+
+
+def _light_words(figures: Mapping[str, Any]) -> str:
+    return (
+        f"  clicks {figures['clicks_mean']:.3f}   photons {figures['photons_mean']:.2f}   "
+        f"illumination {figures['illumination']:.1f}   exposures {figures['exposures_mean']:.2f}"
     )
 
 

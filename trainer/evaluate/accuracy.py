@@ -63,15 +63,9 @@ def light_of(
     """
     if images.shape[1:] != bundle.image_shape:
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
-    if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
-        raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
-    if bundle.analyser is None:
-        exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
-    else:
-        exposure_us = bundle.analyser.exposure_us
-    law = click_law(profile, exposure_us)
-    if dark is not None:
-        law = ClickLaw(dark, law.read_noise_e, law.threshold_e)
+    if bundle.automaton is not None:
+        raise ValueError(f"{bundle.name} has an automaton: what it shows depends on the clicks (walks.walks_of)")
+    law = law_of(bundle, profile, eta, dark)
     if bundle.analyser is not None:
         with as_usage_error():
             light = bundle.analyser.photoelectrons(images) * eta
@@ -83,6 +77,21 @@ def light_of(
         part = images[start : start + step]
         light[start : start + step] = object_transmission(profile, part.reshape(len(part), -1)) @ patterns.T
     return Light(light, click_probability(law, light), law, bundle.illumination() * eta)
+
+
+def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None) -> ClickLaw:
+    """Return the click law of one exposure of `bundle` on `profile`, with `dark` photoelectrons in place of the profile's if given.
+
+    ValueError for an `eta` or `dark` that is not finite or below 0.
+    """
+    if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
+        raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
+    if bundle.analyser is None:
+        exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
+    else:
+        exposure_us = bundle.analyser.exposure_us
+    law = click_law(profile, exposure_us)
+    return law if dark is None else ClickLaw(dark, law.read_noise_e, law.threshold_e)
 
 
 def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:

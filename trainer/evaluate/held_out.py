@@ -21,6 +21,7 @@ from .accuracy import (
     evaluate_sampled,
     light_of,
 )
+from .walks import MeasuredWalks, Walks, measured_walks, walks_of
 
 DEFAULT_PROFILE = "oled-qcmos"
 DEFAULT_TRIALS = 30  # as many as the paper's experiment repeats
@@ -36,6 +37,7 @@ class Conditions:
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
     seed: int = 0  # of the trials
     data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
+    confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +59,7 @@ def evaluate(
     objects: int | None = None,
     data_dir: str | Path | None = None,
     conditions: Conditions = Conditions(),
-) -> Measured | MeasuredPictures:
+) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` (or the .pans file at that path) decides on held-out objects, per decision of `shots` shots.
 
     `task` and `objects` (the first so many) are by default what the bundle was trained on, and all. With `trials` decisions are
@@ -66,6 +68,7 @@ def evaluate(
     """
     model = bundle if isinstance(bundle, Bundle) else load_bundle(bundle)[0]
     held_out = held_out_of(model, task, objects, data_dir, conditions)
+    exact = exact or model.automaton is not None
     if trials is None and (not exact or model.picture_shape is not None):
         trials = default_trials(model)
     return measure(model, held_out, shots=shots, trials=trials, conditions=conditions)
@@ -109,9 +112,13 @@ def measure(
     shots: int = 1,
     trials: int | None = None,
     conditions: Conditions = Conditions(),
-) -> Measured | MeasuredPictures:
+) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` decides on the objects: from `trials` decisions per object, or exact without (not of pictures)."""
     objects = held_out.objects
+    if bundle.automaton is not None:
+        return measured_walks(walks_on(bundle, held_out, shots=shots, trials=trials, conditions=conditions))
+    if conditions.confidence:
+        raise ValueError(f"confidence is {conditions.confidence:g}, but {bundle.name} has no automaton")
     light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
     if bundle.picture_shape is not None:
         if trials is None:
@@ -122,8 +129,37 @@ def measure(
     return evaluate_sampled(bundle, light, objects.labels, shots=shots, trials=trials, seed=conditions.seed)
 
 
+def walks_on(
+    bundle: Bundle,
+    held_out: HeldOut,
+    *,
+    shots: int = 1,
+    trials: int | None = None,
+    conditions: Conditions = Conditions(),
+) -> Walks:
+    """Return what the automaton of `bundle` does on the objects: `trials` walks of each, or exact without."""
+    if shots != 1:
+        raise ValueError(
+            f"shots is {shots}, allowed with an automaton: 1 (a walk is one shot; several are several trials)"
+        )
+    objects, told = held_out.objects, conditions
+    return walks_of(
+        bundle,
+        held_out.profile,
+        objects.images,
+        objects.labels,
+        eta=told.eta,
+        dark=told.dark,
+        confidence=told.confidence,
+        trials=trials,
+        seed=told.seed,
+    )
+
+
 def trials_needed(bundle: Bundle, shots: int = 1) -> int | None:
     """Return None where the exact expectation can be had, else a number of trials: 30, of pictures one."""
     if bundle.picture_shape is not None:
         return 1
+    if bundle.automaton is not None:
+        return None
     return DEFAULT_TRIALS if (shots + 1) ** bundle.n_features > EXACT_OUTCOMES_MAX else None

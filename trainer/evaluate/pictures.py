@@ -1,4 +1,4 @@
-"""Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns.
+"""Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns, reliability.
 
 Owns which pictures there are and what is on them; the measuring is accuracy.py's. All are SIMULATED, and say so.
 """
@@ -6,6 +6,7 @@ Owns which pictures there are and what is on them; the measuring is accuracy.py'
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from pans.trainer.tasks.registry import Objects
 
 from .accuracy import Light
 from .tsne import tsne
+from .walks import Walks, calibration_bins, confusion_of, measured_walks
 
 MAPPED_OBJECTS = 600
 SHOWN_PICTURES = 8
@@ -46,15 +48,40 @@ def write_pictures(
     return written
 
 
+def write_walk_pictures(folder: Path, bundle: Bundle, walks: Walks, *, force: bool = False) -> list[Path]:
+    """Write patterns, confusion and reliability of an automaton, in exact expectation, into `folder` and return their paths."""
+    make_folder(folder)
+    pictures = bundle.patterns().reshape(-1, *bundle.image_shape)
+    bins = [(one.probability, one.accuracy, one.share) for one in calibration_bins(walks)]
+    table, measured = confusion_of(walks), measured_walks(walks)
+    right, error = 100 * (measured.accuracy_mean or 0.0), 100 * (measured.expected_calibration_error or 0.0)
+    drawn = {
+        "patterns.png": page_figures.patterns(pictures, "photoelectrons per exposure\nand unit transmission"),
+        "reliability.png": page_figures.reliability(
+            bins, f"{bundle.name}: expected calibration error {error:.2f} points (SIMULATED)"
+        ),
+    }
+    for name, picture in drawn.items():
+        write_file(folder / name, picture, force=force)
+    title = f"{bundle.name}: {right:.1f} % right, exact (SIMULATED)"
+    return [folder / name for name in drawn] + [_shown_confusion(folder / "confusion.png", bundle, table, title, force)]
+
+
 def _confusion(
     path: Path, bundle: Bundle, counts: NDArray[np.int64], labels: NDArray[np.int64], shots: int, force: bool
 ) -> Path:
     """One sampled decision per object, truth against decision."""
     table = np.zeros((bundle.n_classes, bundle.n_classes), np.int64)
     np.add.at(table, (labels, make_decider(bundle, shots=shots).decide_batch(counts, shots)), 1)
+    right = float(np.trace(table) / max(table.sum(), 1))
+    title = f"{bundle.name}: {100 * right:.1f} % right, K = {shots} (SIMULATED)"
+    return _shown_confusion(path, bundle, table, title, force)
+
+
+def _shown_confusion(path: Path, bundle: Bundle, table: NDArray[Any], title: str, force: bool) -> Path:
     size = min(9.0, 3.0 + 0.42 * bundle.n_classes)
     figure, axis = new_figure(width=size + 1.2, height=size, panels=1)
-    share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
+    share = table / np.maximum(table.sum(axis=1, keepdims=True), 1e-300)
     shown = axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
     if bundle.n_classes <= 20:
         for (row, column), value in np.ndenumerate(share):
@@ -64,10 +91,7 @@ def _confusion(
     places = range(bundle.n_classes)
     axis.set_xticks(places, bundle.classes, rotation=60, ha="right")
     axis.set_yticks(places, bundle.classes)
-    right = float(np.trace(table) / max(table.sum(), 1))
-    axis.set(
-        xlabel="decision", ylabel="truth", title=f"{bundle.name}: {100 * right:.1f} % right, K = {shots} (SIMULATED)"
-    )
+    axis.set(xlabel="decision", ylabel="truth", title=title)
     figure.colorbar(shown, ax=axis, label="share of the truth's decisions (numbers: %)", shrink=0.8)
     save_figure(figure, path, force=force)
     return path

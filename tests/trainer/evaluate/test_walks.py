@@ -1,0 +1,225 @@
+"""Evaluation of automata: exact against a sum over all words and against trials, calibration, and what the command says."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import naive_automaton as naive
+import numpy as np
+import pytest
+from automata import automaton_bundle, random_automaton
+from commands import json_of
+
+from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
+from pans.runtime.cli import main
+from pans.runtime.decide import make_decider
+from pans.runtime.instrument.click_law import click_probability, object_transmission
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.evaluate import Conditions, evaluate
+from pans.trainer.evaluate.accuracy import law_of
+from pans.trainer.evaluate.walks import (
+    calibration_bins,
+    confusion_of,
+    expected_differences,
+    measured_walks,
+    walks_of,
+)
+
+RNG = np.random.default_rng(0)
+PROFILE = load_profile("oled-qcmos")
+LABELS = RNG.integers(0, 3, 60)
+IMAGES = RNG.integers(0, 256, (60, 2, 2), dtype=np.uint8)
+
+
+def bundle(**facts: Any) -> Bundle:
+    return automaton_bundle(random_automaton(3, slots=6), **{"photons_per_level": 0.15} | facts)
+
+
+def by_hand(model: Bundle, dark: float, eta: float, confidence: float) -> dict[str, Any]:
+    """The same figures by a sum over all click words, with the decider's own answers."""
+    assert model.automaton is not None
+    decider: Any = make_decider(model, confidence=confidence)
+    automaton = decider.automaton
+    seen = object_transmission(PROFILE, IMAGES.reshape(60, -1))
+    law = law_of(model, PROFILE, dark=dark)
+    sums = dict.fromkeys(("right", "decided", "clicks", "photons", "illumination", "exposures"), 0.0)
+    for row, label in zip(seen, LABELS):
+        whole = model.pattern_levels[automaton.pattern] * (eta * model.photons_per_level)
+        states = whole * (automaton.dwell / automaton.dwell_steps)[:, None]
+        light = states @ row
+        found = naive.expectation(automaton, click_probability(law, light).tolist(), 1.0)
+        sums["clicks"] += found["clicks"]
+        sums["exposures"] += found["exposures"]
+        sums["photons"] += float(np.dot(found["shown"], light))
+        sums["illumination"] += float(np.dot(found["shown"], states.sum(axis=1)))
+        sums["right"] += sum(p for leaf, p in enumerate(found["leaves"]) if decider.decide_leaf(leaf).label == label)
+        sums["decided"] += sum(p for leaf, p in enumerate(found["leaves"]) if decider.decide_leaf(leaf).label < 3)
+    return sums
+
+
+@pytest.mark.parametrize(("dark", "eta", "confidence"), [(0.02, 1.0, 0.0), (0.0, 2.0, 0.7)])
+def test_exact_figures_are_sums_over_all_words(dark: float, eta: float, confidence: float) -> None:
+    model = bundle()
+    walks = walks_of(model, PROFILE, IMAGES, LABELS, dark=dark, eta=eta, confidence=confidence)
+    found, wanted = measured_walks(walks), by_hand(model, dark, eta, confidence)
+    assert found.accuracy_mean == pytest.approx(wanted["right"] / wanted["decided"], rel=1e-9)
+    assert found.abstained == pytest.approx(1 - wanted["decided"] / 60, abs=1e-9)
+    assert (found.abstained > 0.01) == (confidence > 0)
+    for name, value in (
+        ("clicks", found.clicks_mean),
+        ("photons", found.photons_mean),
+        ("illumination", found.illumination),
+    ):
+        assert value == pytest.approx(wanted[name] / 60, rel=1e-9)
+    assert found.exposures_mean == pytest.approx(wanted["exposures"] / 60, rel=1e-9)
+    assert confusion_of(walks).sum() == pytest.approx(wanted["decided"], rel=1e-9)
+    assert np.trace(confusion_of(walks)) == pytest.approx(wanted["right"], rel=1e-9)
+
+
+def test_trials_agree_with_the_expectation_within_their_error() -> None:
+    """400 walks of each object; 5 standard errors, seed fixed."""
+    model, trials = bundle(), 400
+    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, dark=0.02, confidence=0.7))
+    sampled = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, dark=0.02, confidence=0.7, trials=trials, seed=4))
+    assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(trials)
+    n = len(LABELS) * trials
+    assert abs(sampled.abstained - exact.abstained) < 5 * math.sqrt(0.25 / n)
+    assert abs(sampled.exposures_mean - exact.exposures_mean) < 5 * 6 / 2 / math.sqrt(n)
+    assert abs(sampled.clicks_mean - exact.clicks_mean) < 5 * 6 / 2 / math.sqrt(n)
+    assert sampled.photons_mean == pytest.approx(exact.photons_mean, rel=0.05)
+    assert sampled.illumination == pytest.approx(exact.illumination, rel=0.05)
+    assert (sampled.trials, exact.trials) == (trials, 0)
+
+
+def test_the_spread_over_trials_is_that_of_trials() -> None:
+    model = bundle()
+    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, confidence=0.7))
+    runs = [walks_of(model, PROFILE, IMAGES, LABELS, confidence=0.7, trials=1, seed=seed) for seed in range(300)]
+    spread = float(np.std([measured_walks(run).accuracy_mean for run in runs], ddof=1))
+    assert spread == pytest.approx(exact.accuracy_std, rel=0.2)  # five times 1 / sqrt(2 * 300)
+
+
+def two_leaves(sure: float) -> Bundle:
+    """A click says class 1, no click class 0, each with the probability `sure`."""
+    posteriors = [[0.5, 0.5], [sure, 1 - sure], [1 - sure, sure]]
+    automaton = Automaton([0], [1], 1, [[1, 2]], posteriors)
+    return automaton_bundle(automaton, pattern_levels=np.full((1, 4), 3), photons_per_level=1.0)
+
+
+def test_calibration_compares_probability_and_accuracy() -> None:
+    """White objects click always, black ones never; a quarter of each has the other label: 75 % right, whatever is claimed."""
+    images = np.repeat(np.array([0, 255], np.uint8), 40)[:, None, None] * np.ones((1, 2, 2), np.uint8)
+    labels = np.repeat([0, 1], 40)
+    labels[:10], labels[40:50] = 1, 0
+    ideal = load_profile("ideal")
+    for sure in (0.75, 0.95):
+        walks = walks_of(two_leaves(sure), ideal, images, labels, dark=0.0, eta=50.0)
+        (only,) = calibration_bins(walks)
+        assert (only.share, only.accuracy) == pytest.approx((1.0, 0.75), abs=1e-9)
+        assert only.probability == pytest.approx(sure, abs=1e-6)
+        assert measured_walks(walks).expected_calibration_error == pytest.approx(sure - 0.75, abs=1e-6)
+
+
+def test_nothing_decided_is_no_accuracy() -> None:
+    found = measured_walks(walks_of(two_leaves(0.6), PROFILE, IMAGES, LABELS % 2, confidence=0.99))
+    assert found.accuracy_mean is None
+    assert found.accuracy_std is None
+    assert found.abstained == 1.0
+
+
+@pytest.fixture
+def own_task(tmp_path: Path) -> str:
+    path = tmp_path / "own.npz"
+    rng = np.random.default_rng(2)
+    images = rng.integers(0, 256, (230, 2, 2), dtype=np.uint8)
+    np.savez(path, images=images, labels=np.arange(230) % 3, classes=np.array(["c0", "c1", "c2"]))
+    return str(path)
+
+
+def test_the_command_gives_all_figures(own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = bundle()
+    write_bundle(model, tmp_path / "a.pans")
+    found = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal")
+    names = (
+        "accuracy_mean",
+        "clicks_mean",
+        "photons_mean",
+        "illumination",
+        "exposures_mean",
+        "expected_calibration_error",
+    )
+    for name in names:
+        assert found[name] == getattr(evaluate(model, task=own_task, conditions=Conditions("ideal")), name)
+    assert (found["trials"], found["objects"], found["shots"], found["exposures_longest"]) == (0, 230, 1, 6)
+    assert found["first_200"]["objects"] == 200
+    assert sum(one["share"] for one in found["calibration"]) == pytest.approx(1.0)
+    few = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, "--profile", "ideal", "--objects", "200")
+    assert few["first_200"] is None
+    for name in ("accuracy_mean", "clicks_mean", "photons_mean", "exposures_mean"):
+        assert few[name] == pytest.approx(found["first_200"][name], rel=1e-12)
+    more = ("--profile", "ideal", "--confidence", "0.6", "--exact")
+    sure = json_of(capsys, "evaluate", tmp_path / "a.pans", "--task", own_task, *more)
+    assert (sure["confidence"], sure["trials"]) == (0.6, 0)
+    assert 0 < sure["abstained"] < 1
+    assert sure["exposures_mean"] < found["exposures_mean"]
+
+
+def test_expected_figures_are_held_against_what_is_found(
+    own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = bundle()
+    found = evaluate(model, task=own_task, conditions=Conditions("ideal"))
+    named = {"profile": "ideal", "task": Path(own_task).stem, "split": "test", "objects": 230}
+    figures = {
+        **{"accuracy": found.accuracy_mean, "clicks": found.clicks_mean, "photons": found.photons_mean},
+        **{"illumination": found.illumination, "exposures": found.exposures_mean},
+    }
+    write_bundle(with_expected(model, named | figures), tmp_path / "true.pans")
+    words = ("--task", own_task, "--profile", "ideal")
+    right = json_of(capsys, "evaluate", tmp_path / "true.pans", *words)
+    assert right["expected_differences"] == []
+    write_bundle(with_expected(model, named | figures | {"accuracy": 0.999}), tmp_path / "false.pans")
+    wrong = json_of(capsys, "evaluate", tmp_path / "false.pans", *words, code=1)
+    assert "expected accuracy is 0.999 in the bundle" in wrong["expected_differences"][0]
+    other = json_of(capsys, "evaluate", tmp_path / "false.pans", *words, "--dark", "0.1")
+    assert other["expected_differences"] is None
+    assert expected_differences(named | figures, named | figures | {"objects": 3, "accuracy": 0.0}) == []
+
+
+def test_the_command_says_what_was_asked_wrongly(
+    own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bundle(bundle(), tmp_path / "a.pans")
+    for more, said in (
+        (["--shots", "2"], "shots is 2"),
+        (["--trials", "0"], "trials is 0"),
+        (["--dark", "-1"], "dark is -1"),
+        (["--confidence", "1.5"], "'1.5' is not"),
+    ):
+        try:
+            code = main(["evaluate", str(tmp_path / "a.pans"), "--task", own_task, *more])
+        except SystemExit as stop:
+            code = stop.code  # type: ignore[assignment]
+        assert code == 2
+        assert said in capsys.readouterr().err
+
+
+def test_pictures_of_an_automaton(own_task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    write_bundle(bundle(), tmp_path / "a.pans")
+    words = ("--task", own_task, "--pictures", tmp_path / "drawn")
+    found = json_of(capsys, "evaluate", tmp_path / "a.pans", *words)
+    assert {Path(path).name for path in found["pictures"]} == {"patterns.png", "reliability.png", "confusion.png"}
+    for path in found["pictures"]:
+        assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_dark_counts_do_not_follow_the_dwell() -> None:
+    automaton = random_automaton(3, slots=6)
+    short = Automaton(automaton.pattern, np.ones_like(automaton.dwell), 8, automaton.successors, automaton.posteriors)
+    ideal = load_profile("ideal")
+    for one in (automaton, short):
+        found = measured_walks(walks_of(automaton_bundle(one), ideal, IMAGES, LABELS, dark=0.3, eta=0.0))
+        assert found.clicks_mean == pytest.approx((1 - math.exp(-0.3)) * found.exposures_mean, rel=1e-12)

@@ -1,0 +1,273 @@
+"""What an automaton decides on held-out objects: exact sums over all walks, or sampled walks; calibration of its posteriors.
+
+Owns the figures of `pans evaluate` for automata; the sums over walks are runtime's `decide.expectation`. Clicks, photons, illumination and
+exposures always stand together. SIMULATED figures: the click law of the profile, no instrument.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.automaton import Automaton, stopped
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.walks import EXPECTED_KEYS
+from pans.runtime.decide.automaton import leaf_verdicts
+from pans.runtime.decide.expectation import expected_walk, pattern_light
+from pans.runtime.decide.verdict import NO_LABEL
+from pans.runtime.instrument.click_law import ClickLaw, click_probability, object_transmission
+from pans.runtime.instrument.profile import Profile
+
+from .accuracy import law_of
+
+CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
+FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
+EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
+_LEAF_NUMBERS = 1 << 22  # objects times leaves at once
+_LIGHT_NUMBERS = 1 << 22
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredWalks:
+    """Means per decision of an automaton.
+
+    With a confidence `accuracy_mean` is that of what is decided, and `abstained` the share of the decisions that are not. `accuracy_std` is
+    the spread over trials (exact without trials), `accuracy_se_objects` the error from having few objects.
+    """
+
+    accuracy_mean: float | None  # None where nothing is decided; so are the next two
+    accuracy_std: float | None
+    accuracy_se_objects: float | None
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    exposures_mean: float
+    expected_calibration_error: float | None
+    abstained: float
+    objects: int
+    trials: int  # 0: exact, no trials were needed
+    shots: int = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walks:
+    """Sums per object, float64 (n,): chances of a right decision and of any, clicks and so on; `by_class` (classes, leaves)."""
+
+    right: F64
+    decided: F64
+    clicks: F64
+    photons: F64
+    illumination: F64
+    exposures: F64
+    by_class: F64  # chance that an object of this class ends at this leaf, summed over the objects
+    automaton: Automaton  # the one that ran
+    leaf_labels: NDArray[np.uint16]
+    trials: int = 0
+
+    def first(self, count: int) -> Walks:
+        """Return the sums of the first `count` objects; `by_class` remains that of all."""
+        names = ("right", "decided", "clicks", "photons", "illumination", "exposures")
+        return replace(self, **{name: getattr(self, name)[:count] for name in names})
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationBin:
+    """Decisions of about one probability: their share of all, mean probability, and accuracy."""
+
+    share: float
+    probability: float
+    accuracy: float
+
+
+def walks_of(
+    bundle: Bundle,
+    profile: Profile,
+    images: NDArray[np.uint8],
+    labels: NDArray[np.int64],
+    *,
+    eta: float = 1.0,
+    dark: float | None = None,
+    confidence: float = 0.0,
+    trials: int | None = None,
+    seed: int = 0,
+) -> Walks:
+    """Show the automaton of `bundle` to `images` (n, height, width) through `profile`; exact, or `trials` walks per object.
+
+    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `confidence` stops early. ValueError for what
+    does not fit.
+    """
+    if bundle.automaton is None:
+        raise ValueError(f"{bundle.name} has no automaton")
+    if images.shape[1:] != bundle.image_shape:
+        raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
+    if trials is not None and trials < 1:
+        raise ValueError(f"trials is {trials}, allowed: 1 or more")
+    law = law_of(bundle, profile, eta, dark)
+    automaton = stopped(bundle.automaton, confidence) if confidence else bundle.automaton
+    leaf_labels = leaf_verdicts(automaton, confidence).labels
+    parts: list[Walks] = []
+    step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
+    rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
+    for start in range(0, len(images), step):
+        part = images[start : start + step]
+        seen = object_transmission(profile, part.reshape(len(part), -1))
+        sums: _Sums
+        if trials is None:
+            found = expected_walk(automaton, bundle.pattern_levels, seen, law, scale)
+            sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
+        else:
+            sums = _sampled(automaton, bundle.pattern_levels, seen, law, scale, trials, rng)
+        parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
+    return _together(parts, trials or 0)
+
+
+_Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposures (n,), leaves (n, leaves)
+
+
+def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_labels: NDArray[np.uint16]) -> Walks:
+    leaves = sums[4]
+    decides = (leaf_labels != NO_LABEL).astype(np.float64)
+    right, by_class = np.empty(len(labels)), np.zeros((automaton.n_classes, automaton.n_leaves))
+    for label in range(automaton.n_classes):
+        of_class = labels == label
+        right[of_class] = leaves[of_class] @ (leaf_labels == label).astype(np.float64)
+        by_class[label] = leaves[of_class].sum(axis=0)
+    decided = leaves @ decides
+    return Walks(np.minimum(right, decided), decided, *sums[:4], by_class, automaton, leaf_labels)
+
+
+def _together(parts: list[Walks], trials: int) -> Walks:
+    names = ("right", "decided", "clicks", "photons", "illumination", "exposures")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
+    return replace(parts[0], **joined, by_class=by_class, trials=trials)
+
+
+def _sampled(
+    automaton: Automaton,
+    patterns: NDArray[Any],
+    seen: NDArray[Any],
+    law: ClickLaw,
+    scale: float,
+    trials: int,
+    rng: np.random.Generator,
+) -> _Sums:
+    """Draw `trials` walks of every object; means per walk, and the share of each leaf."""
+    n, rows = len(seen), np.arange(len(seen))
+    light = pattern_light(patterns, seen, scale)
+    whole = patterns.sum(axis=1, dtype=np.float64) * scale
+    sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
+    for _ in range(trials):
+        node, going = np.zeros(n, np.int64), rows
+        while going.size:
+            state = node[going]
+            pattern, share = automaton.pattern[state], automaton.dwell[state] / automaton.dwell_steps
+            photoelectrons = light[going, pattern] * share
+            click = rng.random(going.size) < click_probability(law, photoelectrons)
+            for total, values in zip(sums, (click, photoelectrons, whole[pattern] * share, 1.0)):
+                total[going] += values
+            node[going] = automaton.successors[state, click.astype(np.int64)]
+            going = going[node[going] < automaton.n_states]
+        leaves[rows, node - automaton.n_states] += 1.0
+    sums /= trials
+    return sums[0], sums[1], sums[2], sums[3], leaves / trials
+
+
+def measured_walks(walks: Walks) -> MeasuredWalks:
+    """Return the means of `walks`."""
+    n, decided = len(walks.right), float(walks.decided.sum())
+    accuracy = float(walks.right.sum()) / decided if decided else 0.0
+    # the ratio's error by its derivative: of each object right - accuracy * decided, whose mean is 0
+    excess = walks.right - accuracy * walks.decided
+    per_walk = (
+        walks.right * (1 - 2 * accuracy) + accuracy**2 * walks.decided - excess**2
+    )  # its variance within one walk
+    return MeasuredWalks(
+        accuracy_mean=accuracy if decided else None,
+        accuracy_std=math.sqrt(max(float(per_walk.sum()), 0.0)) / decided if decided else None,
+        accuracy_se_objects=math.sqrt(float((excess**2).sum()) * n / max(n - 1, 1)) / decided if decided else None,
+        clicks_mean=float(walks.clicks.mean()),
+        photons_mean=float(walks.photons.mean()),
+        illumination=float(walks.illumination.mean()),
+        exposures_mean=float(walks.exposures.mean()),
+        expected_calibration_error=calibration_error(calibration_bins(walks)) if decided else None,
+        abstained=1.0 - decided / n,
+        objects=n,
+        trials=walks.trials,
+    )
+
+
+def calibration_bins(walks: Walks) -> list[CalibrationBin]:
+    """Return what becomes of decisions by their probability, in bins of equal width; empty ones are left out."""
+    decides = walks.leaf_labels != NO_LABEL
+    leaves = np.flatnonzero(decides)
+    mass = walks.by_class[:, leaves].sum(axis=0)
+    right = walks.by_class[walks.leaf_labels[leaves], leaves]
+    probability = walks.automaton.posteriors[walks.automaton.n_states + leaves].max(axis=1).astype(np.float64)
+    place = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
+    total = float(mass.sum())
+    bins = []
+    for number in range(CALIBRATION_BINS):
+        inside = place == number
+        of_bin = float(mass[inside].sum())
+        if of_bin > 0:
+            mean = float(mass[inside] @ probability[inside]) / of_bin
+            bins.append(CalibrationBin(of_bin / total, mean, float(right[inside].sum()) / of_bin))
+    return bins
+
+
+def calibration_error(bins: list[CalibrationBin]) -> float:
+    """Return the expected calibration error: the mean distance of probability and accuracy over the bins, by their shares."""
+    return sum(one.share * abs(one.probability - one.accuracy) for one in bins)
+
+
+def confusion_of(walks: Walks) -> F64:
+    """Return how often, in expectation, truth (rows) is decided as what (columns), float64 (classes, classes)."""
+    labels, n_classes = walks.leaf_labels, walks.automaton.n_classes
+    table = np.zeros((n_classes, n_classes))
+    for label in range(n_classes):
+        table[:, label] = walks.by_class[:, labels == label].sum(axis=1)
+    return table
+
+
+def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) -> dict[str, Any]:
+    """Return exact figures as a bundle keeps them (`with_expected`); ValueError for sampled ones."""
+    if found.trials:
+        raise ValueError("sampled figures are no expectation")
+    conditions: dict[str, Any] = {"profile": profile, "task": task, "split": split, "objects": found.objects}
+    return conditions | {
+        "accuracy": found.accuracy_mean,
+        "clicks": found.clicks_mean,
+        "photons": found.photons_mean,
+        "illumination": found.illumination,
+        "exposures": found.exposures_mean,
+    }
+
+
+def expected_differences(kept: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """Return which figures of a bundle's `expected` are others now; those of other conditions cannot be compared, and give none."""
+    names = EXPECTED_KEYS
+    if any(kept[name] != found[name] for name in names[:4]):
+        return []
+    return [
+        f"expected {name} is {kept[name]:.9g} in the bundle, {found[name]:.9g} here"
+        for name in names[4:]
+        if not math.isclose(kept[name], found[name], rel_tol=EXPECTED_TOLERANCE, abs_tol=EXPECTED_TOLERANCE)
+    ]
+
+
+def walk_payload(walks: Walks) -> dict[str, Any]:
+    """Return the calibration and the figures of the first objects, for `--json`."""
+    few = len(walks.right) <= FIRST_OBJECTS
+    first = None if few else asdict(measured_walks(walks.first(FIRST_OBJECTS)))
+    if first is not None:
+        del first["expected_calibration_error"]  # of so few objects it is mostly noise
+    bins = [asdict(one) for one in calibration_bins(walks)]
+    return {"exposures_longest": walks.automaton.n_slots, "calibration": bins, f"first_{FIRST_OBJECTS}": first}
