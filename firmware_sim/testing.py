@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
+from pans.runtime.bundle.automaton import reachable_automaton
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, with_expected
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.instrument.profile import Profile, load_profile
 
@@ -55,3 +56,33 @@ def small_bundle(profile: Profile, exposure_us: float) -> Bundle:
         back_end=BackEnd(table=rng.normal(size=(1 << N_PATTERNS, 3)).astype(np.float32)),
         provenance={},
     )
+
+
+def small_automaton_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
+    """Return a bundle of an automaton of six states and four slots: one edge ends early, walks meet again, states share patterns.
+
+    Patterns have 2 x 2 pixels; the light is that of the profile `ideal`. The expected figures are in range, but nobody's measurement.
+    """
+    rng = np.random.default_rng(2)
+    automaton = reachable_automaton(
+        pattern=[0, 1, 2, 1, 3, 0],
+        dwell=[4, 2, 1, 4, 3, 2],
+        dwell_steps=4,
+        successors=[[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]],
+        posteriors=rng.dirichlet(np.full(3, 0.6), 10),
+    )
+    patterns = rng.integers(0, levels, (4, 4))
+    patterns[:, 0] = levels - 1
+    top_hz = load_profile("ideal").projector.peak_photoelectrons_hz
+    bundle = make_bundle(
+        name="small automaton",
+        task="small",
+        classes=("a", "b", "c"),
+        image_shape=(2, 2),
+        optics=Shown(levels, patterns, exposure_us * 1e-6 * top_hz / (levels - 1)),
+        automaton=automaton,
+        provenance={"seed": 2},
+    )
+    conditions = {"profile": "ideal", "task": "small", "split": "test", "objects": 10}
+    figures = {"accuracy": 0.5, "clicks": 1.0, "photons": 2.0, "illumination": 3.0, "exposures": 2.0}
+    return with_expected(bundle, conditions | figures)

@@ -133,10 +133,14 @@ def mutated_array(dice: random.Random, array: NDArray[Any]) -> NDArray[Any]:
         flat[:] = flat[::-1].copy()
         return changed
     values: tuple[Any, ...] = FLOATS
+    if array.dtype.kind in "iu" and kind < 0.3:  # next to what was there: still in range more often than not
+        place = dice.randrange(flat.size)
+        flat[place] = flat[(place + 1) % flat.size] if kind < 0.2 else flat[place] ^ 1
+        return changed
     if array.dtype.kind in "iu":
         info = np.iinfo(array.dtype)
         values = (info.min, info.max, 0, 1, info.max // 2)
-    where = slice(None) if kind < 0.3 else [dice.randrange(flat.size) for _ in range(dice.choice((1, 1, 3, 20)))]
+    where = slice(None) if kind < 0.4 else [dice.randrange(flat.size) for _ in range(dice.choice((1, 1, 3, 20)))]
     flat[where] = np.array(dice.choice(values)).astype(array.dtype)
     return changed
 

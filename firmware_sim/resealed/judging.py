@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pans.firmware_sim.testing import small_setup
+from pans.firmware_sim.testing import small_automaton_bundle, small_setup
 from pans.hw_profiles import __file__ as _profiles
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import BackEnd, Shown, bundle_bytes, load_bundle, make_bundle
@@ -153,7 +153,7 @@ def _base_files() -> dict[str, _Kind]:
 
 
 def _bundles() -> list[bytes]:
-    """The shipped bundle, a table alone, passive optics, a head that gives pictures back."""
+    """The shipped bundle, a table alone, passive optics, a head that gives pictures back, automata of bits and of bytes."""
     shipped, _ = load_bundle(SHIPPED / "fashion10.pans")
     rng = np.random.default_rng(1)
     facts: dict[str, Any] = {"task": "small", "provenance": {"seed": 1, "losses": [0.5, 0.25]}}
@@ -174,7 +174,10 @@ def _bundles() -> list[bytes]:
         back_end=BackEnd(head_onnx=shipped.head_onnx),
         **facts,
     )
-    return [bundle_bytes(bundle) for bundle in (shipped, small_setup()[1], small_setup()[1], passive, picture)]
+    automata = [small_automaton_bundle(levels) for levels in (2, 8)]
+    return [
+        bundle_bytes(bundle) for bundle in (shipped, small_setup()[1], small_setup()[1], passive, picture, *automata)
+    ]
 
 
 def _made(make: Callable[[Path], bytes]) -> bytes:

@@ -27,6 +27,7 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import read_recording, replay
 from pans.runtime.record.format import Kind
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.report.file_facts import file_facts
 
 RUN_EVERY = 20  # accepted bundles: one in that many, told by its bytes, is run through the whole loop
 DECISIONS = 3
@@ -90,6 +91,10 @@ def _use_bundle(path: Path) -> None:
             decider.decide(counts[0], shots)
             if not np.isfinite(decider.scores_batch(counts, shots)).all() and bundle.table is not None and shots == 1:
                 raise ValueError("scores that are not finite from a checked table")
+    file_facts(path)
+    if bundle.automaton is not None:
+        for confidence in (0.5, 1.0):
+            make_decider(bundle, confidence=confidence)
     if not (math.isfinite(bundle.illumination()) and np.isfinite(bundle.patterns()).all()):
         raise ValueError("a light that is not finite")
     planned = [

@@ -100,6 +100,11 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
 
     found = np.asarray(clicks)
     if found.ndim == 1:
+        if bundle.n_features > 63:
+            raise UsageError(
+                f"words of one shot hold at most 63 clicks, {bundle.name} has {bundle.n_features}",
+                remedy="give counts (n, d_f)",
+            )
         if found.size and (int(found.min()) < 0 or int(found.max()) >> bundle.n_features):
             raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
         found = word_means(found, bundle.n_features).astype(np.int64)

@@ -101,6 +101,12 @@ def greatest_light(automaton: Automaton, light: NDArray[np.float64]) -> float:
     return float(most[0])
 
 
+def shortest_walk(automaton: Automaton) -> int:
+    """Return the exposures of the shortest walk: one more than the depth of the first state with a leaf behind it."""
+    ends = (automaton.successors >= automaton.n_states).any(axis=1)
+    return int(automaton.depth[ends].min()) + 1
+
+
 def check_expected(expected: Mapping[str, Any], automaton: Automaton) -> None:
     """Raise ValueError for figures that are not in range or that no walk of `automaton` can have."""
     demand(

@@ -65,6 +65,25 @@ def confusion(counts: NDArray[np.int64], classes: Sequence[str]) -> bytes:
     return _done(figure)
 
 
+def states_by_slot(slots: Sequence[NDArray[np.float32]], leaves: NDArray[np.float32]) -> bytes:
+    """Draw how many states each slot has, the spread of their largest posterior (median and middle half), and that of the leaves."""
+    figure, axes = _new(9.0, 4.2, 2, 2)
+    (count, empty), (sure, of_leaves) = axes
+    slot = np.arange(len(slots))
+    count.bar(slot, [len(values) for values in slots], color="C0")
+    count.set(ylabel="states", xlim=(-1, len(slots)))
+    low, middle, high = np.array([np.quantile(values, (0.25, 0.5, 0.75)) for values in slots]).T
+    sure.fill_between(slot, low, high, color="C0", alpha=0.25, lw=0, label="middle half of the states")
+    sure.plot(slot, middle, color="C0", label="median")
+    sure.set(xlabel="slot", ylabel="largest posterior", xlim=(-1, len(slots)), ylim=(0, 1))
+    sure.legend(fontsize=7, loc="upper left")
+    of_leaves.hist(leaves, bins=20, range=(0, 1), orientation="horizontal", color="C1")
+    of_leaves.set(xlabel="leaves", ylim=(0, 1))
+    empty.set_axis_off()
+    figure.get_layout_engine().set(wspace=0.05)
+    return _done(figure)
+
+
 def reliability(bins: Sequence[tuple[float, float, float]], title: str) -> bytes:
     """Draw accuracy against the probability that was stated, and how many decisions stated it: (probability, accuracy, share) per bin."""
     figure, axes = _new(5.0, 5.4, 2)

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.bundle.optics import Analyser
+from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -23,6 +25,8 @@ from pans.runtime.record import Recording, read_recording
 
 from .handshakes import handshakes
 from .verify import file_kind
+
+MOST_USED = 5  # patterns of an automaton that are named
 
 
 def file_facts(path: str | Path) -> dict[str, Any]:
@@ -47,7 +51,8 @@ def file_facts(path: str | Path) -> dict[str, Any]:
 
 
 def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
-    back_ends = [name for name, part in (("table", bundle.table), ("onnx", bundle.head_onnx)) if part is not None]
+    parts = {"table": bundle.table, "onnx": bundle.head_onnx, "automaton": bundle.automaton}
+    back_ends = [name for name, part in parts.items() if part is not None]
     return {
         "name": bundle.name,
         "task": bundle.task,
@@ -55,7 +60,7 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "encoder": bundle.encoder,
         "sensor": None if bundle.analyser is None else _sensor_facts(bundle.analyser),
         "picture_shape_px": None if bundle.picture_shape is None else list(bundle.picture_shape),
-        "patterns": bundle.n_features,
+        "patterns": bundle.n_patterns,
         "image_shape_px": list(bundle.image_shape),
         "levels": bundle.levels,
         "photons_per_level": bundle.photons_per_level,
@@ -64,7 +69,28 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "head_bytes": 0 if bundle.head_onnx is None else len(bundle.head_onnx),
         "table_rows": 0 if bundle.table is None else len(bundle.table),
         "golden_vectors": len(bundle.golden_means),
+        "automaton": None if bundle.automaton is None else automaton_facts(bundle.automaton),
+        "expected": None if bundle.expected is None else dict(bundle.expected),
         "provenance": dict(bundle.provenance),
+    }
+
+
+def automaton_facts(automaton: Automaton) -> dict[str, Any]:
+    """Return what an automaton is: its size, the exposures of its walks, how patterns are shared, how sure its leaves are."""
+    used = np.bincount(automaton.pattern)
+    most = np.argsort(-used, kind="stable")[:MOST_USED]
+    leaves = automaton.posteriors[automaton.n_states :]
+    return {
+        "states": automaton.n_states,
+        "leaves": automaton.n_leaves,
+        "outcomes": automaton.n_outcomes,
+        "exposures_longest": automaton.n_slots,
+        "exposures_shortest": shortest_walk(automaton),
+        "states_per_slot_most": int(np.bincount(automaton.depth).max()),
+        "dwell_steps": automaton.dwell_steps,
+        "patterns_shown": int(np.count_nonzero(used)),
+        "states_of_most_used_patterns": {str(i): int(used[i]) for i in most if used[i]},
+        "leaf_probability_median": float(np.median(leaves.max(axis=1))),
     }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
 
 from . import figures as draw
@@ -25,7 +26,7 @@ def bundle_page(bundle: Bundle, sha256: str, path: Path) -> bytes:
     facts = file_facts(path)
     provenance = facts.pop("provenance", {})
     page.facts(facts)
-    page.heading("Patterns" if bundle.analyser is None else "Optics")
+    page.heading("Optics" if bundle.analyser is not None else "Patterns" if bundle.automaton is None else "Automaton")
     add_optics(page, bundle)
     page.heading("Provenance")
     page.facts({"SHA-256": sha256, **provenance})
@@ -34,6 +35,9 @@ def bundle_page(bundle: Bundle, sha256: str, path: Path) -> bytes:
 
 def add_optics(page: Page, bundle: Bundle) -> None:
     """Add the patterns that are shown, or the rows of the passive optics."""
+    if bundle.automaton is not None:
+        _add_automaton(page, bundle, bundle.automaton)
+        return
     if bundle.analyser is None:
         pictures = bundle.patterns().reshape(-1, *bundle.image_shape)
         more = (
@@ -53,3 +57,22 @@ def add_optics(page: Page, bundle: Bundle) -> None:
     matrix = bundle.analyser.matrix.reshape(-1, *bundle.image_shape)
     values, unit = (np.abs(matrix), "modulus of W") if np.iscomplexobj(matrix) else (matrix, "W")
     page.figure(draw.patterns(values.astype(np.float64), unit), f"The rows of W, {bundle.encoder}: one per detector.")
+
+
+def _add_automaton(page: Page, bundle: Bundle, automaton: Automaton) -> None:
+    """Add the patterns that most states show, how many states each slot has, and how sure states and leaves are."""
+    used = np.bincount(automaton.pattern, minlength=bundle.n_patterns)
+    most = np.argsort(-used, kind="stable")[: draw.PATTERNS_MAX]
+    shown = bundle.pattern_levels[most].astype(np.float64) * bundle.photons_per_level
+    page.figure(
+        draw.patterns(shown.reshape(-1, *bundle.image_shape), "photoelectrons per exposure\nand unit transmission"),
+        f"{len(most)} of {bundle.n_patterns} patterns, those of most states first (of {int(used[most[0]])} states the first), in "
+        f"{bundle.levels} whole levels, as they are with the light on all the time.",
+    )
+    sure = automaton.posteriors.max(axis=1)
+    states = sure[: automaton.n_states]
+    slots = [states[automaton.depth == slot] for slot in range(automaton.n_slots)]
+    page.figure(
+        draw.states_by_slot(slots, sure[automaton.n_states :]),
+        f"States of each slot, and the largest probability in their posteriors; on the right that of the {automaton.n_leaves} leaves.",
+    )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.facts import GOLDEN_WORK_MAX
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
 from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, word_means
@@ -139,7 +140,10 @@ def _what_survives(path: str | Path) -> list[str]:
 
 def _verify_bundle(bundle: Bundle, verdict: FileVerdict) -> None:
     """Golden vectors on every back end, table against head on every word, and signs of a bad export."""
-    parts = {"table": bundle.table, "onnx": bundle.head_onnx, "int8": bundle.int8_head, "int8-onnx": bundle.int8_onnx}
+    parts = {
+        **{"table": bundle.table, "onnx": bundle.head_onnx, "int8": bundle.int8_head, "int8-onnx": bundle.int8_onnx},
+        "automaton": bundle.automaton,
+    }
     for backend, part in parts.items():
         if part is not None:
             try:
@@ -178,12 +182,28 @@ def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
         yield f"the brightest pixel is at level {top} of {bundle.levels - 1}: every exposure is longer than it must be"
     dark = np.flatnonzero(~bundle.pattern_levels.any(axis=1))
     if len(dark) and bundle.analyser is None:
-        yield f"{len(dark)} of {bundle.n_features} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
+        yield f"{len(dark)} of {bundle.n_patterns} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
     if bundle.table is not None:
-        never = set(range(bundle.n_classes)) - set(np.unique(bundle.table.argmax(axis=1)).tolist())
-        if never:
-            names = ", ".join(bundle.classes[label] for label in sorted(never)[:5])
-            yield f"{len(never)} classes are never decided by any click word: {names}"
+        yield from _never_decided(bundle, bundle.table)
+    if bundle.automaton is not None:
+        yield from _automaton_alerts(bundle, bundle.automaton)
+
+
+def _automaton_alerts(bundle: Bundle, automaton: Automaton) -> Iterator[str]:
+    unused = np.setdiff1d(np.arange(bundle.n_patterns), automaton.pattern)
+    if len(unused):
+        yield f"{len(unused)} of {bundle.n_patterns} patterns are shown by no state (the first: {int(unused[0])})"
+    longest = int(automaton.dwell.max())
+    if longest < automaton.dwell_steps:
+        yield f"the longest dwell is {longest} of {automaton.dwell_steps}: every exposure is longer than it must be"
+    yield from _never_decided(bundle, automaton.posteriors[automaton.n_states :])
+
+
+def _never_decided(bundle: Bundle, scores: NDArray[np.float32]) -> Iterator[str]:
+    never = set(range(bundle.n_classes)) - set(np.unique(scores.argmax(axis=1)).tolist())
+    if never:
+        names = ", ".join(bundle.classes[label] for label in sorted(never)[:5])
+        yield f"{len(never)} classes are never decided by any click word: {names}"
 
 
 def _verify_recording(recording: Recording, verdict: FileVerdict) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from automata import automaton_bundle, diamond, random_automaton
 
 import pans
 from pans.runtime.errors import UsageError
@@ -44,6 +45,15 @@ def test_words_and_counts_are_decided_alike_and_checked() -> None:
     for wrong in ([-1], [1 << bundle.n_features], [[2] * bundle.n_features], [[0, 1]]):
         with pytest.raises(UsageError, match="allowed"):
             pans.decide(bundle, wrong)
+
+
+def test_an_automaton_decides_on_words_and_long_words_are_counts() -> None:
+    short, long = automaton_bundle(diamond()), automaton_bundle(random_automaton(1, slots=70, width=2))
+    for clicks in ([0b000, 0b111], [[0, 0, 0], [1, 1, 1]]):
+        assert pans.decide(short, clicks).labels.tolist() == [0, 1]
+    with pytest.raises(UsageError, match="at most 63 clicks"):
+        pans.decide(long, [1])
+    assert len(pans.decide(long, np.zeros((2, 70), int)).labels) == 2
 
 
 def test_a_plan_is_built_for_a_shipped_profile() -> None:

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from automata import automaton_bundle, diamond, early_leaf
 from bundles import made_bundle
 
+from pans.runtime.bundle import Automaton, with_expected
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile, shipped_profiles
@@ -200,6 +202,46 @@ def test_info_of_every_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     perfect.write_text(re.sub(r"(?m)^contrast *=.*$", "contrast = inf", load_profile("oled-qcmos").text))
     code, found = run(capsys, "info", perfect, "--json")
     assert (code, found["object_modulator"]["contrast"]) == (0, "inf")
+
+
+EXPECTED = {
+    **{"profile": "ideal", "task": "test", "split": "test", "objects": 9, "accuracy": 0.5, "clicks": 1.0},
+    **{"photons": 1.5, "illumination": 4.0, "exposures": 2.5},
+}
+
+
+def test_info_of_an_automaton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bundle(with_expected(automaton_bundle(diamond()), EXPECTED), tmp_path / "a.pans")
+    code, found = run(capsys, "info", tmp_path / "a.pans", "--json")
+    assert code == 0
+    assert (found["encoder"], found["patterns"], found["back_ends"]) == ("automaton", 3, ["automaton"])
+    assert found["expected"] == EXPECTED
+    automaton = found["automaton"]
+    assert (automaton["states"], automaton["leaves"], automaton["outcomes"], automaton["dwell_steps"]) == (5, 3, 2, 2)
+    assert (automaton["exposures_longest"], automaton["exposures_shortest"]) == (3, 3)
+    assert automaton["states_of_most_used_patterns"] == {"0": 2, "1": 2, "2": 1}
+    code, text = run(capsys, "info", tmp_path / "a.pans")
+    for words in ("expected.accuracy", "automaton.states", "automaton.exposures_longest"):
+        assert words in text
+    write_bundle(automaton_bundle(early_leaf()), tmp_path / "b.pans")
+    code, found = run(capsys, "info", tmp_path / "b.pans", "--json")
+    assert found["automaton"]["exposures_shortest"] == 1
+
+
+def test_verify_tells_of_an_odd_automaton(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bundle(automaton_bundle(diamond()), tmp_path / "good.pans")
+    assert run(capsys, "verify", tmp_path / "good.pans", "--json")[0] == 0
+    half = Automaton([0], [1], 2, [[1, 1]], [[0.4, 0.3, 0.3], [0.5, 0.3, 0.2]])
+    levels = [[3, 0, 0, 0], [0, 0, 0, 0]]
+    write_bundle(automaton_bundle(half, pattern_levels=levels), tmp_path / "odd.pans")
+    code, found = run(capsys, "verify", tmp_path / "odd.pans", "--json")
+    assert (code, found["violations"]) == (1, [])
+    messages = " ".join(item["message"] for item in found["alerts"])
+    for sign in (
+        *("1 of 2 patterns are dark", "1 of 2 patterns are shown by no state (the first: 1)"),
+        *("the longest dwell is 1 of 2", "2 classes are never decided by any click word: c1, c2"),
+    ):
+        assert sign in messages
 
 
 def test_info_reads_a_damaged_recording_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from automata import automaton_bundle, random_automaton
 from commands import page_of, words_of
 
 from pans.runtime.bundle.model import load_bundle, write_bundle
@@ -101,3 +102,18 @@ def test_without_matplotlib_the_extra_is_named(
     monkeypatch.setattr(importlib, "import_module", without)
     assert main(["report", str(demo), "-o", str(tmp_path / "a.html")]) == 2
     assert "pans-runtime[plot]" in capsys.readouterr().err
+
+
+def test_an_automaton_s_page(tmp_path: Path) -> None:
+    write_bundle(automaton_bundle(random_automaton(2, slots=6, patterns=9)), tmp_path / "a.pans")
+    page = page_of(tmp_path / "a.pans", tmp_path)
+    words = words_of(page)
+    assert "<h2>Automaton</h2>" in page
+    for text in (
+        "exposures_longest",
+        "states_of_most_used_patterns",
+        "those of most states first",
+        "leaf_probability_median",
+    ):
+        assert text in words
+    assert len(re.findall(r"<img [^>]*src=\"data:image/", page)) == 2
