@@ -1,10 +1,14 @@
-"""Small trainings that several test files share."""
+"""Small trainings that several test files share: a task, machines with random patterns, short fits."""
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
+import numpy as np
 import pytest
+
+from pans.trainer.tasks.registry import Objects, Task
 
 
 @pytest.fixture
@@ -13,3 +17,40 @@ def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     from pans.trainer.train import head_fit
 
     monkeypatch.setattr(head_fit, "fit_head_exactly", partial(head_fit.fit_head_exactly, steps=30))
+
+
+def bars_task(n: int = 1200, seed: int = 0) -> Task:
+    """Four classes on 6 x 6 pixels: the bright bar stands in one of four columns, over noise."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 4, n)
+    images = rng.integers(0, 50, (n, 6, 6), dtype=np.uint8)
+    images[np.arange(n), :, labels + 1] = rng.integers(150, 256, (n, 6), dtype=np.uint8)
+    part = n * 2 // 3
+    train, test = Objects(images[:part], labels[:part]), Objects(images[part:], labels[part:])
+    return Task("bars", ("a", "b", "c", "d"), train, test, "0" * 64, "the test part of the data")
+
+
+def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> Any:
+    """Three levels of 1, 2 and 3 states on 5 pixels, four classes; a leaf behind level 0, two behind level 1, five behind level 2."""
+    import torch
+
+    from pans.trainer.adaptive.light import Bits, Grey
+    from pans.trainer.adaptive.machine import Level, Machine
+
+    random = torch.Generator().manual_seed(seed)
+    successors = [[[0], [1]], [[2, 0], [1, 4]], [[0, 2, 4], [1, 3, 0]]]
+    one = torch.full((1, 1), -1.0, dtype=torch.float64)
+    levels = []
+    for number, edges in enumerate(successors):
+        shape = len(edges[0]), 5
+        drawn = torch.randn(shape, generator=random, dtype=torch.float64)
+        if bits:
+            own = torch.randn((shape[0], 1), generator=random, dtype=torch.float64) - 1
+            light: Any = Bits(drawn, one if shared else own)
+        else:
+            light = Grey(drawn * 0.6)
+        if number == 0:
+            edges = [[2], [0]]  # a leaf, and a state
+        levels.append(Level(light, torch.tensor(edges)))
+    counts = [torch.rand((n, 4), generator=random, dtype=torch.float64) + 0.1 for n in (1, 2, 5)]
+    return Machine(levels, counts)

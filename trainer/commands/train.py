@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from pans.trainer.train.loop import EpochReport, Trained
 
 DEFAULT_PROFILE = "oled-qcmos"
+AUTOMATON = "automaton"
 HISTORY_FILES = ("history.json", "curves.png", "evolution.png")
 # options that are numbers, with the defaults of Options: name, metavar, help
 NUMBERS = (
@@ -72,9 +73,22 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task", metavar="TASK", help="a name (`pans data list`), a .npz file, or a folder of class folders"
     )
-    parser.add_argument("--features", type=int, required=True, metavar="D", help="number of patterns")
-    parser.add_argument("--profile", default=DEFAULT_PROFILE, metavar="P", help=f"default: {DEFAULT_PROFILE}")
-    parser.add_argument("--encoder", choices=ENCODERS, help="how light meets the object (default: what the task's is)")
+    parser.add_argument("--features", type=int, metavar="D", help="number of patterns (not of an automaton)")
+    parser.add_argument("--profile", metavar="P", help=f"default: {DEFAULT_PROFILE}; of an automaton ideal")
+    parser.add_argument(
+        "--encoder",
+        choices=(*ENCODERS, AUTOMATON),
+        help="how light meets the object (default: what the task's is); automaton: each pattern follows from the clicks before it",
+    )
+    parser.add_argument(
+        "--exposures", type=int, metavar="T", help="of an automaton: exposures per decision (default: by the budget)"
+    )
+    parser.add_argument(
+        "--states", type=int, metavar="S", help="of an automaton: most states per exposure (default: by the budget)"
+    )
+    parser.add_argument(
+        "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"
+    )
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
     parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
     parser.add_argument(
@@ -91,14 +105,13 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--budget",
         choices=tuple(BUDGETS),
-        default="firm",
         help="how strictly --photons and --clicks hold during training (default firm)",
     )
     defaults = {field.name: field.default for field in fields(Options)}
     for name, metavar, words in NUMBERS:
         flag, default = "--" + name.replace("_", "-"), defaults[name]
         kind = float if default is None else type(default)
-        parser.add_argument(flag, type=kind, default=default, metavar=metavar, help=words)
+        parser.add_argument(flag, type=kind, metavar=metavar, help=words)
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
     parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
     parser.add_argument(
@@ -117,14 +130,24 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
 
 def _train(args: argparse.Namespace) -> int:
     checkpoint = args.out.with_name(args.out.name + ".checkpoint")
-    _check_files(args, checkpoint)
+    if args.encoder == AUTOMATON:
+        from .train_automaton import train_automaton_command
+
+        check_files(args, checkpoint)
+        return train_automaton_command(args, checkpoint)
+    if args.features is None:
+        raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
+    for name in ("exposures", "states", "grey"):
+        if getattr(args, name):
+            raise UsageError(f"--{name} belongs to an automaton", remedy="add --encoder automaton, or leave it out")
+    check_files(args, checkpoint)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.device import computing_on
     from pans.trainer.tasks.registry import load_task
     from pans.trainer.train.loop import train
 
-    profile = load_profile(args.profile)
+    profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     options = _options(args, task)
     check_options(options, profile)
@@ -155,9 +178,9 @@ def _train(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
-def _check_files(args: argparse.Namespace, checkpoint: Path) -> None:
+def check_files(args: argparse.Namespace, checkpoint: Path) -> None:
     """Refuse, before anything is loaded, what cannot be written in the end; a checkpoint is hours of work too."""
-    inputs = [args.task, args.profile]
+    inputs = [args.task, *([args.profile] if args.profile else [])]
     if checkpoint.exists() and not (args.resume or args.force):
         raise UsageError(
             f"{checkpoint}: is here, of a training that was interrupted",
@@ -221,7 +244,7 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     best = "exact" if args.features <= EXACT_FEATURES_MAX else "local"
     estimator = args.estimator or ("ste" if is_picture else best)
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    given = {name: getattr(args, name) for name in AS_GIVEN}
+    given = {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
     return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
 
 

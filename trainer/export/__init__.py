@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from .automaton import ExportedAutomaton, export_automaton
     from .writer import Exported, export_trained
 
-__all__ = ["Exported", "export_trained"]
+__all__ = ["Exported", "ExportedAutomaton", "export_automaton", "export_trained"]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "Exported": ".writer",
+        "ExportedAutomaton": ".automaton",
+        "export_automaton": ".automaton",
         "export_trained": ".writer",
     },
 )

@@ -7,30 +7,32 @@ with `weights_only`: tensors and plain values, nothing that could run code.
 from __future__ import annotations
 
 import io
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.outputs import replace_file
-from pans.trainer.options import Options
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
-def _identity(options: Options, data_sha256: str) -> dict[str, Any]:
-    plain = {key: str(value) for key, value in asdict(replace(options, restarts=1)).items()}
-    return plain | {"data": data_sha256}
+def _identity(options: DataclassInstance, data_sha256: str) -> dict[str, Any]:
+    plain = {key: str(value) for key, value in asdict(options).items()} | {"data": data_sha256}
+    return plain | {"restarts": "1"} if "restarts" in plain else plain
 
 
-def write_checkpoint(path: Path, options: Options, data_sha256: str, state: dict[str, Any]) -> None:
+def write_checkpoint(path: Path, options: DataclassInstance, data_sha256: str, state: dict[str, Any]) -> None:
     """Write `state` (nested dicts and lists of tensors and plain values) to `path`, whole or not at all."""
     file = io.BytesIO()
     torch.save({"identity": _identity(options, data_sha256), **state}, file)
     replace_file(path, file.getbuffer())
 
 
-def read_checkpoint(path: Path, options: Options, data_sha256: str) -> dict[str, Any]:
+def read_checkpoint(path: Path, options: DataclassInstance, data_sha256: str) -> dict[str, Any]:
     """Return the state in `path`; UsageError unless it belongs to the same options (but restarts) and data."""
     if not path.is_file():
         raise UsageError(f"{path} is not there", remedy="leave --resume out to start anew")

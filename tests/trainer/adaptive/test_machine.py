@@ -1,0 +1,157 @@
+"""The exact forward pass and its gradient: against all click words one by one, and against differences of the loss."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from mpmath import mp, mpf
+from naive_adaptive import every_word
+from trainings import random_machine
+
+from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
+from pans.trainer.adaptive.figures import figures
+from pans.trainer.adaptive.light import Bits
+from pans.trainer.adaptive.machine import Sight, backward, brought, forward
+from pans.trainer.adaptive.objects import Block
+from pans.trainer.adaptive.outcomes import no_click
+
+NOISY = ClickLaw(dark_per_exposure=0.02, read_noise_e=0.3, threshold_e=0.5)
+LAWS = (ClickLaw(), ClickLaw(0.05), NOISY)
+GREY = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255], [0, 0, 0, 0, 0]], dtype=torch.float64)
+ONE_HOT = torch.tensor([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]], dtype=torch.float64)
+
+
+def wide(law, floor=0.0, gain=1 / 255):
+    return Sight(law, gain, floor, torch.float64)
+
+
+@pytest.mark.parametrize("dark", [0.0, 0.05])
+@pytest.mark.parametrize("bits", [False, True])
+def test_forward_is_the_sum_over_all_words(dark, bits):
+    machine, sight = random_machine(1, bits), wide(ClickLaw(dark), 0.01)
+    passed = forward(machine, sight, GREY)
+    successors = [level.successors.tolist() for level in machine.levels]
+    n_states = [level.n_states for level in machine.levels] + [0]
+    for i in range(len(GREY)):
+        light = [brought(level.light, sight, GREY)[:, i].tolist() for level in machine.levels]
+        leaves, clicks, photons, exposures = every_word(successors, n_states, light, dark)
+        assert float(sum(leaves.values())) == pytest.approx(1.0, abs=1e-15)
+        for (level, leaf), chance in leaves.items():
+            assert float(passed.leaves[level - 1][leaf, i]) == pytest.approx(float(chance), rel=1e-12, abs=1e-300)
+        assert float(passed.clicks()[i]) == pytest.approx(float(clicks), rel=1e-12)
+        assert float(passed.photons()[i]) == pytest.approx(float(photons), rel=1e-12)
+        assert sum(float(step.alpha[:, i].sum()) for step in passed.steps) == pytest.approx(float(exposures), rel=1e-12)
+
+
+@pytest.mark.parametrize("light", [1e-30, 1e-7, 3.0, 50.0, 1e4])
+def test_forward_keeps_tiny_and_nearly_certain_chances(light):
+    machine, sight = random_machine(2), wide(ClickLaw(), gain=1.0)
+    for level in machine.levels:
+        level.light.root = torch.full_like(level.light.root, (light / 5) ** 0.5)
+    passed = forward(machine, sight, torch.ones(1, 5, dtype=torch.float64))
+    mp.dps = 60
+    exact = float(mpf(1) - mp.exp(-mpf(light)))
+    got = float((passed.steps[0].alpha * (1 - passed.steps[0].dark)).sum())
+    assert got == pytest.approx(exact, rel=1e-12, abs=2e-16)
+    assert torch.cat(passed.leaves).sum().item() == pytest.approx(1.0, abs=1e-15)
+    assert all(bool((leaves >= 0).all()) for leaves in passed.leaves)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_probability_of_no_click_is_the_runtimes(law):
+    light = np.array([0.0, 1e-7, 0.01, 0.5, 1.0, 3.0, 10.0, 40.0])
+    dark, fall = no_click(torch.from_numpy(light), law)
+    np.testing.assert_allclose(dark.numpy(), np.exp(log_no_click(law, light)), rtol=2e-7, atol=1e-12)
+    step = 1e-5
+    slope = (click_probability(law, light + step) - click_probability(law, np.maximum(0, light - step))) / (
+        np.minimum(light, step) + step
+    )
+    np.testing.assert_allclose(fall.numpy(), slope, rtol=2e-5, atol=1e-8)
+
+
+def loss_of(machine, sight, price):
+    passed = forward(machine, sight, GREY)
+    total = price * float(passed.photons().mean())
+    for counts, leaves in zip(machine.counts, passed.leaves):
+        log = torch.log(counts / counts.sum(dim=1, keepdim=True))
+        total -= float(((leaves @ ONE_HOT.T) * log).sum()) / len(GREY)
+    return total
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("floor", [0.0, 0.02])
+def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor):
+    machine, sight, price = random_machine(3), wide(law, floor), 0.07
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), price)
+    step = 1e-6
+    for level in machine.levels:
+        gradient = level.light.root.grad.clone()
+        for index in np.ndindex(*level.light.root.shape):
+            there = level.light.root[index].item()
+            level.light.root[index] = there + step
+            above = loss_of(machine, sight, price)
+            level.light.root[index] = there - step
+            below = loss_of(machine, sight, price)
+            level.light.root[index] = there
+            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_gradient_of_the_brightness_of_bits(shared):
+    machine, sight, price = random_machine(4, bits=True, shared=shared), wide(ClickLaw(0.01), 0.01), 0.05
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), price)
+    step = 1e-6
+    tensors = {id(level.light.log_light): level.light.log_light for level in machine.levels}
+    assert len(tensors) == (1 if shared else 3)
+    for tensor in tensors.values():
+        gradient = tensor.grad.clone()
+        for index in np.ndindex(*tensor.shape):
+            there = tensor[index].item()
+            tensor[index] = there + step
+            above = loss_of(machine, sight, price)
+            tensor[index] = there - step
+            below = loss_of(machine, sight, price)
+            tensor[index] = there
+            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+
+
+def test_gradient_of_a_bit_is_that_of_a_sigmoid():
+    lean = torch.tensor([[-0.7, 0.0, 0.1, 2.0]], dtype=torch.float64, requires_grad=True)
+    slope = torch.tensor([[1.0, -2.0, 3.0, 4.0]], dtype=torch.float64)
+    (torch.sigmoid(4 * lean) * slope).sum().backward()
+    wanted = lean.grad.clone()
+    with torch.no_grad():
+        bits = Bits(lean.detach().clone(), torch.zeros(1, 1, dtype=torch.float64))
+        bits.take(slope.clone(), torch.zeros(1, 1, dtype=torch.float64))
+    torch.testing.assert_close(bits.lean.grad, wanted)
+
+
+def test_bfloat16_products_keep_one_bit_patterns_exact_and_light_close():
+    random = torch.Generator().manual_seed(5)
+    grey = torch.randint(0, 256, (40, 784), generator=random).float()
+    mask = (torch.rand(30, 784, generator=random) < 0.1).float()
+    exact = Sight(ClickLaw(), 1 / 255).light(mask, grey)
+    quick = Sight(ClickLaw(), 1 / 255, products=torch.bfloat16).light(mask, grey.bfloat16())
+    assert float(((quick - exact).abs() / exact).max()) < 2**-8  # the sum is rounded once, to 8 bits
+
+
+def test_figures_are_means_over_the_objects():
+    machine, sight = random_machine(6), wide(ClickLaw(0.02), 0.01)
+    found = figures(machine, sight, [Block(GREY[:2], ONE_HOT[:, :2]), Block(GREY[2:], ONE_HOT[:, 2:])])
+    passed = forward(machine, sight, GREY)
+    assert found.clicks == pytest.approx(float(passed.clicks().mean()))
+    assert found.photons == pytest.approx(float(passed.photons().mean()))
+    right = sum(
+        float(leaves[leaf, i])
+        for counts, leaves in zip(machine.counts, passed.leaves)
+        for leaf in range(len(leaves))
+        for i in range(3)
+        if int(counts[leaf].argmax()) == int(ONE_HOT[:, i].argmax())
+    )
+    assert found.accuracy == pytest.approx(right / 3)
+    clear = forward(machine, Sight(ClickLaw(0.02), 1.0, 0.0, torch.float64), torch.ones(1, 5, dtype=torch.float64))
+    shown = [step.light[:, 0] for step in clear.steps]
+    walked = sum(float(step.alpha.mean(dim=1) @ light) for step, light in zip(passed.steps, shown))
+    assert found.illumination == pytest.approx(walked)

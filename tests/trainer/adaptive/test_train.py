@@ -1,0 +1,190 @@
+"""Training of an automaton on a small task: what it learns, the budget, repeatability, checkpoints, the export, and what is refused."""
+
+# ruff: noqa: E402  (what follows needs torch)
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from trainings import bars_task
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.errors import PansError, PlanError, UsageError
+from pans.runtime.instrument.profile import load_profile, parse_profile
+from pans.trainer.adaptive.finished import Grid, to_grid
+from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options, default_size, price_at
+from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.export.automaton import compare_walks, export_automaton, measure_walks
+
+IDEAL = load_profile("ideal")
+SMALL = AutomatonOptions(photons=4.0, exposures=6, states=12, batch=64, tune_epochs=3, epochs=6, first_price=0.1)
+
+
+@pytest.fixture(scope="module")
+def task():
+    return bars_task()
+
+
+@pytest.fixture(scope="module")
+def trained(task):
+    return train_automaton(task, IDEAL, SMALL)
+
+
+def profile_of(name, **changes):
+    """A shipped profile with other values."""
+    text = load_profile(name).text
+    for old, new in changes.values():
+        assert old in text
+        text = text.replace(old, new)
+    return parse_profile(text, f"{name}.toml")
+
+
+def test_learns_the_bars_within_its_budget(task, trained):
+    found = measure_walks(export_bundle(trained, task), task.test, IDEAL).figures()
+    assert found.accuracy_mean > 0.7  # four classes: 0.25 by chance
+    assert found.photons_mean < 4.0 * 1.05
+    assert 0.98 * 4.0 < trained.held_back.photons <= 4.0
+    assert found.expected_calibration_error < 0.1
+
+
+def export_bundle(trained, task, profile=IDEAL):
+    from pans.trainer.export.automaton import bundle_of
+
+    return bundle_of(trained, task, profile, "bars", {})
+
+
+def test_a_budget_of_clicks_is_met(task):
+    found = train_automaton(task, IDEAL, replace(SMALL, photons=None, clicks=1.5)).held_back
+    assert 0.98 * 1.5 < found.clicks <= 1.5
+
+
+def test_the_same_seed_gives_the_same_automaton_and_another_seed_another(task, trained):
+    again = train_automaton(task, IDEAL, SMALL)
+    for name in ("pattern_levels", "dwell", "successors", "posteriors"):
+        np.testing.assert_array_equal(getattr(again.arrays, name), getattr(trained.arrays, name))
+    other = train_automaton(task, IDEAL, replace(SMALL, seed=1))
+    assert other.held_back != trained.held_back
+
+
+@pytest.mark.parametrize("stop_at", [7, 8, 11])
+def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_path, stop_at):
+    path = tmp_path / "bars.checkpoint"
+
+    def stop(told):
+        if told.done == stop_at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_automaton(task, IDEAL, SMALL, checkpoint=path, report=stop)
+    resumed = path.is_file()
+    went_on = train_automaton(task, IDEAL, SMALL, checkpoint=path, resume=resumed)
+    assert resumed == (stop_at > 7)  # the first state is kept after the first whole epoch of tuning
+    np.testing.assert_array_equal(went_on.arrays.pattern_levels, trained.arrays.pattern_levels)
+    np.testing.assert_array_equal(went_on.arrays.posteriors, trained.arrays.posteriors)
+
+
+def test_a_checkpoint_of_other_options_is_refused(task, tmp_path):
+    path = tmp_path / "bars.checkpoint"
+    train_automaton(task, IDEAL, replace(SMALL, epochs=1, tune_epochs=1), checkpoint=path)
+    with pytest.raises(UsageError, match="belongs to another training"):
+        train_automaton(task, IDEAL, replace(SMALL, epochs=2, tune_epochs=1), checkpoint=path, resume=True)
+
+
+def test_one_bit_projector_without_dwell_shows_one_brightness(task):
+    profile = profile_of("dmd-spad", rate=("pattern_memory = 43_690", "pattern_memory = 43_690"))
+    profile = replace(profile, projector=replace(profile.projector, dwell_steps=1))
+    arrays = train_automaton(task, profile, SMALL).arrays
+    assert set(np.unique(arrays.pattern_levels)) <= {0, 1}
+    assert arrays.dwell_steps == 1
+    assert set(arrays.dwell) == {1}
+
+
+def test_dwell_is_in_whole_steps_of_the_profile(task):
+    profile = load_profile("dmd-spad")
+    profile = replace(profile, projector=replace(profile.projector, dwell_steps=20))
+    arrays = train_automaton(task, profile, SMALL).arrays
+    assert arrays.dwell_steps == 20
+    assert arrays.dwell.min() >= 1
+    assert arrays.dwell.max() <= 20
+    assert len(set(arrays.dwell)) > 3
+    low = profile.projector.peak_photoelectrons_hz * profile.exposure.min_us * 1e-6
+    assert arrays.photons_per_level >= low * (1 - 1e-9)
+
+
+def test_grey_patterns_are_whole_levels(task):
+    trained = train_automaton(task, IDEAL, replace(SMALL, grey=True))
+    assert len(np.unique(trained.arrays.pattern_levels)) > 50
+    compare_walks(export_bundle(trained, task), trained, task, IDEAL)
+
+
+def test_contrast_and_read_noise_of_a_profile_are_trained_through(task):
+    profile = load_profile("oled-qcmos")
+    assert profile.min_transmission > 0
+    trained = train_automaton(task, profile, SMALL)
+    bundle = export_bundle(trained, task, profile)
+    compare_walks(bundle, trained, task, profile)
+    found = measure_walks(bundle, task.test, profile).figures()
+    assert found.accuracy_mean > 0.6
+    assert found.clicks_mean == pytest.approx(trained.held_back.clicks, rel=0.1)
+
+
+def test_export_writes_a_bundle_that_is_read_back(task, trained, tmp_path):
+    path = tmp_path / "bars.pans"
+    exported = export_automaton(path, trained, task, IDEAL, name="bars", provenance={})
+    bundle, digest = load_bundle(path)
+    assert digest == exported.sha256
+    assert bundle.expected["accuracy"] == exported.measured.accuracy_mean
+    assert bundle.automaton.n_slots == 6
+    assert exported.first_200.objects == 200
+    with pytest.raises(UsageError):
+        export_automaton(path, trained, task, IDEAL, name="bars", provenance={})
+
+
+def test_export_refuses_an_automaton_that_is_not_the_models(task, trained, tmp_path):
+    arrays = trained.arrays
+    swapped = replace(arrays, successors=arrays.successors[:, ::-1].copy())
+    with pytest.raises(PansError, match="differ from the trained automaton"):
+        export_automaton(tmp_path / "x.pans", replace(trained, arrays=swapped), task, IDEAL, name="x", provenance={})
+    assert not list(tmp_path.iterdir())
+
+
+def test_rounding_to_the_grid_keeps_at_least_one_step(trained):
+    from copy import deepcopy
+
+    machine = deepcopy(trained.machine)
+    to_grid(machine, Grid(1.0, 4, False))
+    light = torch.cat([level.light.scale().flatten() for level in machine.levels])
+    assert set(light.numpy().round(6).tolist()) <= {0.25, 0.5, 0.75, 1.0}
+
+
+def test_options_that_cannot_be(task):
+    with pytest.raises(PlanError, match="sequential"):
+        check_automaton_options(SMALL, task, load_profile("wdm-snspd"))
+    for changes, error in (
+        ({"photons": None}, "one budget"),
+        ({"clicks": 2.0}, "one budget"),
+        ({"photons": float("nan")}, "--photons is nan"),
+        ({"exposures": 2000}, "--exposures is 2000"),
+        ({"batch": 1}, "--batch is 1"),
+        ({"photons": None, "clicks": 6.5}, "--clicks is 6.5"),
+        ({"dark": -1.0}, "--dark is -1.0"),
+    ):
+        with pytest.raises(UsageError, match=error):
+            check_automaton_options(replace(SMALL, **changes), task, IDEAL)
+    with pytest.raises(PlanError, match="65533"):
+        check_automaton_options(replace(SMALL, exposures=200, states=500), task, IDEAL)
+    with pytest.raises(UsageError, match="the light is the scene's own"):
+        check_automaton_options(SMALL, replace(task, light="field"), IDEAL)
+    with pytest.raises(UsageError, match="asks for a picture"):
+        check_automaton_options(SMALL, replace(task, target="image"), IDEAL)
+
+
+def test_prices_fall_along_the_levels_and_sizes_grow_with_the_budget():
+    prices = [price_at(SMALL, level) for level in range(40)]
+    assert prices[0] == SMALL.first_price
+    assert all(before >= after for before, after in pairwise(prices))
+    sizes = [default_size(photons) for photons in (3.0, 10.0, 40.0)]
+    assert sizes == sorted(sizes)

@@ -1,0 +1,59 @@
+"""`pans train --encoder automaton`: from images to a bundle that runs, its answer, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the train extra")
+
+from trainings import bars_task
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+
+SHORT = ["--encoder", "automaton", "--exposures", "4", "--states", "8", "--epochs", "2", "--batch", "64"]
+
+
+@pytest.fixture
+def images(tmp_path):
+    task = bars_task()
+    path = tmp_path / "bars.npz"
+    parts = {"train_images": task.train.images, "train_labels": task.train.labels}
+    np.savez(path, **parts, test_images=task.test.images, test_labels=task.test.labels)
+    return str(path)
+
+
+def test_trains_exports_and_reports(images, tmp_path, capsys):
+    out = tmp_path / "bars.pans"
+    assert main(["train", images, *SHORT, "--photons", "3", "-o", str(out), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    bundle, digest = load_bundle(out)
+    assert answer["sha256"] == digest
+    assert answer["simulated"] is True
+    assert answer["objects"] == 400
+    assert answer["first_200"]["objects"] == 200
+    assert answer["accuracy_mean"] == bundle.expected["accuracy"] > 0.4
+    assert answer["photons_mean"] < 3.3
+    assert bundle.provenance["options"]["photons"] == 3.0
+    assert not list(tmp_path.glob("*.checkpoint"))
+    for key in ("clicks_mean", "illumination", "exposures_mean", "expected_calibration_error"):
+        assert answer[key] == pytest.approx(answer["first_200"][key], rel=0.5, abs=0.2)
+
+
+def refusal(capsys, *words):
+    assert main(["train", *words]) == 2
+    return capsys.readouterr().err
+
+
+def test_refusals(images, tmp_path, capsys):
+    out = ["-o", str(tmp_path / "x.pans")]
+    assert "one budget" in refusal(capsys, images, *SHORT, *out)
+    assert "--features, --head: not of an automaton" in refusal(
+        capsys, images, *SHORT, "--photons", "3", "--features", "4", "--head", "conv", *out
+    )
+    assert "--states belongs to an automaton" in refusal(capsys, images, "--features", "3", "--states", "4", *out)
+    assert "--features is missing" in refusal(capsys, images, *out)
+    fiber = refusal(capsys, "fiber", *SHORT, "--photons", "3", *out)
+    assert "the light is the scene's own" in fiber
+    assert not list(tmp_path.glob("*.pans*"))

@@ -1,0 +1,63 @@
+"""What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures.
+
+Owns the passes without gradient: recounted leaves and the figures of held-back objects. In float32 products unless told otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from .machine import COUNT_FLOOR, Machine, Sight, forward
+from .objects import Block
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Means over the objects; `loss` in nats, `illumination` in photoelectrons of a clear object."""
+
+    loss: float
+    accuracy: float
+    clicks: float
+    photons: float
+    illumination: float
+    exposures: float
+
+
+def recount(machine: Machine, sight: Sight, blocks: list[Block]) -> None:
+    """Set the class counts of all leaves to those of the objects in `blocks`."""
+    with torch.no_grad():
+        fresh = [torch.full_like(counts, COUNT_FLOOR) for counts in machine.counts]
+        for block in blocks:
+            for counts, leaves in zip(fresh, forward(machine, sight, block.grey).leaves):
+                counts += leaves @ block.one_hot.T
+        for counts, new in zip(machine.counts, fresh):
+            counts.copy_(new)
+
+
+def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
+    """Return the exact expectation over the objects in `blocks`, decisions by the machine's class counts."""
+    sums, n = torch.zeros(6, dtype=torch.float64), sum(len(block) for block in blocks)
+    with torch.no_grad():
+        posteriors = [counts / counts.sum(dim=1, keepdim=True) for counts in machine.counts]
+        whole = []
+        for level in machine.levels:
+            mask, scale = level.light.shown()
+            whole.append(mask.sum(dim=1) if scale is None else mask.sum(dim=1) * scale.squeeze(1))
+        for block in blocks:
+            passed = forward(machine, sight, block.grey)
+            loss = right = 0.0
+            for leaves, posterior in zip(passed.leaves, posteriors):
+                if not len(leaves):
+                    continue
+                arrived = (leaves @ block.one_hot.T).double()
+                loss -= float((arrived * posterior.double().log()).sum())
+                right += float(arrived.gather(1, posterior.argmax(dim=1, keepdim=True)).sum())
+            illumination = sum(float(step.alpha.sum(dim=1) @ light) for step, light in zip(passed.steps, whole))
+            exposures = sum(float(step.alpha.sum()) for step in passed.steps)
+            sums += torch.tensor(
+                [loss, right, passed.clicks().sum(), passed.photons().sum(), illumination, exposures],
+                dtype=torch.float64,
+            )
+    return Figures(*(sums / n).tolist())

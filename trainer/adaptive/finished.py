@@ -1,0 +1,119 @@
+"""The finished automaton as arrays: patterns in projector levels, dwell, successors and posteriors, numbered as a bundle holds them.
+
+Owns the way from brightness to whole dwell steps or levels, the numbering, and patterns that several states share; never trains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.model.exposure import top_limits
+
+from .light import Bits
+from .machine import Machine
+from .posteriors import Posteriors
+
+TOP_QUANTILE = 0.999  # of the states' brightness: the brightest few are dimmed to it, so that one does not set the exposure for all
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finished:
+    """Arrays as `pans.runtime.bundle.automaton.Automaton` and `Shown` take them; posteriors by node, states first."""
+
+    pattern_levels: NDArray[np.uint16]
+    photons_per_level: float
+    levels: int
+    pattern: NDArray[np.int64]
+    dwell: NDArray[np.int64]
+    dwell_steps: int
+    successors: NDArray[np.int64]
+    posteriors: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What brightness a profile can show: `steps` of `top` photoelectrons; as dwell, or (`by_level`) as the level of the lit pixels."""
+
+    top: float
+    steps: int
+    by_level: bool
+
+
+def bit_grid(machine: Machine, profile: Profile) -> Grid:
+    """Return the grid for the one-bit patterns of `machine`: the top that they need, within the exposures of the profile."""
+    low, high = top_limits(profile)
+    light = torch.cat([level.light.shown()[1].flatten() for level in machine.levels if isinstance(level.light, Bits)])
+    wanted = float(torch.quantile(light.double().cpu(), TOP_QUANTILE))
+    steps = dwell_steps(profile)
+    by_level = steps == 1 and profile.projector.levels > 2
+    return Grid(min(high, max(low, wanted)), profile.projector.levels - 1 if by_level else steps, by_level)
+
+
+def dwell_steps(profile: Profile) -> int:
+    """Return in how many steps the projector of `profile` can shorten its light."""
+    return int(getattr(profile.projector, "dwell_steps", 1))
+
+
+def to_grid(machine: Machine, grid: Grid) -> None:
+    """Round the brightness of all one-bit patterns to whole steps, at least one."""
+    with torch.no_grad():
+        for level in machine.levels:
+            light = level.light
+            assert isinstance(light, Bits)
+            units = (light.log_light.exp() / grid.top * grid.steps).round().clamp(1, grid.steps)
+            light.log_light.copy_((units / grid.steps * grid.top).log())
+
+
+def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: Grid | None) -> Finished:
+    """Return the arrays of `machine`, whose patterns are whole levels (no `grid`) or bits on the grid."""
+    rows, dwells, top = [], [], 0.0
+    levels = profile.projector.levels
+    for level in machine.levels:
+        mask, scale = (None if part is None else part.double().cpu().numpy() for part in level.light.shown())
+        assert mask is not None
+        if grid is None:
+            top = float(level.light.top)
+            rows.append(np.rint(mask).astype(np.uint16))
+            dwells.append(np.ones(len(mask), np.int64))
+            continue
+        assert scale is not None
+        units = np.broadcast_to(np.rint(scale / grid.top * grid.steps).astype(np.int64), (len(mask), 1))
+        top = grid.top
+        rows.append((mask * (units if grid.by_level else levels - 1)).astype(np.uint16))
+        dwells.append(np.ones(len(mask), np.int64) if grid.by_level else units[:, 0])
+    shown, pattern = np.unique(np.concatenate(rows), axis=0, return_inverse=True)
+    return Finished(
+        shown,
+        top / (levels - 1),
+        levels,
+        pattern.reshape(-1),
+        np.concatenate(dwells),
+        1 if grid is None or grid.by_level else grid.steps,
+        _numbered(machine),
+        _by_node(machine, posteriors),
+    )
+
+
+def _numbered(machine: Machine) -> NDArray[np.int64]:
+    """Successors (states, outcomes) as numbers of nodes: all states in order of their levels, then all leaves."""
+    sizes = [level.n_states for level in machine.levels]
+    first_state, n_states = np.concatenate([[0], np.cumsum(sizes)]), sum(sizes)
+    first_leaf = n_states + np.concatenate([[0], np.cumsum([len(counts) for counts in machine.counts])])
+    rows = []
+    for number, level in enumerate(machine.levels):
+        n_next = sizes[number + 1] if number + 1 < len(sizes) else 0
+        to = level.successors.T.cpu().numpy()
+        rows.append(np.where(to < n_next, first_state[number + 1] + to, first_leaf[number] + to - n_next))
+    return np.concatenate(rows).astype(np.int64)
+
+
+def _by_node(machine: Machine, posteriors: Posteriors) -> NDArray[np.float32]:
+    sizes = [*(level.n_states for level in machine.levels), 0]
+    states = [level[:n] for level, n in zip(posteriors.levels, sizes)]
+    leaves = [level[n:] for level, n in zip(posteriors.levels, sizes)]
+    return np.concatenate([*states, *leaves]).astype(np.float32)

@@ -1,0 +1,202 @@
+"""Growing an automaton level by level: new patterns for every state, trained on what their click tells, then merged.
+
+Owns one level at a time: candidates from the class means that each state sees, the best of them trained by Adam on the expected
+cross-entropy of its two children and the price of its light, and the merging of the children to as many states as are wanted. Growing
+looks one exposure ahead; what lies further ahead is tuned (tune.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .light import Grey
+from .machine import COUNT_FLOOR, Level, Machine, Sight, children
+from .merge import merged
+from .objects import Block
+from .outcomes import no_click
+
+TRIED_BLOCKS = 6  # objects on which candidates are compared, in blocks
+LIGHT_TRIED = (0.4, 1.6)  # mean photoelectrons of a candidate
+REST_TRIED = (0.5, 1.5)  # how much of the mean of the other classes is taken away
+GLOW = 1e-6  # least light of a pixel at the start: squares of 0 would never move
+
+
+@dataclass(frozen=True, slots=True)
+class GrowOptions:
+    """How a level is grown: at most `states` behind it, `epochs` of Adam at `rate`, the best of `candidates` class splits."""
+
+    states: int = 128
+    epochs: int = 2
+    rate: float = 0.03
+    candidates: int = 6
+
+
+class Growth:
+    """An automaton that grows over fixed blocks of objects; `alphas` are the probabilities of its present states per block."""
+
+    def __init__(self, blocks: list[Block], sight: Sight, options: GrowOptions, random: torch.Generator) -> None:
+        self.blocks, self.sight, self.options, self.random = blocks, sight, options, random
+        self.alphas = [torch.ones(1, len(block)) for block in blocks]
+        self.levels: list[Level] = []
+        self.spent = 0.0, 0.0  # photons and clicks of an object so far
+        self.counts = self._class_counts()
+
+    def _class_counts(self) -> Tensor:
+        return sum_of(alpha @ block.one_hot.T for alpha, block in zip(self.alphas, self.blocks))
+
+    def grow(self, price: float) -> None:
+        """Add a level whose light costs `price` per photoelectron."""
+        roots = self._best_candidates(price).clamp(min=GLOW).sqrt()
+        light = Grey(roots)
+        self._train(light, price)
+        self._branch(light)
+
+    def follow(self, levels: list[Level]) -> None:
+        """Go on from levels that grew before over the same blocks."""
+        for level in levels:
+            assert isinstance(level.light, Grey)
+            self._carry(level.light, level.successors, int(level.successors.max()) + 1)
+            self.levels.append(level)
+        self.counts = self._class_counts()
+
+    def machine(self) -> Machine:
+        """Return the automaton as it has grown; the present states are its leaves."""
+        none = [torch.zeros(0, self.counts.shape[1]) for _ in self.levels[1:]]
+        return Machine(self.levels, [*none, self.counts + COUNT_FLOOR])
+
+    # ---- a level ----
+
+    def _best_candidates(self, price: float) -> Tensor:
+        tried = min(TRIED_BLOCKS, len(self.blocks))
+        means, masses = self._class_means(tried)
+        best = torch.full((len(masses),), torch.inf)
+        chosen = torch.zeros(len(masses), means.shape[2])
+        for _ in range(self.options.candidates):
+            patterns = self._candidate(means, masses)
+            cost = self._cost_of(patterns, tried, price)
+            better = cost < best
+            best[better], chosen[better] = cost[better], patterns[better]
+        return chosen
+
+    def _class_means(self, tried: int) -> tuple[Tensor, Tensor]:
+        """Mean transmission that every state sees of every class, (states, classes, pixels), and the mass behind it."""
+        blocks, alphas = self.blocks[:tried], self.alphas[:tried]
+        sums = []
+        for label in range(blocks[0].one_hot.shape[0]):
+            sums.append(
+                sum_of(
+                    self.sight.mask_slope((alpha * block.one_hot[label]), block.grey)
+                    for alpha, block in zip(alphas, blocks)
+                )
+            )
+        masses = sum_of(alpha @ block.one_hot.T for alpha, block in zip(alphas, blocks))
+        means = torch.stack(sums, dim=1)
+        return means / (masses.unsqueeze(2) + 1e-6), masses
+
+    def _candidate(self, means: Tensor, masses: Tensor) -> Tensor:
+        """One class split per state: relu(mean of some classes - c * mean of the others), scaled to about a photoelectron."""
+        states, classes, _ = means.shape
+        chosen = (torch.rand(states, classes, generator=self.random) < 0.5).float() * masses
+        others = masses - chosen
+        wanted = torch.bmm((chosen / (chosen.sum(1, keepdim=True) + 1e-6)).unsqueeze(1), means).squeeze(1)
+        rest = torch.bmm((others / (others.sum(1, keepdim=True) + 1e-6)).unsqueeze(1), means).squeeze(1)
+        pattern = torch.relu(wanted - self._uniform(states, REST_TRIED) * rest) + 1e-4
+        seen = torch.bmm((masses / (masses.sum(1, keepdim=True) + 1e-6)).unsqueeze(1), means).squeeze(1)
+        mean_light = (pattern * seen).sum(dim=1, keepdim=True)
+        return pattern / (mean_light + 1e-6) * self._uniform(states, LIGHT_TRIED)
+
+    def _uniform(self, states: int, limits: tuple[float, float]) -> Tensor:
+        low, high = limits
+        return low + (high - low) * torch.rand(states, 1, generator=self.random)
+
+    def _cost_of(self, patterns: Tensor, tried: int, price: float) -> Tensor:
+        """What every state's pattern leaves unknown of the class, and the price of its light, (states,)."""
+        silent, spent = torch.zeros(len(patterns), self.counts.shape[1]), torch.zeros(len(patterns))
+        whole = torch.zeros_like(silent)
+        for alpha, block in zip(self.alphas[:tried], self.blocks[:tried]):
+            light = self.sight.light(patterns, block.grey)
+            dark, _ = no_click(light, self.sight.law)
+            silent += (alpha * dark) @ block.one_hot.T
+            whole += alpha @ block.one_hot.T
+            spent += (alpha * light).sum(dim=1)
+        return mass_entropy(silent) + mass_entropy((whole - silent).clamp(min=0)) + price * spent
+
+    def _train(self, light: Grey, price: float) -> None:
+        """Adam on the two children's expected cross-entropy under running class counts."""
+        options = self.options
+        optimiser = torch.optim.Adam([light.root], lr=options.rate, fused=True)
+        n = sum(len(block) for block in self.blocks)
+        whole = self.counts.double() + 2 * COUNT_FLOOR  # in float32 a child's count could vanish beside the other's
+        silent = torch.minimum(self._silent_counts(light).double() + COUNT_FLOOR, whole - COUNT_FLOOR)
+        steps, done = options.epochs * len(self.blocks), 0
+        for epoch in range(options.epochs):
+            share = 0.05 if epoch == 0 else 0.03
+            for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
+                alpha, block = self.alphas[index], self.blocks[index]
+                mask, _ = light.shown()
+                dark, fall = no_click(self.sight.light(mask, block.grey), self.sight.law)
+                here_silent = (alpha * dark) @ block.one_hot.T
+                gain = (log_posterior(whole - silent) - log_posterior(silent)).float() @ block.one_hot
+                slope = torch.mul(fall, gain).neg_().add_(price).mul_(alpha).mul_(1.0 / len(block))
+                light.take(self.sight.mask_slope(slope, block.grey), None)
+                optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
+                optimiser.step()
+                done += 1
+                silent = torch.minimum((1 - share) * silent + share * n / len(block) * here_silent, whole - COUNT_FLOOR)
+                silent.clamp_(min=COUNT_FLOOR)
+
+    def _silent_counts(self, light: Grey) -> Tensor:
+        mask, _ = light.shown()
+        return sum_of(
+            (alpha * no_click(self.sight.light(mask, block.grey), self.sight.law)[0]) @ block.one_hot.T
+            for alpha, block in zip(self.alphas, self.blocks)
+        )
+
+    def _branch(self, light: Grey) -> None:
+        """Carry the probabilities to the children and merge these."""
+        states = len(light.root)
+        silent = self._silent_counts(light)
+        both = torch.cat([silent, (self.counts - silent).clamp(min=0)])
+        groups = merged(both.double().cpu().numpy(), min(self.options.states, len(both)))
+        successors = torch.from_numpy(np.ascontiguousarray(groups)).to(both.device).reshape(2, states)
+        n_nodes = int(groups.max()) + 1
+        self._carry(light, successors, n_nodes)
+        self.levels.append(Level(light, successors))
+        self.counts = torch.zeros(n_nodes, both.shape[1]).index_add_(0, successors.flatten(), both)
+
+    def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
+        """Carry the probabilities of all objects over one level, and add up its light and clicks."""
+        mask, _ = light.shown()
+        photons = clicks = 0.0
+        for index, block in enumerate(self.blocks):
+            alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)
+            dark, _ = no_click(brought, self.sight.law)
+            photons += float((alpha * brought).sum())
+            clicks += float((alpha * (1 - dark)).sum())
+            self.alphas[index] = children(alpha, dark, successors, n_nodes)
+        n = sum(len(block) for block in self.blocks)
+        self.spent = self.spent[0] + photons / n, self.spent[1] + clicks / n
+
+
+def sum_of(parts: object) -> Tensor:
+    """Return the sum of an iterable of tensors."""
+    total: Tensor | None = None
+    for part in parts:  # type: ignore[attr-defined]
+        total = part if total is None else total + part
+    assert total is not None
+    return total
+
+
+def log_posterior(counts: Tensor) -> Tensor:
+    """Return the logarithm of the class posterior of every row of counts."""
+    return torch.log(counts / counts.sum(dim=1, keepdim=True))
+
+
+def mass_entropy(counts: Tensor) -> Tensor:
+    """Return mass times class entropy of every row of counts, nats."""
+    mass = counts.sum(dim=1)
+    return torch.special.xlogy(mass, mass) - torch.special.xlogy(counts, counts).sum(dim=1)

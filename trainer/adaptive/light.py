@@ -1,0 +1,112 @@
+"""The patterns of one level as parameters: grey, in whole projector levels, or one bit with a brightness per state.
+
+Owns the way from parameters to what is shown, and the way back of the gradient. What is shown is `scale * mask`: `mask` (states,
+pixels) goes into the matrix products, `scale` (states, 1) does not. Grey patterns are squares, so that no light is negative; levels
+and bits pass the gradient straight through their rounding (levels) or through a sigmoid (bits).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BIT_SLOPE = 4.0  # of the sigmoid whose gradient a bit has; 4 did better than 1 or 16
+BIT_CUT = 0.2  # a pixel is lit that had more than this part of the brightest one
+BRIGHTNESS_MIN, BRIGHTNESS_MAX = 1e-6, 1e6  # photoelectrons of a lit pixel
+
+
+@dataclass(slots=True)
+class Grey:
+    """Patterns root**2, (states, pixels), photoelectrons per exposure and unit transmission, at most `top` per pixel.
+
+    With `levels`, what is shown is rounded to multiples of top / (levels - 1).
+    """
+
+    root: Tensor
+    top: float = math.inf
+    levels: int = 0
+
+    def parameters(self) -> list[Tensor]:
+        """Return what an optimiser changes."""
+        return [self.root]
+
+    def shown(self) -> tuple[Tensor, Tensor | None]:
+        """Return (mask, scale); no scale stands for 1."""
+        light, scale = self.root.square(), self.scale()
+        if scale is not None:
+            light = light.div_(scale).round_().clamp_(max=self.levels - 1)
+        return light, scale
+
+    def scale(self) -> Tensor | None:
+        """Return the scale alone."""
+        return torch.full((len(self.root), 1), self.top / (self.levels - 1)) if self.levels else None
+
+    def take(self, slope: Tensor, _: Tensor | None) -> None:
+        """Set the gradients from that of the mask times the scale; `slope` is used up."""
+        factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
+        self.root.grad = slope.mul_(self.root).mul_(factor)
+
+    def settle(self) -> None:
+        """Take brighter pixels back to the top after a step: no gradient would ever darken them."""
+        if self.top < math.inf:
+            bound = math.sqrt(self.top)
+            self.root.clamp_(-bound, bound)
+
+
+@dataclass(slots=True)
+class Bits:
+    """Patterns of one bit, lit where `lean` is above 0, and the photoelectrons of their lit pixels: exp(`log_light`), (states, 1).
+
+    With one brightness for all, `log_light` is one tensor (1, 1) that all levels share. The brightness stays from `bottom` to `top`.
+    """
+
+    lean: Tensor
+    log_light: Tensor
+    bottom: float = BRIGHTNESS_MIN
+    top: float = BRIGHTNESS_MAX
+
+    def parameters(self) -> list[Tensor]:
+        """Return what an optimiser changes."""
+        return [self.lean, self.log_light]
+
+    def shown(self) -> tuple[Tensor, Tensor]:
+        """Return (mask, scale)."""
+        return (self.lean > 0).to(self.lean.dtype), self.scale()
+
+    def scale(self) -> Tensor:
+        """Return the brightness of every state, (states, 1)."""
+        return self.log_light.exp().expand(len(self.lean), 1)
+
+    def take(self, slope: Tensor, light_slope: Tensor | None) -> None:
+        """Set the gradients from those of the mask (times the scale) and of the logarithm of the scale; `slope` is used up.
+
+        The gradient of a bit is that of sigmoid(BIT_SLOPE * lean), times BIT_SLOPE / 4: 1 - tanh(BIT_SLOPE * lean / 2)**2.
+        """
+        bend = torch.mul(self.lean, 0.5 * BIT_SLOPE).tanh_().square_()
+        self.lean.grad = bend.mul_(slope).neg_().add_(slope).mul_(0.25 * BIT_SLOPE)
+        assert light_slope is not None
+        if (
+            len(self.log_light) != len(self.lean) or self.log_light.grad is not None
+        ):  # shared: a sum over states and levels
+            light_slope = light_slope.sum(dim=0, keepdim=True)
+            light_slope = light_slope if self.log_light.grad is None else self.log_light.grad + light_slope
+        self.log_light.grad = light_slope
+
+    def settle(self) -> None:
+        """Keep the brightness inside its limits."""
+        self.log_light.clamp_(math.log(self.bottom), math.log(self.top))
+
+
+Light = Grey | Bits
+
+
+def as_bits(grey: Tensor, mean_object: Tensor) -> Bits:
+    """Return one-bit patterns made from grey ones, (states, pixels), which give the same light on `mean_object` (pixels,)."""
+    brightest = grey.amax(dim=1, keepdim=True).clamp(min=1e-30)
+    lean = grey / brightest - BIT_CUT
+    mask = (lean > 0).to(grey.dtype)
+    light = (grey @ mean_object) / (mask @ mean_object).clamp(min=1e-9)
+    return Bits(lean, light.clamp(min=BRIGHTNESS_MIN).log().unsqueeze(1))

@@ -1,0 +1,178 @@
+"""The automaton while it is trained: levels of states, their successors, and the class counts of its leaves.
+
+Owns the exact forward pass (the probability of every node, given an object), the exact gradient of the expected loss, and the matrix
+products in reduced precision that make both quick. A level has states; an outcome (no click, click) of a state leads to a node of the
+next level; nodes are that level's states first, then its leaves. Nodes of the last level are all leaves.
+
+Tensors stand as (states, objects): rows are moved whole along the edges. For a state s of a level, with alpha its probability, q that
+of no click and beta the expected loss from there on:
+
+    alpha'(n) = sum over the edges (s, k) into n of alpha(s) q_k(s)
+    beta(s) = sum_k q_k(s) beta'(successor_k(s)) + price * light(s)
+    d loss / d light(s) = alpha(s) * (sum_k q_k'(s) beta'(successor_k(s)) + price)
+
+The logarithm of a leaf's posterior is its loss; the class counts behind it are running means, whose own gradient vanishes at the
+optimum (envelope theorem).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pans.runtime.instrument.click_law import ClickLaw
+
+from .light import Light
+from .outcomes import no_click
+
+OUTCOMES = 2  # no click, click
+COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
+
+
+@dataclass(slots=True)
+class Level:
+    """States of one exposure: what they show, and `successors` (outcomes, states), nodes of the next level."""
+
+    light: Light
+    successors: Tensor
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return self.successors.shape[1]
+
+
+@dataclass(slots=True)
+class Machine:
+    """An automaton: `levels`, and for the nodes behind each of them `counts`, the class counts of the leaves (leaves, classes)."""
+
+    levels: list[Level]
+    counts: list[Tensor]
+
+    def n_nodes(self, level: int) -> int:
+        """Return the number of nodes behind exposure `level`."""
+        states = self.levels[level + 1].n_states if level + 1 < len(self.levels) else 0
+        return states + len(self.counts[level])
+
+    def parameters(self) -> list[Tensor]:
+        """Return what an optimiser changes, each tensor once."""
+        found: dict[int, Tensor] = {}
+        for level in self.levels:
+            found.update((id(tensor), tensor) for tensor in level.light.parameters())
+        return list(found.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """How light meets objects: transmission = floor + gain * grey; the law of one exposure; the type of the matrix products."""
+
+    law: ClickLaw
+    gain: float
+    floor: float = 0.0
+    products: torch.dtype = torch.float32
+
+    @property
+    def sums(self) -> torch.dtype:
+        """The type of everything but the products: float32, or wider where these are."""
+        return torch.promote_types(self.products, torch.float32)
+
+    def light(self, mask: Tensor, grey: Tensor) -> Tensor:
+        """Return mask @ transmission, (states, objects), of grey values `grey` (objects, pixels) in the type of the products."""
+        brought = (mask.to(self.products) @ grey.T).to(self.sums).mul_(self.gain)
+        if self.floor:
+            brought += self.floor * mask.sum(dim=1, keepdim=True)
+        return brought
+
+    def mask_slope(self, slope: Tensor, grey: Tensor) -> Tensor:
+        """Return the gradient of the mask (states, pixels) from that of the light, (states, objects)."""
+        result = (slope.to(self.products) @ grey).to(slope.dtype).mul_(self.gain)
+        if self.floor:
+            result += self.floor * slope.sum(dim=1, keepdim=True)
+        return result
+
+
+@dataclass(slots=True)
+class Step:
+    """One level of a pass: probability of the states, light, probability of no click and how fast it falls with light."""
+
+    alpha: Tensor
+    light: Tensor
+    dark: Tensor
+    fall: Tensor
+
+
+@dataclass(slots=True)
+class Pass:
+    """A forward pass of some objects: its steps and, behind every level, the probability of the leaves (leaves, objects)."""
+
+    steps: list[Step] = field(default_factory=list)
+    leaves: list[Tensor] = field(default_factory=list)
+
+    def photons(self) -> Tensor:
+        """Return the expected photoelectrons of every object."""
+        return torch.stack([(step.alpha * step.light).sum(dim=0) for step in self.steps]).sum(dim=0)
+
+    def clicks(self) -> Tensor:
+        """Return the expected clicks of every object."""
+        return torch.stack([(step.alpha * (1 - step.dark)).sum(dim=0) for step in self.steps]).sum(dim=0)
+
+
+def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
+    """Return the light (states, objects) that the patterns of `light` bring from objects of `grey`."""
+    mask, scale = light.shown()
+    result = sight.light(mask, grey)
+    return result if scale is None else result.mul_(scale)
+
+
+def children(alpha: Tensor, dark: Tensor, successors: Tensor, n_nodes: int) -> Tensor:
+    """Return the probability of the nodes behind states of probability `alpha` that stay dark with `dark`, (nodes, objects)."""
+    silent = alpha * dark
+    nodes = torch.zeros(n_nodes, alpha.shape[1], dtype=alpha.dtype)
+    nodes.index_add_(0, successors[0], silent)
+    return nodes.index_add_(0, successors[1], torch.sub(alpha, silent, out=silent))
+
+
+def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
+    """Return the pass of the objects `grey` (objects, pixels) through `machine`."""
+    result = Pass()
+    nodes = torch.ones(1, len(grey), dtype=sight.sums)
+    for number, level in enumerate(machine.levels):
+        alpha = nodes[: level.n_states]
+        if number:
+            result.leaves.append(nodes[level.n_states :])
+        light = brought(level.light, sight, grey)
+        dark, fall = no_click(light, sight.law)
+        result.steps.append(Step(alpha, light, dark, fall))
+        nodes = children(alpha, dark, level.successors, machine.n_nodes(number))
+    result.leaves.append(nodes)
+    return result
+
+
+def leaf_losses(counts: Tensor, one_hot: Tensor) -> Tensor:
+    """Return -log of the posterior of the true class in every leaf, (leaves, objects); `one_hot` is (classes, objects)."""
+    return -torch.log(counts / counts.sum(dim=1, keepdim=True)) @ one_hot
+
+
+def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, passed: Pass, price: float) -> None:
+    """Set the gradients of the mean of loss + price * photons over the objects of `passed`.
+
+    `price` is per photoelectron. The gradients replace those that were there.
+    """
+    for tensor in machine.parameters():
+        tensor.grad = None
+    share = 1.0 / len(grey)
+    beta = leaf_losses(machine.counts[-1], one_hot)
+    for number in range(len(machine.levels) - 1, -1, -1):
+        level, step = machine.levels[number], passed.steps[number]
+        after_click = beta[level.successors[1]]
+        gain = beta[level.successors[0]].sub_(after_click)  # what no click costs more than a click
+        slope = torch.mul(step.fall, gain).neg_().add_(price).mul_(step.alpha).mul_(share)
+        mask_slope = sight.mask_slope(slope, grey)
+        scale = level.light.scale()
+        light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
+        level.light.take(mask_slope if scale is None else mask_slope.mul_(scale), light_slope)
+        beta = gain.mul_(step.dark).add_(after_click).add_(step.light, alpha=price)
+        if number and len(machine.counts[number - 1]):
+            beta = torch.cat([beta, leaf_losses(machine.counts[number - 1], one_hot)])

@@ -1,0 +1,110 @@
+"""What the training of an automaton sees: grey values of the objects, in an order and a distortion that change from epoch to epoch.
+
+Owns the split into objects to fit and objects held back (they set prices and calibrate, no pattern is trained on them), the random
+order, and blocks of one size. Grey values stay whole numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.device import here
+from pans.trainer.tasks.distort import DISTORT_STREAM, distorted
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.shifts import shifted
+
+HELD_BACK_PART = 12  # one in 12 training objects, the last ones
+ORDER_STREAM = 0xA07
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Some objects: `grey` (objects, pixels) in the type of the matrix products, `one_hot` (classes, objects) of their labels."""
+
+    grey: Tensor
+    one_hot: Tensor
+
+    def __len__(self) -> int:
+        return len(self.grey)
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """How training images change from epoch to epoch: moved by whole pixels along and across the rows; `copies` distorted versions.
+
+    Epochs take the images as they are and their distorted versions in turn.
+    """
+
+    shift_px: int = 0
+    offset_px: int = 0
+    copies: int = 0
+
+
+class TrainingObjects:
+    """The training objects of a task: `epoch` gives those to fit, `held_back` the others, in blocks.
+
+    `gain` and `floor` turn grey values into the transmission of the profile's modulator.
+    """
+
+    def __init__(self, task: Task, profile: Profile, seed: int, augmentation: Augmentation, held_back: int = 0) -> None:
+        n_back = held_back or max(1, len(task.train) // HELD_BACK_PART)
+        n_fit = len(task.train) - n_back
+        if n_fit < 1:
+            raise ValueError(f"{n_back} of {len(task.train)} training objects held back, allowed: all but one")
+        self._fit = task.train.first(n_fit)
+        self._back = Objects(task.train.images[n_fit:], task.train.labels[n_fit:])
+        self.n_classes, self.n_fit, self.n_pixels = len(task.classes), n_fit, task.image_shape[0] * task.image_shape[1]
+        self.image_shape = task.image_shape
+        modulator = profile.object_modulator
+        self._levels = 256 if modulator is None else min(256, modulator.levels)
+        self.floor = profile.min_transmission
+        self.gain = (1.0 - self.floor) / (self._levels - 1)
+        self._seed, self._augmentation = seed, augmentation
+
+    def mean_transmission(self) -> Tensor:
+        """Return the mean transmission of every pixel over the first objects, float32 (pixels,)."""
+        grey = torch.from_numpy(self._grey(self._fit.images[:10_000]).copy())
+        return here(self.floor + self.gain * grey.float().mean(dim=0))
+
+    def wide(self, objects: Objects) -> Tensor:
+        """Return the grey values of any objects of the task, float64 (objects, pixels)."""
+        return here(torch.from_numpy(self._grey(objects.images).astype(np.float64)))
+
+    def epoch(self, number: int, size: int, dtype: torch.dtype, plain: bool = False) -> list[Block]:
+        """Return the objects to fit in an order of their own, augmented unless `plain`; the last block may be smaller."""
+        random = np.random.default_rng([ORDER_STREAM, self._seed, number])
+        order = random.permutation(self.n_fit)
+        objects = self._fit if plain else self._augmented(number)
+        return list(self._blocks(Objects(objects.images[order], objects.labels[order]), size, dtype))
+
+    def held_back(self, size: int, dtype: torch.dtype) -> list[Block]:
+        """Return the objects held back, as they are."""
+        return list(self._blocks(self._back, size, dtype))
+
+    def _augmented(self, number: int) -> Objects:
+        objects, way = self._fit, self._augmentation
+        version = number % (way.copies + 1)
+        if version:
+            objects = Objects(distorted(objects.images, [DISTORT_STREAM, self._seed, version]), objects.labels)
+        return shifted(objects, way.shift_px, way.offset_px, self._seed + 1000 * number)
+
+    def _grey(self, images: np.ndarray) -> np.ndarray:
+        flat = images.reshape(len(images), -1)
+        if self._levels == 256:
+            return np.ascontiguousarray(flat)
+        table = np.rint(np.arange(256) / 255.0 * (self._levels - 1)).astype(np.uint8)
+        return np.asarray(table[flat])
+
+    def _blocks(self, objects: Objects, size: int, dtype: torch.dtype) -> Iterator[Block]:
+        grey, labels = self._grey(objects.images), objects.labels
+        for first in range(0, len(labels), size):
+            part = torch.from_numpy(grey[first : first + size].copy())
+            one_hot = torch.zeros(self.n_classes, len(part))
+            one_hot[here(torch.from_numpy(labels[first : first + size])), torch.arange(len(part))] = 1.0
+            yield Block(here(part).to(dtype), one_hot)

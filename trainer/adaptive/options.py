@@ -1,0 +1,143 @@
+"""What to train: the options of an automaton, their defaults from the budget, and what of them is impossible on a task or profile.
+
+Owns names, defaults and limits; never trains. `check_automaton_options` returns nothing, or raises with the numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
+from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.tasks.registry import Task
+
+PHOTONS_PER_CLICK = 1.85  # of a trained automaton, about; only to choose defaults for a budget of clicks
+PRICE_AT_10 = 0.02  # nats per photoelectron at which training spends about 10 of them on the public sets
+PRICE_POWER = 1.6  # how the price falls with the budget
+GROWN_PRICE = 0.7  # of the last level grown, over the price of the budget: tuning saves light
+DEFAULT_PHOTONS = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class AutomatonOptions:
+    """What to train. `photons` or `clicks` is the budget of one decision, on average; 0 exposures or states stand for defaults."""
+
+    photons: float | None = None
+    clicks: float | None = None
+    exposures: int = 0
+    states: int = 0
+    seed: int = 0
+    batch: int = 500
+    grow_epochs: int = 2
+    candidates: int = 6
+    first_price: float = (
+        0.2  # nats per photoelectron of the first question, halved every `half` levels towards the last price
+    )
+    half: float = 6.0
+    tune_epochs: int = 3
+    epochs: int = 6  # of the patterns as they are shown
+    tune_rate: float = 0.005
+    rate: float = 0.01
+    reroutes: int = 2  # sweeps that move edges to better states, after the first epochs of the last stage
+    shift_px: int = 0  # training images are moved by up to that much along the rows, anew in every epoch
+    offset_px: int = 0  # and across them
+    copies: int = 0  # distorted versions of every training image, which the epochs take in turn (distort.py)
+    grey: bool = False  # patterns in all levels of the projector, instead of one bit and a brightness
+    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
+
+
+LIMITS = {
+    "exposures": (0, SLOTS_MAX),
+    "states": (0, STATES_MAX),
+    "seed": (0, 2**63 - 1),
+    "batch": (2, 1 << 20),
+    "grow_epochs": (1, 1000),
+    "candidates": (1, 1000),
+    "tune_epochs": (0, 100_000),
+    "epochs": (1, 100_000),
+    "reroutes": (0, 1000),
+    "shift_px": (0, 65536),
+    "offset_px": (0, 65536),
+    "copies": (0, 1000),
+}
+
+
+def photons_wanted(options: AutomatonOptions) -> float:
+    """Return the budget in photoelectrons, about, whether it was given in photons or clicks."""
+    if options.photons is not None:
+        return options.photons
+    return DEFAULT_PHOTONS if options.clicks is None else PHOTONS_PER_CLICK * options.clicks
+
+
+def price_of(photons: float) -> float:
+    """Return the price per photoelectron (nats) with which training spends about that many on the public sets."""
+    return PRICE_AT_10 * (10.0 / photons) ** PRICE_POWER
+
+
+def default_size(photons: float) -> tuple[int, int]:
+    """Return the exposures and states per level that serve a budget: many cheap exposures beat few dear ones."""
+    exposures = min(96, max(16, 4 * round(photons * 0.45 + 7)))
+    return exposures, 256 if photons <= 12 else 384
+
+
+def with_defaults(options: AutomatonOptions) -> tuple[int, int]:
+    """Return exposures and states per level: those asked for, else those of the budget."""
+    exposures, states = default_size(photons_wanted(options))
+    return options.exposures or exposures, options.states or states
+
+
+def price_at(options: AutomatonOptions, level: int) -> float:
+    """Return the price of light in a level that grows: dear at first, when every photon is spent on all objects."""
+    last = GROWN_PRICE * price_of(photons_wanted(options))
+    return last + (max(last, options.first_price) - last) * 0.5 ** (level / options.half)
+
+
+def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:
+    """Raise UsageError or PlanError for what cannot be trained for this task on this profile."""
+    for name, (low, high) in LIMITS.items():
+        if not low <= getattr(options, name) <= high:
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{flag} is {getattr(options, name)}, allowed: {low} to {high}")
+    for name in ("photons", "clicks"):
+        value = getattr(options, name)
+        if value is not None and not (math.isfinite(value) and 0.1 <= value <= 1000):
+            raise UsageError(f"--{name} is {value}, allowed: 0.1 to 1000")
+    if (options.photons is None) == (options.clicks is None):
+        raise UsageError(
+            "an automaton is trained for one budget, --photons or --clicks", remedy="give exactly one of them"
+        )
+    if options.dark is not None and not 0 <= options.dark < math.inf:
+        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
+    _check_task(task)
+    _check_fits(options, profile)
+
+
+def _check_task(task: Task) -> None:
+    if task.target == "image":
+        raise UsageError(
+            f"--encoder automaton: {task.name} asks for a picture, the leaves of an automaton hold classes",
+            remedy="use --encoder coherent",
+        )
+    if task.light != "transmission" or task.optics != "none":
+        raise UsageError(
+            f"--encoder automaton: in {task.name} the light is the scene's own, no pattern of ours can follow the clicks",
+            remedy="use a passive encoder: coherent or incoherent",
+        )
+
+
+def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
+    exposures, states = with_defaults(options)
+    if profile.mode != "sequential":
+        raise PlanError(
+            f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",
+            remedy="choose a sequential profile, such as ideal or dmd-spad",
+        )
+    if exposures * states > STATES_MAX + states:
+        raise PlanError(
+            f"{exposures} exposures of {states} states are {exposures * states} states, allowed at most {STATES_MAX}",
+            remedy=f"--states {STATES_MAX // exposures}, or fewer",
+        )
+    if options.clicks is not None and options.clicks >= exposures:
+        raise UsageError(f"--clicks is {options.clicks}, allowed: below {exposures}, one click per exposure at most")

@@ -1,0 +1,168 @@
+"""Better successors for what is already tuned: every edge goes to the node behind it that costs its objects least.
+
+Owns one sweep from the last level to the first: with the expected loss beta' of every node of the next level, exact for every object, an
+edge (state s, outcome k) moves to the node n of least sum over objects of alpha(s) q_k(s) beta'(n). Levels above are not touched by
+it, levels below are already done, so that the expected loss on the objects of the sweep falls with every move (the improvement step of
+Hansen's policy iteration for finite-state controllers). Nodes that lose their last edge take over edges of the fullest
+nodes, as copies of them; what only the old node led to is revived by the next sweep.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .light import Bits, Grey
+from .machine import COUNT_FLOOR, Machine, Sight, forward, leaf_losses
+from .objects import Block
+from .outcomes import no_click
+
+SURE = 0.5  # standard errors by which a node must be better; the difference of an object's losses varies by about LOSS_SPREAD
+LOSS_SPREAD = 0.5  # nats
+
+
+@dataclass(frozen=True, slots=True)
+class Rerouted:
+    """How many edges moved, how many nodes were left empty and revived, and the loss saved per object, nats."""
+
+    moved: int
+    revived: int
+    saved: float
+
+
+class _Sweep:
+    """What a sweep keeps of every block: probability and light of all states, and the expected loss behind the present level."""
+
+    def __init__(self, machine: Machine, sight: Sight, blocks: list[Block]) -> None:
+        self.machine, self.sight, self.blocks = machine, sight, blocks
+        self.kept: list[list[tuple[Tensor, Tensor]]] = []
+        for block in blocks:
+            steps = forward(machine, sight, block.grey).steps
+            self.kept.append([(step.alpha.bfloat16(), step.light.bfloat16()) for step in steps])
+        self.betas = [leaf_losses(machine.counts[-1], block.one_hot) for block in blocks]
+
+    def costs(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Expected loss of every edge at every node, (2, states, nodes), class counts of the edges, (2, states, classes), and the
+        standard error of a difference of losses, (2, states)."""
+        costs: Tensor | None = None
+        arrived: Tensor | None = None
+        squares: Tensor | None = None
+        for kept, beta, block in zip(self.kept, self.betas, self.blocks):
+            alpha, dark = self._alpha_dark(kept[number])
+            silent = alpha * dark
+            both = torch.cat([silent, alpha - silent])
+            part, counted, square = both @ beta.T, both @ block.one_hot.T, both.square().sum(dim=1)
+            costs = part if costs is None else costs + part
+            arrived = counted if arrived is None else arrived + counted
+            squares = square if squares is None else squares + square
+        assert costs is not None
+        assert arrived is not None
+        assert squares is not None
+        error = LOSS_SPREAD * squares.sqrt()
+        return costs.unflatten(0, (2, -1)), arrived.unflatten(0, (2, -1)), error.unflatten(0, (2, -1))
+
+    def copy_node(self, source: int, target: int) -> None:
+        """Let the expected loss of `target` behind the present level be that of `source`."""
+        for beta in self.betas:
+            beta[target] = beta[source]
+
+    def step_back(self, number: int, price: float) -> None:
+        """Replace the expected losses behind level `number` by those before it, under its present successors."""
+        level = self.machine.levels[number]
+        for index, (kept, block) in enumerate(zip(self.kept, self.blocks)):
+            _, dark = self._alpha_dark(kept[number])
+            beta = self.betas[index]
+            after = beta[level.successors[1]]
+            before = after + dark * (beta[level.successors[0]] - after) + price * kept[number][1].float()
+            if number and len(self.machine.counts[number - 1]):
+                before = torch.cat([before, leaf_losses(self.machine.counts[number - 1], block.one_hot)])
+            self.betas[index] = before
+
+    def _alpha_dark(self, kept: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        alpha, light = kept
+        return alpha.float(), no_click(light.float(), self.sight.law)[0]
+
+
+def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float) -> Rerouted:
+    """Move the edges of `machine` to better nodes, by the objects in `blocks`; `price` is that of a photoelectron."""
+    with torch.no_grad():
+        sweep = _Sweep(machine, sight, blocks)
+        moved = revived = 0
+        saved = 0.0
+        for number in range(len(machine.levels) - 1, -1, -1):
+            level = machine.levels[number]
+            costs, arrived, error = sweep.costs(number)
+            now = costs.gather(2, level.successors.unsqueeze(2)).squeeze(2)
+            least, best = costs.min(dim=2)
+            better = least < now - SURE * error
+            level.successors = torch.where(better, best, level.successors)
+            moved += int(better.sum())
+            saved += float((now - least)[better].sum())
+            for full, empty in _revive(machine, number, arrived):
+                sweep.copy_node(full, empty)
+                revived += 1
+            sweep.step_back(number, price)
+    return Rerouted(moved, revived, saved / sum(len(block) for block in blocks))
+
+
+def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, int]]:
+    """Give every node behind level `number` an edge: an empty one becomes a copy of the fullest and takes half of its edges.
+
+    Returns the copies made, (full, empty).
+    """
+    level, n_nodes = machine.levels[number], machine.n_nodes(number)
+    targets, edges = level.successors.flatten(), arrived.flatten(0, 1)
+    mass = edges.sum(dim=1)
+    in_edges = torch.bincount(targets, minlength=n_nodes)
+    revived: list[tuple[int, int]] = []
+    for empty in (in_edges == 0).nonzero().flatten().tolist():
+        load = torch.zeros(n_nodes).index_add_(0, targets, mass)
+        load[in_edges < 2] = -1.0
+        full = int(load.argmax())
+        if load[full] < 0:
+            break
+        own = (targets == full).nonzero().flatten()
+        half = _other_half(edges[own])
+        targets[own[half]] = empty
+        in_edges[full] -= int(half.sum())
+        in_edges[empty] = int(half.sum())
+        _copy_node(machine, number, full, empty, edges[own[half]].sum(dim=0))
+        revived.append((full, empty))
+    level.successors = targets.unflatten(0, (2, -1))
+    return revived
+
+
+def _other_half(counts: Tensor) -> Tensor:
+    """Part edges by their classes: the edge furthest from the sum, and those nearer to it than to the rest; never all."""
+    share = (counts + COUNT_FLOOR) / (counts + COUNT_FLOOR).sum(dim=1, keepdim=True)
+    whole = (counts.sum(dim=0) + COUNT_FLOOR) / (counts.sum(dim=0) + COUNT_FLOOR).sum()
+    distance = (share * (share / whole).log()).sum(dim=1) * counts.sum(dim=1)
+    far = share[int(distance.argmax())]
+    to_far, to_whole = (far * (far / share).log()).sum(dim=1), (whole * (whole / share).log()).sum(dim=1)
+    half = to_far < to_whole
+    half[int(distance.argmax())] = True
+    if bool(half.all()):
+        half[int(to_whole.argmin())] = False
+    return half
+
+
+def _copy_node(machine: Machine, number: int, source: int, target: int, counts: Tensor) -> None:
+    """Let node `target` behind level `number` do what `source` does; a leaf takes the class counts of its own edges."""
+    n_states = machine.n_nodes(number) - len(machine.counts[number])
+    if source >= n_states and target >= n_states:
+        whole = machine.counts[number]
+        share = counts / counts.sum().clamp(min=1e-9)
+        whole[target - n_states] = share * whole[source - n_states].sum() / 2 + COUNT_FLOOR
+        return
+    if source >= n_states or target >= n_states:
+        return
+    level = machine.levels[number + 1]
+    light = level.light
+    rows = [light.root] if isinstance(light, Grey) else [light.lean]
+    if isinstance(light, Bits) and len(light.log_light) > 1:
+        rows.append(light.log_light)
+    for tensor in rows:
+        tensor[target] = tensor[source]
+    level.successors[:, target] = level.successors[:, source]

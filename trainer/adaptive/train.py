@@ -1,0 +1,330 @@
+"""Training of an automaton from end to end: grow, tune, one bit, reroute, meet the budget, calibrate.
+
+Owns the order of the stages, the checkpoint between them and the way into the arrays of a bundle; never writes a bundle (the package
+export) and never sees the held-out objects. `train_automaton` returns a `TrainedAutomaton` whose figures are of objects held back.
+
+Sources: finite-state controllers and their improvement (Hansen 1998), decision jungles (Shotton et al. 2013), the agglomerative
+information bottleneck (Slonim and Tishby 1999), sequential decisions on photons (Chen and Perona 2017) and in general (Wald 1945).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.device import new_generator
+from pans.trainer.model.exposure import exposure_us_of, top_limits
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
+
+from .figures import Figures, figures, recount
+from .finished import Finished, bit_grid, dwell_steps, finished, to_grid
+from .grow import GrowOptions, Growth
+from .light import Bits, Grey, as_bits
+from .machine import Machine, Sight, forward
+from .objects import Augmentation, TrainingObjects
+from .options import AutomatonOptions, check_automaton_options, photons_wanted, price_at, price_of, with_defaults
+from .posteriors import Posteriors, calibrated, node_counts
+from .reroute import reroute
+from .state import machine_from, machine_state
+from .tune import Price, Tuning
+
+KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
+GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
+REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
+UNDER_BUDGET = 0.99  # of the budget is what the held-back objects may take: others take a little more or less
+DIMMINGS = 4  # steps of the search for the brightness that meets the budget
+STAGES = ("grow", "grey", "shown")
+FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a training is: `done` of `steps`, and what the present stage measured on the objects that it fits."""
+
+    stage: str
+    done: int
+    steps: int
+    loss: float
+    accuracy: float
+    clicks: float
+    photons: float
+    price: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainedAutomaton:
+    """The arrays of a bundle, and figures of the held-back objects; `price` is nats per photoelectron in the end."""
+
+    arrays: Finished
+    machine: Machine
+    posteriors: Posteriors
+    sight: Sight
+    grey: Callable[
+        [Objects], torch.Tensor
+    ]  # grey values of objects as the machine takes them, float64 (objects, pixels)
+    held_back: Figures
+    price: float
+    options: AutomatonOptions
+
+    def chances(self, objects: Objects) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the chance of every class by the leaves' posteriors, (objects, classes), and the photons (objects,), in float64."""
+        with torch.no_grad():
+            passed = forward(self.machine, replace(self.sight, products=torch.float64), self.grey(objects))
+        total = np.zeros((len(objects), self.posteriors.levels[0].shape[1]))
+        for number, leaves in enumerate(passed.leaves):
+            posterior = self.posteriors.levels[number + 1]
+            total += leaves.T.cpu().numpy() @ posterior[len(posterior) - len(leaves) :]
+        return total, passed.photons().cpu().numpy()
+
+
+def train_automaton(
+    task: Task,
+    profile: Profile,
+    options: AutomatonOptions,
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    report: Callable[[Progress], None] = lambda _: None,
+    held_back: int = 0,
+) -> TrainedAutomaton:
+    """Train `task` through `profile`; the same options, machine and number of threads give the same result.
+
+    After every level and epoch the state goes to `checkpoint`; with `resume` a training goes on from there. `held_back` objects (0: one
+    in twelve) set the price and calibrate; no pattern is trained on them. KeyboardInterrupt passes through.
+    """
+    check_automaton_options(options, task, profile)
+    saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
+    run = _Run(task, profile, options, report, held_back)
+    if saved:
+        run.restore(saved["run"])
+
+    def keep() -> None:
+        if checkpoint:
+            write_checkpoint(checkpoint, options, task.sha256, {"run": run.state()})
+
+    run.grow(keep)
+    run.tune("grey", options.tune_epochs, options.tune_rate, keep)
+    run.start_showing()
+    run.tune("shown", options.epochs, options.rate, keep)
+    return run.finish()
+
+
+class _Run:
+    """One training: the machine, its stage and epoch, the price, and the optimiser of the present stage."""
+
+    def __init__(
+        self,
+        task: Task,
+        profile: Profile,
+        options: AutomatonOptions,
+        report: Callable[[Progress], None],
+        held_back: int,
+    ) -> None:
+        self.profile, self.options, self.report = profile, options, report
+        changes = Augmentation(options.shift_px, options.offset_px, options.copies)
+        self.objects = TrainingObjects(task, profile, options.seed, changes, held_back)
+        self.exposures, self.states = with_defaults(options)
+        self.stage, self.epoch = "grow", 0
+        self.machine = Machine([], [])
+        budget = options.photons if options.clicks is None else options.clicks
+        self.price = Price(price_of(photons_wanted(options)), budget, options.clicks is not None)
+        self.tuning: Tuning | None = None
+        self.saved_tuning: dict[str, Any] | None = None
+        self.products = product_dtype()
+
+    @property
+    def steps(self) -> int:
+        """Levels to grow and epochs to tune."""
+        return self.exposures + self.options.tune_epochs + self.options.epochs
+
+    # ---- the instrument ----
+
+    def sight(self, products: torch.dtype = torch.float32) -> Sight:
+        """How the instrument sees objects at the exposure that the present brightest pixel needs."""
+        low, high = top_limits(self.profile)
+        top = low
+        if self.stage == "shown":
+            light = self.machine.levels[0].light
+            top = bit_grid(self.machine, self.profile).top if isinstance(light, Bits) else light.top
+        law = click_law(self.profile, exposure_us_of(self.profile, min(high, max(low, top))))
+        if self.options.dark is not None:
+            law = replace(law, dark_per_exposure=self.options.dark)
+        return Sight(law, self.objects.gain, self.objects.floor, products)
+
+    # ---- the stages ----
+
+    def grow(self, keep: Callable[[], None]) -> None:
+        """Grow levels until there are as many as exposures."""
+        if self.stage != "grow":
+            return
+        options = GrowOptions(self.states, self.options.grow_epochs, candidates=self.options.candidates)
+        blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)
+        with torch.no_grad():
+            growth = Growth(blocks, self.sight(self.products), options, new_generator(self.options.seed))
+            growth.follow(self.machine.levels)
+            while len(growth.levels) < self.exposures:
+                growth.grow(price_at(self.options, len(growth.levels)))
+                self.machine = growth.machine()
+                self.report(self._grown(growth))
+                if len(growth.levels) % KEPT_EVERY == 0:
+                    keep()
+        self.stage, self.epoch = "grey", 0
+
+    def _grown(self, growth: Growth) -> Progress:
+        photons, clicks = growth.spent
+        counts = growth.counts
+        known, n = counts / counts.sum(dim=1, keepdim=True).clamp(min=1e-9), float(counts.sum())
+        loss = -float(torch.special.xlogy(counts, known).sum()) / n
+        price = price_at(self.options, len(growth.levels) - 1)
+        right = float(counts.amax(dim=1).sum()) / n
+        return Progress("grow", len(growth.levels), self.steps, loss, right, clicks, photons, price)
+
+    def start_showing(self) -> None:
+        """Turn grey patterns into what the projector shows: one bit and a brightness, or whole levels."""
+        if self.stage != "grey":
+            return
+        low, high = top_limits(self.profile)
+        lights = [level.light.shown()[0] for level in self.machine.levels]
+        if self.options.grey:
+            top = min(high, max(low, max(float(light.max()) for light in lights)))
+            for level, light in zip(self.machine.levels, lights):
+                level.light = Grey(light.clamp(max=top).sqrt(), top, self.profile.projector.levels)
+        else:
+            self._start_bits(lights, low, high)
+        self.stage, self.epoch, self.tuning = "shown", 0, None
+
+    def _start_bits(self, lights: list[torch.Tensor], low: float, high: float) -> None:
+        mean = self.objects.mean_transmission()
+        shared = self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
+        made = [as_bits(light, mean) for light in lights]
+        typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
+        for level, bits in zip(self.machine.levels, made):
+            bits.top = high
+            if shared:
+                bits.log_light, bits.bottom = typical, low
+            bits.settle()
+            level.light = bits
+
+    def tune(self, stage: str, epochs: int, rate: float, keep: Callable[[], None]) -> None:
+        """Train all levels together for the rest of a stage's epochs."""
+        if self.stage != stage:
+            return
+        size = self.options.batch
+        steps = max(1, epochs * -(-self.objects.n_fit // size))
+        if self.tuning is None:
+            self.tuning = Tuning(self.machine, self.sight(self.products), self.price, rate, steps)
+            if self.saved_tuning is not None:
+                self.tuning.restore(self.saved_tuning)
+                self.saved_tuning = None
+        while self.epoch < epochs:
+            self.tuning.sight = self.sight(self.products)
+            if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
+                self._reroute()
+            blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
+            told = self.tuning.epoch(blocks)
+            self.epoch += 1
+            before = self.exposures + (self.options.tune_epochs if stage == "shown" else 0)
+            figures_told = told.loss, told.accuracy, told.clicks, told.photons, told.price
+            self.report(Progress(stage, before + self.epoch, self.steps, *figures_told))
+            keep()
+
+    def _reroute(self) -> None:
+        states = sum(level.n_states for level in self.machine.levels)
+        blocks = self.objects.epoch(FIRST_EPOCH["shown"] + self.epoch - 1, GROWTH_BLOCK, self.products)
+        reroute(
+            self.machine,
+            self.sight(self.products),
+            blocks[: max(1, REROUTE_NUMBERS // (GROWTH_BLOCK * states))],
+            self.price.value,
+        )
+
+    # ---- the end ----
+
+    def finish(self) -> TrainedAutomaton:
+        """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
+        blocks = self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)
+        held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
+        self._meet_budget(held_back)
+        grid = None if self.options.grey else bit_grid(self.machine, self.profile)
+        if grid is not None:
+            to_grid(self.machine, grid)
+        sight = self.sight()
+        recount(self.machine, sight, blocks)
+        measured = figures(self.machine, sight, held_back)
+        posteriors = self._posteriors(sight)
+        arrays = finished(self.machine, posteriors, self.profile, grid)
+        return TrainedAutomaton(
+            arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
+        )
+
+    def _meet_budget(self, held_back: list[Any]) -> None:
+        """Dim or brighten all patterns alike until the held-back objects take 99 % of the budget; a few percent at most."""
+        if self.price.budget is None:
+            return
+        for _ in range(DIMMINGS):
+            found = figures(self.machine, self.sight(), held_back)
+            spent = found.clicks if self.price.of_clicks else found.photons
+            wanted = UNDER_BUDGET * self.price.budget / spent
+            if 0.995 <= wanted <= 1.0:
+                return
+            scale_light(self.machine, wanted**1.1)
+
+    def _posteriors(self, sight: Sight) -> Posteriors:
+        fitted = node_counts(self.machine, sight, self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True))
+        arrived = node_counts(self.machine, sight, self.objects.held_back(GROWTH_BLOCK, torch.float32))
+        sizes = [*(level.n_states for level in self.machine.levels), 0]
+        return calibrated(fitted, arrived, sizes)
+
+    # ---- checkpoints ----
+
+    def state(self) -> dict[str, Any]:
+        """Return what `restore` needs: tensors and plain values."""
+        return {
+            "stage": self.stage,
+            "epoch": self.epoch,
+            "price": self.price.value,
+            "machine": machine_state(self.machine),
+            "tuning": None if self.tuning is None else self.tuning.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self.stage, self.epoch, self.price.value = state["stage"], state["epoch"], state["price"]
+        self.machine = machine_from(state["machine"])
+        self.saved_tuning = state["tuning"]
+
+
+def scale_light(machine: Machine, factor: float) -> None:
+    """Multiply the light of all patterns by `factor`."""
+    with torch.no_grad():
+        done: set[int] = set()
+        for level in machine.levels:
+            light = level.light
+            if isinstance(light, Bits):
+                if id(light.log_light) not in done:
+                    light.log_light.add_(torch.log(torch.tensor(factor)))
+                    done.add(id(light.log_light))
+                light.settle()
+            else:
+                light.root.mul_(factor**0.5)
+                light.top *= factor
+
+
+def product_dtype() -> torch.dtype:
+    """Return the type of training's matrix products: bfloat16 where the device multiplies it fast, else float32.
+
+    Grey values and one-bit patterns are exact in it, sums are float32; final figures are always float32 or wider.
+    """
+    if torch.get_default_device().type == "cuda":
+        return torch.bfloat16
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return torch.bfloat16 if supported is not None and supported() else torch.float32

@@ -1,0 +1,163 @@
+"""`pans train --encoder automaton`: train patterns that follow from the clicks before them, and export a bundle.
+
+Owns which options an automaton takes and how the answer looks; the work is done by the packages adaptive and export. All accuracies here
+are exact expectations, SIMULATED through the profile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, emit, say
+from pans.runtime.errors import UsageError
+
+from .arguments import torch_with, usage_errors
+
+if TYPE_CHECKING:
+    from pans.trainer.adaptive.options import AutomatonOptions
+    from pans.trainer.adaptive.train import Progress, TrainedAutomaton
+    from pans.trainer.export.automaton import ExportedAutomaton, WalkFigures
+
+DEFAULT_PROFILE = "ideal"
+TAKEN = (
+    "photons",
+    "clicks",
+    "exposures",
+    "states",
+    "epochs",
+    "seed",
+    "batch",
+    "shift_px",
+    "offset_px",
+    "copies",
+    "dark",
+)
+FOREIGN = (
+    *("features", "estimator", "head", "alpha", "budget", "history", "input_photons", "restarts", "starts", "warm"),
+    *("polish", "similarity", "mix", "shots", "hidden", "slope", "clamp", "complex_field", "conserving"),
+)
+
+
+def train_automaton_command(args: argparse.Namespace, checkpoint: Path) -> int:
+    """Train as `args` say, write the bundle, and report what it decides on the held-out objects."""
+    _refuse_foreign(args)
+    torch_with(args.threads)
+    from pans.runtime.instrument.profile import load_profile
+    from pans.trainer.adaptive.options import check_automaton_options
+    from pans.trainer.adaptive.train import train_automaton
+    from pans.trainer.device import computing_on, keep_freed_memory
+    from pans.trainer.tasks.registry import load_task
+
+    profile = load_profile(args.profile or DEFAULT_PROFILE)
+    task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
+    options = _options(args)
+    check_automaton_options(options, task, profile)
+    keep_freed_memory()
+    started = time.perf_counter()
+    try:
+        with usage_errors(), _progress() as show, computing_on(args.device):
+            trained = train_automaton(task, profile, options, checkpoint=checkpoint, resume=args.resume, report=show)
+            exported = _export(args, trained, task, profile, time.perf_counter() - started)
+    except KeyboardInterrupt:
+        say(f"interrupted; the last whole step is in {checkpoint}\n  go on: the same command with --resume")
+        return EXIT_INTERRUPTED
+    checkpoint.unlink(missing_ok=True)
+    _answer(args, trained, exported, time.perf_counter() - started)
+    return EXIT_FINE
+
+
+def _refuse_foreign(args: argparse.Namespace) -> None:
+    given = [name for name in FOREIGN if getattr(args, name) not in (None, False)]
+    if given:
+        flags = ", ".join("--" + name.replace("_", "-") for name in given)
+        raise UsageError(f"{flags}: not of an automaton", remedy="leave it out, or choose another --encoder")
+
+
+def _options(args: argparse.Namespace) -> AutomatonOptions:
+    from pans.trainer.adaptive.options import AutomatonOptions
+
+    given = {name: value for name in TAKEN if (value := getattr(args, name)) is not None}
+    return AutomatonOptions(grey=args.grey, **given)
+
+
+def _export(
+    args: argparse.Namespace, trained: TrainedAutomaton, task: Any, profile: Any, seconds: float
+) -> ExportedAutomaton:
+    from pans.trainer.export.automaton import export_automaton
+    from pans.trainer.tasks.registry import task_names
+
+    provenance = {
+        "task_argument": args.task if args.task in task_names() else Path(args.task).name,
+        "data_seed": args.data_seed,
+        "options": asdict(trained.options) | {"threads": args.threads, "device": args.device},
+        "training_seconds": round(seconds, 1),
+    }
+    name = args.name or args.out.stem
+    return export_automaton(args.out, trained, task, profile, name=name, provenance=provenance, force=args.force)
+
+
+def _answer(args: argparse.Namespace, trained: TrainedAutomaton, exported: ExportedAutomaton, seconds: float) -> None:
+    bundle = exported.bundle
+    automaton = bundle.automaton
+    assert automaton is not None
+    payload = {
+        "bundle": str(args.out),
+        "sha256": exported.sha256,
+        **asdict(exported.measured),
+        "first_200": asdict(exported.first_200),
+        "held_back": asdict(trained.held_back),
+        "states": automaton.n_states,
+        "patterns": bundle.n_patterns,
+        "exposures": automaton.n_slots,
+        "price": trained.price,
+        "seconds": seconds,
+        "simulated": True,
+    }
+    lines = [
+        f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s",
+        f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
+        _words("all held-out objects", exported.measured),
+        _words("the first 200", exported.first_200),
+    ]
+    emit(args, payload, "\n".join(lines))
+
+
+def _words(which: str, found: WalkFigures) -> str:
+    return (
+        f"SIMULATED accuracy {100 * found.accuracy_mean:.2f} %  ({which}: {found.objects}, exact expectation, "
+        f"error from the objects {100 * found.accuracy_se_objects:.2f} points)\n"
+        f"  clicks {found.clicks_mean:.3f}   photons {found.photons_mean:.2f}   illumination {found.illumination:.1f}   "
+        f"exposures {found.exposures_mean:.1f}   calibration error {100 * found.expected_calibration_error:.1f} points"
+    )
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[Progress], None]]:
+    """A bar on a terminal, else a line per epoch and every eighth level; both on stderr."""
+    if not sys.stderr.isatty():
+        yield lambda told: say(_line(told)) if told.stage != "grow" or told.done % 8 == 0 else None
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    with Bar(console=Console(stderr=True)) as bar:
+        task = bar.add_task("training", total=None)
+
+        def show(told: Progress) -> None:
+            bar.update(task, completed=told.done, total=told.steps, description=_line(told))
+
+        yield show
+
+
+def _line(told: Progress) -> str:
+    return (
+        f"{told.stage} {told.done}/{told.steps}: loss {told.loss:.3f}, accuracy {100 * told.accuracy:.1f} %, "
+        f"{told.clicks:.2f} clicks, {told.photons:.2f} photons"
+    )

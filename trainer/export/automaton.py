@@ -1,0 +1,222 @@
+"""From a trained automaton to a bundle, with the proof that the bundle walks as the model does, and what it is expected to achieve.
+
+Owns the bundle's facts, the comparison and the figures of the held-out objects; never trains. `export_automaton` writes the file, reads it
+back and raises when the file's walks differ from the model's. All figures are exact expectations, SIMULATED through the profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pans.runtime import __version__
+from pans.runtime.bundle.automaton import reachable_automaton
+from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
+from pans.runtime.bundle.walks import walk_nodes
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.expectation import ExpectedWalk, expected_walk
+from pans.runtime.errors import PansError
+from pans.runtime.instrument.click_law import click_law, object_transmission
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.outputs import whole_file
+from pans.trainer.adaptive.posteriors import calibration_error
+from pans.trainer.adaptive.train import TrainedAutomaton
+from pans.trainer.model.exposure import exposure_us_of
+from pans.trainer.tasks.registry import Objects, Task
+
+COMPARED_OBJECTS = 100
+TOLERANCE = 1e-5  # of chances and of relative light: posteriors are stored in float32
+FIRST = 200  # the held-out objects that the paper judges by
+AT_ONCE = 1000
+SAMPLED_WALKS = 1000
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WalkFigures:
+    """Exact means per decision over some objects; `accuracy_se_objects`: the standard error that comes from their number."""
+
+    objects: int
+    accuracy_mean: float
+    accuracy_se_objects: float
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    exposures_mean: float
+    expected_calibration_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedAutomaton:
+    """The written bundle, and what it does on all held-out objects and on the first 200."""
+
+    bundle: Bundle
+    sha256: str
+    measured: WalkFigures
+    first_200: WalkFigures
+    difference: float  # of class chances between the file and the model, the largest
+
+
+def export_automaton(
+    path: Path,
+    trained: TrainedAutomaton,
+    task: Task,
+    profile: Profile,
+    *,
+    name: str,
+    provenance: Mapping[str, Any],
+    force: bool = False,
+) -> ExportedAutomaton:
+    """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
+    bundle = bundle_of(trained, task, profile, name, provenance)
+    difference = compare_walks(bundle, trained, task, profile)
+    walked = measure_walks(bundle, task.test, profile, trained.options.dark)
+    measured = walked.figures()
+    expected = {
+        "profile": profile.name,
+        "task": task.name,
+        "split": "test",
+        "objects": len(task.test),
+        "accuracy": measured.accuracy_mean,
+        "clicks": measured.clicks_mean,
+        "photons": measured.photons_mean,
+        "illumination": measured.illumination,
+        "exposures": measured.exposures_mean,
+    }
+    with whole_file(path, force=force) as unchecked:
+        write_bundle(with_expected(bundle, expected), unchecked)
+        written, digest = load_bundle(unchecked)
+        compare_decider(written, trained.options.seed)
+    return ExportedAutomaton(written, digest, measured, walked.figures(FIRST), difference)
+
+
+def bundle_of(
+    trained: TrainedAutomaton, task: Task, profile: Profile, name: str, provenance: Mapping[str, Any]
+) -> Bundle:
+    """Return the bundle of a trained automaton: states and leaves that no walk reaches are left out, and patterns that none shows."""
+    arrays = trained.arrays
+    automaton = reachable_automaton(
+        arrays.pattern, arrays.dwell, arrays.dwell_steps, arrays.successors, arrays.posteriors
+    )
+    shown, pattern = np.unique(automaton.pattern, return_inverse=True)
+    automaton = replace(automaton, pattern=pattern.astype(np.uint16))
+    facts = {
+        "data_sha256": task.sha256,
+        "data_split": task.split,
+        "task_light": task.light,
+        "task_optics": task.optics,
+        "task_source": task.source,
+        "profile": profile.name,
+        "profile_sha256": profile.sha256,
+        "held_back": {key: round(value, 6) for key, value in asdict(trained.held_back).items()},
+        "calibration_error": trained.posteriors.calibration_error,
+        "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}",
+        **provenance,
+    }
+    return make_bundle(
+        name=name,
+        task=task.name,
+        classes=task.classes,
+        image_shape=task.image_shape,
+        optics=Shown(arrays.levels, arrays.pattern_levels[shown], arrays.photons_per_level),
+        automaton=automaton,
+        provenance=facts,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walked:
+    """Per object: clicks, photons, illumination, exposures (n, 4), the chance of a right decision (n,); per leaf its
+    posterior."""
+
+    light: F64
+    right: F64
+    labels: NDArray[np.int64]
+    leaf_of: list[F64]
+    posteriors: NDArray[np.float32]
+
+    def figures(self, count: int | None = None) -> WalkFigures:
+        """Return the means over the first `count` objects, or all."""
+        right, n = self.right[:count], len(self.right[:count])
+        clicks, photons, illumination, exposures = (float(mean) for mean in self.light[:count].mean(axis=0))
+        error = float(right.std(ddof=1) / n**0.5) if n > 1 else 0.0
+        calibration = _calibration(self, n)
+        return WalkFigures(n, float(right.mean()), error, clicks, photons, illumination, exposures, calibration)
+
+
+def _calibration(walked: Walked, n: int) -> float:
+    arrived = np.zeros(walked.posteriors.shape)
+    first = 0
+    for leaves in walked.leaf_of:
+        part = leaves[: max(0, n - first)]
+        labels = walked.labels[first : first + len(part)]
+        arrived += part.T @ (labels[:, None] == np.arange(walked.posteriors.shape[1])).astype(np.float64)
+        first += len(leaves)
+    return calibration_error(walked.posteriors.astype(np.float64), arrived)
+
+
+def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> Walked:
+    """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
+    automaton = bundle.automaton
+    assert automaton is not None
+    posteriors = automaton.posteriors[automaton.n_states :]
+    decided = posteriors.argmax(axis=1)
+    light, right, leaves = [], [], []
+    for first in range(0, len(objects), AT_ONCE):
+        found = _expected(bundle, objects.images[first : first + AT_ONCE], profile, dark)
+        labels = objects.labels[first : first + AT_ONCE]
+        light.append(np.stack([found.clicks, found.photons, found.illumination, found.exposures], axis=1))
+        right.append((found.leaves * (decided == labels[:, None])).sum(axis=1))
+        leaves.append(found.leaves)
+    return Walked(np.concatenate(light), np.concatenate(right), objects.labels, leaves, posteriors)
+
+
+def _expected(bundle: Bundle, images: NDArray[np.uint8], profile: Profile, dark: float | None) -> ExpectedWalk:
+    assert bundle.automaton is not None
+    law = click_law(
+        profile, max(profile.exposure.min_us, exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1)))
+    )
+    if dark is not None:
+        law = type(law)(dark, law.read_noise_e, law.threshold_e)
+    flat = images.reshape(len(images), -1)
+    transmission = object_transmission(profile, flat)
+    return expected_walk(bundle.automaton, bundle.pattern_levels, transmission, law, bundle.photons_per_level)
+
+
+def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
+    """Hold the file's chances of every class and its light against the model's, on held-out objects; PansError where they differ."""
+    objects = task.test.first(COMPARED_OBJECTS)
+    found = _expected(bundle, objects.images, profile, trained.options.dark)
+    assert bundle.automaton is not None
+    of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
+    wanted, photons = trained.chances(objects)
+    difference = float(np.abs(of_class - wanted).max())
+    of_light = float((np.abs(found.photons - photons) / np.maximum(1e-9, photons)).max())
+    if not (difference <= TOLERANCE and of_light <= TOLERANCE):
+        raise PansError(
+            f"the walks of {bundle.name} differ from the trained automaton: chances of a class by {difference:.3g}, light by "
+            f"{of_light:.3g} of itself, allowed {TOLERANCE:g}",
+            remedy="report this with the bundle: the export is wrong",
+        )
+    return difference
+
+
+def compare_decider(bundle: Bundle, seed: int) -> None:
+    """Hold the back end that will decide against plain walks of random click words; PansError where a decision differs."""
+    automaton = bundle.automaton
+    assert automaton is not None
+    words = np.random.default_rng(seed).integers(0, 2, (SAMPLED_WALKS, automaton.n_bits))
+    wanted = automaton.posteriors[walk_nodes(automaton, words)[:, -1]]
+    found = make_decider(bundle, backend="automaton").scores_batch(words.astype(np.int64), 1)
+    if not np.array_equal(found.argmax(axis=1), wanted.argmax(axis=1)):
+        raise PansError(
+            f"the back end of {bundle.name} decides otherwise than its leaves",
+            remedy="report this with the bundle: the export is wrong",
+        )
