@@ -23,15 +23,23 @@ N_PATTERNS = 4
 EXPOSURE_US = 100.0
 
 
-def following_profile() -> Profile:
+def following_profile(levels: int = 65_536) -> Profile:
     """Return the ideal instrument as one that follows automata of up to 16 states, with four dwell steps."""
     profile = load_profile("ideal")
-    projector = replace(profile.projector, automaton_states=16, dwell_steps=4)
+    projector = replace(profile.projector, automaton_states=16, dwell_steps=4, levels=levels)
     return replace(profile, projector=projector, timing=replace(profile.timing, host_turn_us=50.0))
 
 
 def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
-    """Return an instrument, a bundle and a plan that put many small frames on the wire; `mode` is sequential or parallel."""
+    """Return an instrument, a bundle and a plan that put many small frames on the wire.
+
+    `mode` is sequential or parallel; or an automaton with binary patterns that the device follows (device-driven) or the host names
+    (host-driven).
+    """
+    if mode in ("device-driven", "host-driven"):
+        profile = following_profile(levels=2)
+        bundle = small_automaton_bundle()
+        return profile, bundle, build_plan(profile, bundle, shots_per_object=4, drive=mode.partition("-")[0])
     profile = load_profile("ideal")
     if mode == "parallel":
         detector = replace(profile.detector, channels=N_PATTERNS)

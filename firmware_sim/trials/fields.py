@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import os
 import random
-import struct
 import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import msgpack
 import numpy as np
 
+from pans.firmware_sim.checks.mutation import LAYOUTS, MISSING, STAMP, Mutation, by, field_of, is_of, mutate, to
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports.shell import TcpPort, serve
@@ -38,10 +37,10 @@ from pans.runtime.live import RunConfig, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.wire import messages
-from pans.runtime.wire.fields import FACTS, MESSAGES, Field, wrong_facts
+from pans.runtime.wire.fields import FACTS, wrong_facts
 from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
-from pans.runtime.wire.messages import NO_OBJECT, STRUCTS, DeviceState, MalformedMessage, MessageType, Opcode
+from pans.runtime.wire.messages import NO_OBJECT, DeviceState, MalformedMessage, MessageType
 
 OBJECTS = 12
 SHOTS = 1
@@ -65,35 +64,14 @@ STRANGE_FACTS: tuple[Any, ...] = (
     [],
     {"a": [{}]},
 )
-TO_DEVICE = ("HELLO", "PING", "COMMAND", "GRANT", "LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE")
+TO_DEVICE = ("HELLO", "PING", "COMMAND", "GRANT", "LOAD_PATTERN", "LOAD_PLAN", "PLAN_SLOT", "ARM", "GATE")
 FROM_DEVICE = ("WELCOME", "PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK")
-
-
-class Mutation(NamedTuple):
-    """In `message`s, from number `first` on and at most `most` of them, `name` becomes `change` of what it was.
-
-    `name` is a field, or a key of WELCOME's map behind "map.". `words` say what the change is.
-    """
-
-    message: str
-    name: str
-    change: Callable[[Any], Any]
-    words: str
-    first: int = 0
-    most: int = 1 << 30
-
-    def __str__(self) -> str:
-        return f"{self.message}.{self.name} {self.words}, from message {self.first} on, {self.most} of them"
-
-
-def to(value: Any) -> tuple[Callable[[Any], Any], str]:
-    """Return the change to `value`, and its words."""
-    return lambda _: value, f"becomes {value!r}"
-
-
-def by(step: int) -> tuple[Callable[[Any], Any], str]:
-    """Return the change by `step`."""
-    return lambda value: value + step, f"moves by {step}"
+MODES = {  # and what a session of each has on the wire beside what all have
+    "sequential": ("CLICKS", "CLICKS", STAMP),
+    "parallel": ("FRAMES", "FRAMES"),
+    "device-driven": ("CLICKS", STAMP, STAMP, "LOAD_MASKS", "LOAD_STATES", "STATE", "STATE"),
+    "host-driven": ("CLICKS", STAMP, STAMP, "LOAD_MASKS", "SHOW", "SHOW"),
+}
 
 
 class Evidence(NamedTuple):
@@ -118,7 +96,7 @@ class Evidence(NamedTuple):
             ("BLOCK", "tick"): abs(new - old) > self.tick_hz,
         }
         always = {
-            **{"MARK": ("seq", "exposure_index", "half_exposures"), "PONG": ("host_ns",)},
+            **{STAMP: ("pattern",), "MARK": ("seq", "exposure_index", "half_exposures"), "PONG": ("host_ns",)},
             "BLOCK": ("seq", "drops", "exposure_index", "period_ticks", "count", "word_bytes"),
         }
         kind = "BLOCK" if message in ("CLICKS", "FRAMES") else message
@@ -151,9 +129,9 @@ class MutatedLink:
 
     def _mutated(self, frame: Frame) -> bytes:
         payload = frame.payload
-        self._armed |= _is(frame, "ARM")
+        self._armed |= is_of(frame, "ARM")
         for place, mutation in enumerate(self._mutations):
-            if not _is(frame, mutation.message):
+            if not is_of(frame, mutation.message):
                 continue
             number = self._seen[place, 0]
             self._seen[place, 0] += 1
@@ -171,7 +149,8 @@ class MutatedLink:
 
     def _excludes(self, mutation: Mutation, old: bytes, new: bytes) -> bool:
         """Whether the changed message cannot be meant, or cannot be true."""
-        decode = getattr(messages, f"decode_{mutation.message.lower()}")
+        kind = "CLICKS" if mutation.message == STAMP else mutation.message
+        decode = getattr(messages, f"decode_{kind.lower()}")
         try:
             decoded = decode(new)
         except MalformedMessage:
@@ -182,55 +161,15 @@ class MutatedLink:
             return False  # the other one may make it a message that is dropped: of another probe, or of an earlier run
         if mutation.message == "STATUS" and (not self._armed or decoded.state == DeviceState.ARMED):
             return False  # of no run, or of one that has not begun
-        place = [one.name for one in MESSAGES[mutation.message]].index(mutation.name)
-        values = [STRUCTS[mutation.message].unpack_from(payload)[place] for payload in (old, new)]
+        values = [field_of(payload, mutation) for payload in (old, new)]
         return self._evidence.excludes(mutation.message, mutation.name, *values)
-
-
-def _is(frame: Frame, message: str) -> bool:
-    if message in ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE"):
-        return frame.type == MessageType.COMMAND and frame.payload[4] == Opcode[message]
-    return frame.type == MessageType[message]
-
-
-def mutate(payload: bytes, mutation: Mutation) -> bytes:
-    """Return `payload` with one field changed; whatever does not fit the field's bits is cut to them."""
-    if mutation.name.startswith("map."):
-        head, facts = payload[: STRUCTS["WELCOME"].size], msgpack.unpackb(payload[STRUCTS["WELCOME"].size :])
-        key = mutation.name[4:]
-        value = mutation.change(facts.get(key))
-        if value is MISSING:
-            facts.pop(key, None)
-        else:
-            facts[key] = value
-        return head + msgpack.packb(facts)
-    start = STRUCTS["COMMAND"].size if mutation.message in ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE") else 0
-    fields = MESSAGES[mutation.message]
-    place = [one.name for one in fields].index(mutation.name)
-    layout = STRUCTS[mutation.message]
-    values = list(layout.unpack_from(payload, start))
-    values[place] = fitted(fields[place], mutation.change(values[place]))
-    return payload[:start] + layout.pack(*values) + payload[start + layout.size :]
-
-
-MISSING = object()
-
-
-def fitted(field: Field, value: Any) -> Any:
-    """Return `value` as the field's bits hold it."""
-    if field.code == "f":
-        return struct.unpack("<f", struct.pack("<f", value))[0]
-    size = struct.calcsize(field.code)
-    return int.from_bytes((int(value) % (1 << 8 * size)).to_bytes(size, "little"), "little", signed=field.code == "h")
 
 
 def any_mutation(dice: random.Random, mode: str) -> Mutation:
     """Draw a mutation of a session in `mode`."""
-    block = "FRAMES" if mode == "parallel" else "CLICKS"
     names = [
         *(name for name in FROM_DEVICE if name not in ("CLICKS", "FRAMES")),
-        block,
-        block,
+        *MODES[mode],
         "MARK",
         "STATUS",
         *TO_DEVICE,
@@ -243,7 +182,7 @@ def any_mutation(dice: random.Random, mode: str) -> Mutation:
         return Mutation(
             message, f"map.{key}", *(to(value) if value is not MISSING else (lambda _: MISSING, "is missing")), first=0
         )
-    chosen = dice.choice([one for one in MESSAGES[message] if one.name not in ("reserved",)])
+    chosen = dice.choice([one for one in LAYOUTS[message] if one.name not in ("reserved",)])
     if chosen.code == "f":
         change, words = to(dice.choice(REALS))
     elif dice.random() < 0.3:
@@ -273,7 +212,8 @@ class Stage:
         self.profile, self.bundle, self.plan = small_setup(mode)
         images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
         self.scene: Scene = scene_from_arrays("fields", images, np.arange(6) % 3, ("a", "b", "c"))
-        self.decider = make_decider(self.bundle, shots=SHOTS, backend="table")
+        self.backend = "table" if self.bundle.automaton is None else "automaton"
+        self.decider = make_decider(self.bundle, shots=SHOTS, backend=self.backend)
 
     def run(self, folder: Path, seed: int, *mutations: Mutation) -> Session:
         """Run one session with `mutations` and judge what can be judged of any."""
@@ -309,7 +249,7 @@ class Stage:
     def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         config = RunConfig(SHOTS, OBJECTS * self.plan.cycles_per_object, deadline_us=1e5)
         core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
-        header = {"config": {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": "table"}}
+        header = {"config": {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}}
         with Recorder(path, header, overwrite=True) as recorder:
             try:
                 result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
@@ -351,7 +291,7 @@ def tcp_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
 
 def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str], list[str]]:
     """Run `count` sessions, one mutation each, or two; return how they ended and what was wrong, with the seed of each."""
-    stages = {mode: Stage(mode, over) for mode in ("sequential", "parallel")}
+    stages = {mode: Stage(mode, over) for mode in MODES}
     ended: Counter[str] = Counter()
     wrong: list[str] = []
     with TemporaryDirectory() as folder:
