@@ -25,8 +25,10 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.live import LiveRun
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_gate
-from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark
+from pans.runtime.wire.messages import ClickBlock, FrameBlock, Mark
 from pans.runtime.wire.tracker import Gap
+
+from .truths import walk_truth, window_members
 
 if TYPE_CHECKING:
     from pans.firmware_sim.device.parallel import FrameRun
@@ -55,6 +57,7 @@ class Stream:
     entries: deque[Entry] = field(default_factory=deque)
     state: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(RING, np.uint8))
     clicks: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(RING, np.uint64))  # bit c: channel c
+    stamps: NDArray[np.uint16] = field(default_factory=lambda: np.zeros(RING, np.uint16))  # of an automaton's exposures
     emitted_to: int = 0
     accounted_to: int = 0
     next_window: int = 0
@@ -96,8 +99,14 @@ class Checker:
         self.violations: list[str] = []
         self.counts = CheckCounts()
         self._visit = plan.slots_per_cycle * plan.cycles_per_object
-        self._members, self._features = _window_members(plan, shots)
-        self._window_of = {int(members[-1]): window for window, members in enumerate(self._members)}
+        self._members, self._features = window_members(plan, shots)
+        self._automaton = plan.automaton
+        # a walk is decided at its leaf, which may be any of its exposures
+        self._window_of = {
+            int(member): window
+            for window, members in enumerate(self._members)
+            for member in (members[-1:] if plan.automaton is None else members)
+        }
         self._n_features = plan.n_patterns
         self._parallel = plan.mode == "parallel"
         if self._n_features > 64:
@@ -137,6 +146,8 @@ class Checker:
         stream.entries.append(entry)
         where = np.arange(entry.first, stream.emitted_to) % RING
         stream.state[where] = EMITTED
+        if self._automaton is not None and isinstance(message, ClickBlock):
+            stream.stamps[where] = message.patterns
         stream.clicks[where] = raw if raw.ndim == 1 else raw.astype(np.uint64) @ self._byte_weights[: raw.shape[1]]
 
     def on_execute(self, epoch: int, session: int, command: wire.CommandMessage, tick: int) -> None:
@@ -292,6 +303,9 @@ class Checker:
             self.fail(f"decision {decision.number} is of window {number}, due was {stream.next_window}")
         stream.next_window = number + 1
         exposures = visit * self._visit + self._members[window]
+        if self._automaton is not None:
+            self._on_walk(stream, decision, exposures)
+            return
         complete = bool((stream.state[exposures % RING] == DELIVERED).all())
         flagged = bool(decision.flags & DecisionFlag.ABSTAINED) and decision.label == NO_LABEL
         self.counts.decisions_flagged += flagged
@@ -303,6 +317,28 @@ class Checker:
             )
         if stream.emitted_to - visit * self._visit > RING:
             self.fail("the checker remembers too few exposures for this plan")
+
+    def _on_walk(self, stream: Stream, decision: Decision, exposures: NDArray[np.int64]) -> None:
+        assert self._automaton is not None
+        where = exposures % RING
+        truth = walk_truth(self._automaton, stream.stamps[where].tolist(), stream.clicks[where].tolist())
+        flagged = bool(decision.flags & DecisionFlag.ABSTAINED) and decision.label == NO_LABEL
+        self.counts.decisions_flagged += flagged
+        delivered = bool((stream.state[where[: truth.taken]] == DELIVERED).all())
+        if not (delivered and truth.ended):
+            if not flagged:
+                self.fail(
+                    f"decision {decision.number} was made from a walk with a gap, or without an end: flags {decision.flags}"
+                )
+            return
+        last = int(exposures[truth.taken - 1])
+        wanted = zlib.crc32(truth.clicks.tobytes()), truth.taken, last
+        found = decision.counts_crc, decision.exposures, decision.exposure_index
+        if flagged or found != wanted:
+            self.fail(
+                f"decision {decision.number} of a whole walk: flags {decision.flags}; clicks, exposures and the last are {found}, "
+                f"emitted were {wanted}"
+            )
 
     def _truth(self, stream: Stream, exposures: NDArray[np.int64], window: int) -> int:
         counts = np.zeros(self._n_features, np.int64)
@@ -348,21 +384,6 @@ class WatchedInstrument(Instrument):
     def _gate(self, body: bytes) -> None:
         super()._gate(body)
         self.checker.on_gate(unpack_gate(body), self.tick)
-
-
-def _window_members(plan: Plan, shots: int) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:
-    """Return for each window of a visit its exposures, ascending, and the pattern of each; in plain loops, from the plan alone."""
-    n_windows = plan.shots_per_cycle * plan.cycles_per_object // shots
-    members: list[list[int]] = [[] for _ in range(n_windows)]
-    features: list[list[int]] = [[] for _ in range(n_windows)]
-    for cycle in range(plan.cycles_per_object):
-        for slot in range(plan.slots_per_cycle):
-            if plan.slot_pattern[slot] == DARK_PATTERN:
-                continue
-            window = (cycle * plan.shots_per_cycle + int(plan.slot_shot[slot])) // shots
-            members[window].append(cycle * plan.slots_per_cycle + slot)
-            features[window].append(int(plan.slot_pattern[slot]))
-    return [np.array(one, np.int64) for one in members], [np.array(one, np.int64) for one in features]
 
 
 def _forget_oldest(log: dict[Any, Any], most: int) -> None:

@@ -1,7 +1,7 @@
 """The fault grid: whole runs in virtual time under every fault, judged by the checkers (checkers.py).
 
 Owns the choice of runs and their report; the host in them is the real one (`run_live`). Each fault runs alone and all together, with
-each seed; even seeds measure sequentially, odd ones in parallel. A failure prints the command that repeats it.
+each seed; seeds measure in MODES in turn. A failure prints the command that repeats it.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from pans.runtime.wire.commands import Gate
 from . import Report, Trial, figures_text
 
 SHOTS = 1
+MODES = ("sequential", "parallel", "device-driven")
 GATE_EVERY = 32  # decisions
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
@@ -98,7 +99,7 @@ def case_faults(case: str) -> str:
 
 def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) -> GridResult:
     """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults."""
-    mode = "parallel" if seed % 2 else "sequential"
+    mode = MODES[seed % len(MODES)]
     profile, bundle, plan = small_setup(mode)
     checker = Checker(plan, SHOTS)
     clock = DeviceClock(profile.clock.tick_hz)
@@ -115,10 +116,11 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
     per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
     config = RunConfig(shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9)
     started = time.perf_counter()
-    core = Core(plan, make_decider(bundle, shots=SHOTS, backend="table"), SHOTS, config.n_cycles)
+    backend = "table" if bundle.automaton is None else "automaton"
+    core = Core(plan, make_decider(bundle, shots=SHOTS, backend=backend), SHOTS, config.n_cycles)
     recovery = Recovery.of(link, "", 30.0)
     observers = Observers(host.watch, host.start)
-    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
+    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend}}
     with TemporaryDirectory() as folder:
         with Recorder(Path(folder) / "grid.pansrec", header) as recorder:
             result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
