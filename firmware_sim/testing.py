@@ -39,7 +39,8 @@ def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
     if mode in ("device-driven", "host-driven"):
         profile = following_profile(levels=2)
         bundle = small_automaton_bundle()
-        return profile, bundle, build_plan(profile, bundle, shots_per_object=4, drive=mode.partition("-")[0])
+        plan = build_plan(profile, bundle, shots_per_object=4, drive=mode.partition("-")[0])
+        return profile, bundle, replace(plan, block_exposures=min(2, plan.block_exposures))
     profile = load_profile("ideal")
     if mode == "parallel":
         detector = replace(profile.detector, channels=N_PATTERNS)

@@ -105,7 +105,7 @@ class BulkSteps:
 
     def step(self, frame: Frame) -> Output:
         """Let the core take a message that is not ordinary."""
-        self._marks_to_core()
+        self.hand_over()
         output = self.core.step(frame)
         if frame.type == MessageType.MARK and self.core.marks:
             mark = self.core.marks[next(reversed(self.core.marks))]
@@ -158,8 +158,8 @@ class BulkSteps:
             core.last_tick, core.jitter_ticks = state[kernels.LAST_TICK], state[kernels.JITTER]
         core.n_decisions, core.n_abstained = state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED]
 
-    def _marks_to_core(self) -> None:
-        """Tell the core of the marks that the kernel has taken."""
+    def hand_over(self) -> None:
+        """Tell the core of the marks that the kernel has taken: before the core does anything by itself."""
         marks, core = self._marks, self.core
         new = np.flatnonzero((marks.objects != self._told.objects) | (marks.truths != self._told.truths))
         for slot in new.tolist():

@@ -246,9 +246,11 @@ def _bulk_decisions(
                 continue
             frame = messages.frame(place)
             if frame.session != streams.session:
+                steps.hand_over()  # what the stream before leaves open has its truth
                 yield streams.begin_up_to(frame.session)
                 steps.begin(frame.session)
             else:
                 place += 1
                 yield steps.step(frame).decisions
+    steps.hand_over()
     yield from streams.begin_rest()

@@ -18,7 +18,7 @@ from pans.firmware_sim.ports import faulty as faulty_module
 from pans.firmware_sim.ports.faults import NAMES, NO_FAULTS, USUAL, Faults, Recurring, check_possible, parse_faults
 from pans.firmware_sim.ports.faulty import FaultCounters, FaultyDevice, Lane
 from pans.firmware_sim.ports.serve import open_sim, parse_sim_url
-from pans.firmware_sim.trials.fault_grid import case_faults, run_case
+from pans.firmware_sim.trials.fault_grid import MODES, case_faults, run_case
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.errors import ConfigError, LinkError, UsageError
@@ -227,7 +227,7 @@ OFTEN = {
 }
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", range(len(MODES)))
 @pytest.mark.parametrize("case", ["none", "all"])
 def test_whole_runs_under_all_faults_or_none(case: str, seed: int) -> None:
     result = run_case(case, seed, 12_000)
@@ -241,7 +241,7 @@ def test_whole_runs_under_all_faults_or_none(case: str, seed: int) -> None:
 @pytest.mark.parametrize("case", NAMES)
 def test_whole_runs_under_each_fault(case: str) -> None:
     assert case_faults(case).startswith(case)
-    result = run_case(case, 2 + NAMES.index(case) % 2, 6_000, OFTEN.get(case))
+    result = run_case(case, NAMES.index(case) % len(MODES), 6_000, OFTEN.get(case))
     assert result.violations == [], result.violations
     assert any(count for name, count in result.faults.items() if name != "frames")
     assert (result.reconnects > 0) == (case in ("disconnect", "reset"))

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from pans.firmware_sim.trials.fields import Mutation, Session, Stage, by, sessions, to
+from pans.firmware_sim.checks.mutation import STAMP, Mutation, by, to
+from pans.firmware_sim.trials.fields import Session, Stage, sessions
 from pans.runtime.cli import main
 from pans.runtime.commands.carry_out import _exit_code
 
@@ -27,6 +28,11 @@ def parallel() -> Stage:
     return Stage("parallel")
 
 
+@pytest.fixture(scope="module")
+def walks() -> Stage:
+    return Stage("device-driven")
+
+
 def ended(session: Session) -> Any:
     assert session.wrong == []
     assert session.changed > 0
@@ -34,8 +40,8 @@ def ended(session: Session) -> Any:
     return session.summary
 
 
-def test_a_session_without_mutations_passes(stage: Stage, parallel: Stage, tmp_path: Path) -> None:
-    for one in (stage, parallel):
+def test_a_session_without_mutations_passes(stage: Stage, parallel: Stage, walks: Stage, tmp_path: Path) -> None:
+    for one in (stage, parallel, walks):
         summary = one.run(tmp_path, 1).summary
         assert summary is not None
         assert (summary.verdict, summary.contradictions, _exit_code(summary)) == ("PASS", {}, 0)
@@ -75,6 +81,46 @@ def test_what_contradicts_the_evidence_is_a_fault_with_its_name(
     assert what in summary.contradictions, summary.faults
     assert any("contradict" in fault for fault in summary.faults)
     assert _exit_code(summary) in (3, 4)
+
+
+@pytest.mark.parametrize("change", [to(0), to(6), to(0xFFFE), to(0xFFFF), by(1)], ids=lambda change: change[1])
+def test_a_state_that_the_walk_does_not_pass_is_a_fault_and_decides_nothing(
+    change: Any, walks: Stage, tmp_path: Path
+) -> None:
+    """Block after block says another first state; those blocks begin with a dark slot, or in the midst of a walk."""
+    mutation = Mutation(STAMP, "pattern", *change)
+    summary = ended(walks.run(tmp_path, secrets.randbelow(1000), mutation))
+    assert summary.verdict == "FAIL"
+    assert summary.wrong_patterns > 0 or summary.contradictions["stamp"] > 0
+
+
+def test_a_device_that_follows_another_automaton_is_found(walks: Stage, tmp_path: Path) -> None:
+    session = walks.run(tmp_path, 3, Mutation("STATE", "next_click", *to(4)))  # of state 0, which leads to 2
+    summary = ended(session)
+    assert (summary.verdict, summary.as_json()["abstained"] > 0, summary.wrong_patterns > 0) == ("FAIL", True, True)
+
+
+@pytest.mark.parametrize(
+    ("mutation", "words"),
+    [
+        (Mutation("STATE", "next_dark", *to(0)), "state 0 leads to 0"),
+        (Mutation("STATE", "pattern", *to(4)), "a state shows pattern 4"),
+        (Mutation("LOAD_STATES", "dwell_steps", *to(3)), "dwell in 3 steps"),
+        (Mutation("LOAD_STATES", "n_states", *to(17)), "17 states: the device follows 16"),
+        (Mutation("LOAD_MASKS", "n_pixels", *to(5)), "LOAD_MASKS holds"),
+        (Mutation("WELCOME", "map.automaton_schema", *to(7)), "automata of schema 0x00000007"),
+        (Mutation("WELCOME", "map.automaton_states", *to(5)), "up to 5 states, needed 6"),
+        (Mutation("WELCOME", "map.dwell_steps", *to(0)), "dwell_steps is 0, allowed 1 to 65535"),
+    ],
+    ids=str,
+)
+def test_what_a_device_cannot_follow_is_refused_with_the_reason(
+    mutation: Mutation, words: str, walks: Stage, tmp_path: Path
+) -> None:
+    session = walks.run(tmp_path, 1, mutation)
+    assert session.wrong == []
+    assert session.error.startswith("DeviceError")
+    assert words in session.error
 
 
 @pytest.mark.parametrize(
