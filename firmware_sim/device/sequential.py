@@ -104,8 +104,8 @@ class Measurement(Timetable):
         return message
 
     def draw_ahead(self) -> bool:
-        """Nothing: what is shown next may be up to the clicks of now."""
-        return False
+        """Prepare what the clicks to come need; they themselves are not drawn, as what is shown next may be up to those of now."""
+        return self._source.prepare(self._batch_first + len(self._batch))
 
     def cut(self, tick: int) -> StreamMessage | None:
         """Return the finished exposures of the block under way when the run is broken off at `tick`; None without any."""

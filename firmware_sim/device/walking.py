@@ -34,6 +34,7 @@ U64 = NDArray[np.uint64]
 BATCH_EXPOSURES = 1 << 14  # of a plan with fixed patterns, drawn at a time
 BLOCK_ENTRIES = 1 << 20  # objects times patterns that are computed at a time
 MAX_BLOCKS = 4  # and how many of those are kept: 32 MiB of float64
+OBJECTS_AHEAD = 3  # whose thresholds are made where there is time
 MAX_THRESHOLDS = 1 << 22  # of states times objects that are kept, twice each: 64 MiB
 
 
@@ -41,6 +42,9 @@ class SlotSource(Protocol):
     """The exposures of a sequential run, asked for in their order, `ahead` of them at a time where they are known."""
 
     ahead: int
+
+    def prepare(self, exposure: int) -> bool:
+        """Do a piece of work of a fraction of a millisecond that `exposure` or those after it will need; whether there was any."""
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """Return what is stamped, uint16 (count,), and the clicks, uint8 (count, 1), of exposures from `first` on; before uint8 (1,)."""
@@ -53,6 +57,10 @@ class PlanSource:
 
     def __init__(self, program: Program, source: ClickSource) -> None:
         self._patterns, self._source = program.patterns, source
+
+    def prepare(self, exposure: int) -> bool:
+        """Nothing."""
+        return False
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""
@@ -128,6 +136,10 @@ class ShownSource:
     def __init__(self, walked: Walked, shows: ShowList) -> None:
         self._walked, self._shows = walked, shows
 
+    def prepare(self, exposure: int) -> bool:
+        """Nothing: what is shown is not known."""
+        return False
+
     def expected_photoelectrons(self, number: int) -> float:
         """Not known: only the host knows the automaton."""
         return math.nan
@@ -168,6 +180,20 @@ class WalkSource:
             follow(first + at, stamps[part], clicks[part], before)
             before, at = clicks[part.stop - 1], part.stop
         return stamps, clicks
+
+    def prepare(self, exposure: int) -> bool:
+        """See `SlotSource`: the thresholds of one of the objects to come."""
+        walked = self._walked
+        if walked.changes:
+            return False
+        visit = walked.program.n_slots * walked.program.cycles_per_object
+        for ahead in range(OBJECTS_AHEAD):
+            number = walked.object_of(exposure + ahead * visit)
+            if number not in self._kept:
+                self._thresholds(number)
+                self.expected_photoelectrons(number)
+                return True
+        return False
 
     def expected_photoelectrons(self, number: int) -> float:
         """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes."""

@@ -240,6 +240,18 @@ def test_the_size_of_time_steps_changes_nothing(cuts: list[int]) -> None:
     assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
 
 
+def test_work_that_is_done_ahead_changes_nothing_and_ends() -> None:
+    bench, made = bright(six_states())
+    bench.done(Opcode.ARM, pack_arm(Arm(bench.device.tick + 100, 40, 100_000)))
+    assert [bench.device.draw_ahead() for _ in range(4)] == [True, True, True, False]  # three objects
+    for _ in range(100):
+        bench.run_to(bench.device.tick + made.cycle_ticks // 2)
+        bench.device.draw_ahead()
+    stamps, clicks = joined([message for _, message in bench.got])
+    assert len(stamps) == 40 * made.slots_per_cycle
+    assert (stamps.tolist(), clicks.tolist()) == naive(bench, made, six_states(), len(stamps))
+
+
 def test_two_runs_of_a_session_walk_differently() -> None:
     bench, made = bright(six_states())
     first, second = (run(bench, made, 50)[1] for _ in range(2))
