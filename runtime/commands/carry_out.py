@@ -134,6 +134,7 @@ class _Prepared:
 def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.bundle.model import load_bundle
     from pans.runtime.core.plan import build_plan
+    from pans.runtime.core.plan_codec import drive_words
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
@@ -161,6 +162,8 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
             drive=job.drive,
             automaton=getattr(decider, "automaton", None),
         )
+        if plan.automaton is not None:
+            say(f"pans: {drive_words(dark.profile, bundle, plan)}")
         n_cycles = n_objects * plan.cycles_per_object
         core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms

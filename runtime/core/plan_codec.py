@@ -20,7 +20,10 @@ from .layout import Plan
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.automaton import Automaton
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.instrument.profile import Profile
 
+SERIAL_BYTES_PER_S = 400_000  # ten bits a byte
 SLOTS_MAX = 1 << 24  # of a plan that is rebuilt: 256 MiB
 
 
@@ -59,6 +62,32 @@ def _chunks_of(automaton: Automaton) -> list[StateChunk]:
     starts = range(0, len(states), STATES_PER_COMMAND)
     head = automaton.dwell_steps, automaton.n_leaves
     return [StateChunk(len(states), first, *head, states[first : first + STATES_PER_COMMAND]) for first in starts]
+
+
+def upload_bytes(plan: Plan, bundle: Bundle) -> int:
+    """How many bytes the device is sent before it can measure: patterns, slots and states, without the frames around them."""
+    n_patterns, n_pixels = bundle.pattern_levels.shape
+    pattern = (n_pixels + 7) // 8 if bundle.levels == 2 else 2 * n_pixels
+    n_states = 0 if plan.automaton is None or plan.drive != "device" else plan.automaton.n_states
+    return n_patterns * pattern + plan.slots_per_cycle * SLOT_DTYPE.itemsize + n_states * STATE_DTYPE.itemsize
+
+
+def drive_words(profile: Profile, bundle: Bundle, plan: Plan) -> str:
+    """Who drives a plan's automaton and what it takes, against what `profile` allows, in one sentence."""
+    automaton = plan.automaton
+    if automaton is None:
+        raise ValueError("a plan without an automaton")
+    projector, size = profile.projector, upload_bytes(plan, bundle)
+    follows = f"of {automaton.n_states} states (the device follows {projector.automaton_states})"
+    names = f"each next pattern, within {profile.timing.host_turn_us:g} us"
+    who = (
+        f"the device drives an automaton {follows}" if plan.drive == "device" else f"the host names {names}, {follows}"
+    )
+    return (
+        f"{who} and {bundle.n_shown} patterns (it holds {projector.pattern_memory}): {plan.slots_per_cycle} slots of "
+        f"{plan.slot_period_ticks * plan.tick_us:.4g} us, {1e6 / plan.cycle_us:.4g} walks per second; upload {size / 1e6:.3g} MB, "
+        f"{size / SERIAL_BYTES_PER_S:.2g} s on a serial line of 4 Mbaud"
+    )
 
 
 def plan_from_chunks(

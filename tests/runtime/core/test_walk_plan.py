@@ -12,7 +12,7 @@ from bundles import automaton_bundle, made_bundle, six_states, two_states
 from pans.runtime.bundle.automaton import Automaton, stopped
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, DARK_PATTERN, NO_SHOT, build_plan, exposure_us
-from pans.runtime.core.plan_codec import plan_chunks, plan_from_chunks, state_chunks
+from pans.runtime.core.plan_codec import drive_words, plan_chunks, plan_from_chunks, state_chunks, upload_bytes
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire.automata import STATES_PER_COMMAND, pack_states, unpack_states
@@ -158,3 +158,16 @@ def test_states_of_another_automaton_are_not_believed() -> None:
         plan_from_chunks(chunks, tick_hz, two_states(), states)
     with pytest.raises(MalformedMessage, match="4 adaptive slots for walks of 0 exposures"):
         plan_from_chunks(chunks, tick_hz)
+
+
+def test_who_drives_is_said_with_the_numbers() -> None:
+    bundle = bundle_for(six_states())
+    plan = build_plan(instrument(), bundle)
+    said = drive_words(instrument(), bundle, plan)
+    assert "the device drives an automaton of 6 states (the device follows 100) and 3 patterns (it holds 43690)" in said
+    assert "5 slots of 53 us, 3774 walks per second" in said
+    assert upload_bytes(plan, bundle) == 3 * 1 + 5 * 12 + 6 * 12  # 6 pixels of one bit, slots and states of 12 bytes
+    hosted = build_plan(instrument(3), bundle)
+    said = drive_words(instrument(3), bundle, hosted)
+    assert said.startswith("the host names each next pattern, within 500 us, of 6 states (the device follows 3)")
+    assert upload_bytes(hosted, bundle) == 3 * 1 + 5 * 12
