@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.ranges import demand
 
 from .automaton import Automaton
-from .facts import GOLDEN_MAX, PATTERN_CELLS_MAX, PATTERNS_MAX, Bundle, frozen
+from .facts import GOLDEN_MAX, GOLDEN_MEANS_MAX, PATTERN_CELLS_MAX, PATTERNS_MAX, Bundle, frozen
 from .walks import log_scores
 
 PATTERN_PARTS = {
@@ -115,6 +115,7 @@ def golden_of(parts: Mapping[str, NDArray[Any]], automaton: Automaton) -> Golden
     n_bits, rows = automaton.n_bits, len(stored)
     width = -(-n_bits // 8)
     demand(1 <= rows <= GOLDEN_MAX, f"{rows} golden walks, allowed: 1 to {GOLDEN_MAX}")
+    demand(rows * n_bits <= GOLDEN_MEANS_MAX, f"{rows} golden words of {n_bits}, allowed: {GOLDEN_MEANS_MAX} in all")
     demand(stored.shape[1] == width, f"golden_words has rows of {stored.shape[1]} bytes, {n_bits} clicks need {width}")
     wanted = (rows, automaton.n_slots + 1)
     demand(walks.shape == wanted, f"golden_walks has shape {walks.shape}, allowed: {wanted}")

@@ -25,6 +25,7 @@ from pans.runtime.ranges import demand
 
 from .automaton import Automaton
 from .facts import (
+    GOLDEN_MEANS_MAX,
     GOLDEN_SCORES_MAX,
     GOLDEN_WORK_MAX,
     LEVELS_MAX,
@@ -215,6 +216,8 @@ def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
     parts = (beside.head_onnx, beside.table, beside.int8_head, beside.int8_onnx)
     demand(all(part is None for part in parts), "an automaton beside a head or a table, allowed: either")
     words = np.concatenate([_golden_words(automaton.n_bits), words_to(automaton, golden_nodes(automaton))])
+    numbers = max(automaton.n_bits / GOLDEN_MEANS_MAX, automaton.n_classes / GOLDEN_SCORES_MAX)
+    words = words[:: math.ceil(len(words) * numbers)]  # fewer of very long ones
     walks = walk_nodes(automaton, words)
     return _Golden(words, log_scores(automaton.posteriors[walks[:, -1]]), None, walks)
 

@@ -112,6 +112,9 @@ def _slots(successors: list[list[int]], nodes: int) -> int:
 def _check_golden(automaton: Automaton, parts: dict[str, NDArray[Any]]) -> None:
     words, walks, posteriors = parts["golden_words"], parts["golden_walks"], parts["golden_posteriors"]
     demand(1 <= len(words) <= 4096 and len(words) == len(walks) == len(posteriors), "golden walks")
+    demand(
+        len(words) * automaton.slots * automaton.channels <= 1 << 20 and posteriors.size <= 1 << 22, "golden numbers"
+    )
     demand(walks.shape[1] == automaton.slots + 1, "length of a golden walk")
     for row, wanted, posterior in zip(words, walks.tolist(), posteriors):
         nodes = automaton.walk(bits_of(row, automaton.slots * automaton.channels))

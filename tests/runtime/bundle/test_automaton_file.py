@@ -181,6 +181,15 @@ def test_bits_that_would_fill_the_memory_are_refused_before() -> None:
         parse_bundle(put_together(header, arrays), "here")
 
 
+def test_long_words_are_fewer_golden_ones() -> None:
+    n = 1024
+    chain = np.tile(np.arange(1, n + 1)[:, None], (1, 16))
+    longest = Automaton(np.zeros(n, int), np.ones(n, int), 1, chain, np.full((n + 1, 2), 0.5))
+    made = automaton_bundle(longest, levels=2)
+    assert (made.n_features, len(made.golden_means)) == (4096, 214)
+    same(made, parse_bundle(bundle_bytes(made), "here"))
+
+
 def test_every_byte_counts() -> None:
     whole = bundle_bytes(automaton_bundle())
     for at in np.random.default_rng(5).integers(0, len(whole), 80).tolist():
