@@ -69,14 +69,14 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "head_bytes": 0 if bundle.head_onnx is None else len(bundle.head_onnx),
         "table_rows": 0 if bundle.table is None else len(bundle.table),
         "golden_vectors": len(bundle.golden_means),
-        "automaton": None if bundle.automaton is None else automaton_facts(bundle.automaton),
+        "automaton": None if bundle.automaton is None else _automaton_facts(bundle, bundle.automaton),
         "expected": None if bundle.expected is None else dict(bundle.expected),
         "provenance": dict(bundle.provenance),
     }
 
 
-def automaton_facts(automaton: Automaton) -> dict[str, Any]:
-    """Return what an automaton is: its size, the exposures of its walks, how patterns are shared, how sure its leaves are."""
+def _automaton_facts(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
+    """What an automaton is: its size, the exposures of its walks, how patterns are shared, how sure its leaves are."""
     used = np.bincount(automaton.pattern)
     most = np.argsort(-used, kind="stable")[:MOST_USED]
     leaves = automaton.posteriors[automaton.n_states :]
@@ -88,6 +88,7 @@ def automaton_facts(automaton: Automaton) -> dict[str, Any]:
         "exposures_shortest": shortest_walk(automaton),
         "states_per_slot_most": int(np.bincount(automaton.depth).max()),
         "dwell_steps": automaton.dwell_steps,
+        "dark_states": int(np.count_nonzero(bundle.state_light() == 0)),
         "patterns_shown": int(np.count_nonzero(used)),
         "states_of_most_used_patterns": {str(i): int(used[i]) for i in most if used[i]},
         "leaf_probability_median": float(np.median(leaves.max(axis=1))),

@@ -181,7 +181,7 @@ def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
     elif (top := int(bundle.pattern_levels.max())) < bundle.levels - 1:
         yield f"the brightest pixel is at level {top} of {bundle.levels - 1}: every exposure is longer than it must be"
     dark = np.flatnonzero(~bundle.pattern_levels.any(axis=1))
-    if len(dark) and bundle.analyser is None:
+    if len(dark) and bundle.analyser is None and bundle.automaton is None:  # a state may wait in the dark for its slot
         yield f"{len(dark)} of {bundle.n_patterns} patterns are dark (the first: {int(dark[0])}): exposures spent on nothing"
     if bundle.table is not None:
         yield from _never_decided(bundle, bundle.table)

@@ -217,6 +217,7 @@ def test_info_of_an_automaton(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert (found["encoder"], found["patterns"], found["back_ends"]) == ("automaton", 3, ["automaton"])
     assert found["expected"] == EXPECTED
     automaton = found["automaton"]
+    assert automaton["dark_states"] == 0
     assert (automaton["states"], automaton["leaves"], automaton["outcomes"], automaton["dwell_steps"]) == (5, 3, 2, 2)
     assert (automaton["exposures_longest"], automaton["exposures_shortest"]) == (3, 3)
     assert automaton["states_of_most_used_patterns"] == {"0": 2, "1": 2, "2": 1}
@@ -238,7 +239,7 @@ def test_verify_tells_of_an_odd_automaton(tmp_path: Path, capsys: pytest.Capture
     assert (code, found["violations"]) == (1, [])
     messages = " ".join(item["message"] for item in found["alerts"])
     for sign in (
-        *("1 of 2 patterns are dark", "1 of 2 patterns are shown by no state (the first: 1)"),
+        "1 of 2 patterns are shown by no state (the first: 1)",
         *("the longest dwell is 1 of 2", "2 classes are never decided by any click word: c1, c2"),
     ):
         assert sign in messages
