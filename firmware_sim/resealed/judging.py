@@ -28,7 +28,7 @@ from pans.runtime.report.verify import verify_file
 
 from .contents import mutated_toml
 from .sealing import changed_bundle, changed_calibration, changed_recording
-from .uses import record_run, small_calibration, use_file
+from .uses import record_automaton, record_run, small_calibration, use_file
 
 ANSWER_S = 2.0  # of processor time for one answer; the files have up to 140 kB
 MEMORY_MIB = 400
@@ -144,7 +144,7 @@ def _base_files() -> dict[str, _Kind]:
 
     return {
         "bundle": _Kind(_bundles(), changed_bundle, ".pans", 40),
-        "recording": _Kind([_made(lambda folder: record_run(folder).read_bytes())], changed_recording, ".pansrec", 25),
+        "recording": _Kind(_recordings(), changed_recording, ".pansrec", 25),
         "calibration": _Kind([_made(small_calibration)], changed_calibration, ".json", 15),
         "profile": _Kind(profiles, text, ".toml", 10),
         "scene": _Kind(scenes, text, ".toml", 6),
@@ -178,6 +178,11 @@ def _bundles() -> list[bytes]:
     return [
         bundle_bytes(bundle) for bundle in (shipped, small_setup()[1], small_setup()[1], passive, picture, *automata)
     ]
+
+
+def _recordings() -> list[bytes]:
+    """Still objects, an automaton."""
+    return [_made(lambda folder, make=make: make(folder).read_bytes()) for make in (record_run, record_automaton)]  # type: ignore[misc]
 
 
 def _made(make: Callable[[Path], bytes]) -> bytes:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pans.firmware_sim.scene.scene_file import open_scene
-from pans.firmware_sim.testing import small_setup
+from pans.firmware_sim.testing import small_automaton_bundle, small_setup
 from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.backends import make_decider
@@ -30,6 +30,7 @@ from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.file_facts import file_facts
 
 RUN_EVERY = 20  # accepted bundles: one in that many, told by its bytes, is run through the whole loop
+RUN_PROFILES = ("ideal", "oled-qcmos", "dmd-spad")  # the last follows automata of 1-bit patterns
 DECISIONS = 3
 
 
@@ -56,6 +57,12 @@ def record_run(folder: Path, bundle: Path | None = None, profile: str = "ideal")
     )
     run_job(job)
     return folder / "run.pansrec"
+
+
+def record_automaton(folder: Path) -> Path:
+    """Return the recording of a small run of an automaton that the device follows, written in `folder`."""
+    write_bundle(small_automaton_bundle(), folder / "automaton.pans")
+    return record_run(folder, folder / "automaton.pans", "dmd-spad")
 
 
 def small_calibration(folder: Path) -> bytes:
@@ -97,9 +104,7 @@ def _use_bundle(path: Path) -> None:
             make_decider(bundle, confidence=confidence)
     if not (math.isfinite(bundle.illumination()) and np.isfinite(bundle.patterns()).all()):
         raise ValueError("a light that is not finite")
-    planned = [
-        profile for profile in (load_profile("ideal"), load_profile("oled-qcmos")) if _plannable(profile, bundle)
-    ]
+    planned = [profile for profile in map(load_profile, RUN_PROFILES) if _plannable(profile, bundle)]
     if planned and zlib.crc32(path.read_bytes()) % RUN_EVERY == 0:
         with tempfile.TemporaryDirectory() as folder:
             record_run(Path(folder), path, planned[0].name)

@@ -26,6 +26,7 @@ from .walks import Walks, calibration_bins, confusion_of, measured_walks
 
 MAPPED_OBJECTS = 600
 SHOWN_PICTURES = 8
+LEAST_SHARE = 1e-4  # of the decisions, for a point of the reliability diagram: exact expectations have bins of 1e-10
 
 
 def write_pictures(
@@ -52,7 +53,8 @@ def write_walk_pictures(folder: Path, bundle: Bundle, walks: Walks, *, force: bo
     """Write patterns, confusion and reliability of an automaton, in exact expectation, into `folder` and return their paths."""
     make_folder(folder)
     pictures = bundle.patterns().reshape(-1, *bundle.image_shape)
-    bins = [(one.probability, one.accuracy, one.share) for one in calibration_bins(walks)]
+    counted = [one for one in calibration_bins(walks) if one.share >= LEAST_SHARE]
+    bins = [(one.probability, one.accuracy, one.share) for one in counted]
     table, measured = confusion_of(walks), measured_walks(walks)
     right, error = 100 * (measured.accuracy_mean or 0.0), 100 * (measured.expected_calibration_error or 0.0)
     drawn = {

@@ -198,7 +198,7 @@ def measured_walks(walks: Walks) -> MeasuredWalks:
         illumination=float(walks.illumination.mean()),
         exposures_mean=float(walks.exposures.mean()),
         expected_calibration_error=calibration_error(calibration_bins(walks)) if decided else None,
-        abstained=1.0 - decided / n,
+        abstained=0.0 if (walks.leaf_labels != NO_LABEL).all() else 1.0 - decided / n,
         objects=n,
         trials=walks.trials,
     )
