@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
+from pans.runtime.instrument.click_law import ClickLaw, both_chances
 
 LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB
 _NUMBERS_AT_ONCE = 1 << 22
@@ -110,8 +110,7 @@ def _walk_block(
         pattern = automaton.pattern[states]
         share = automaton.dwell[states] / automaton.dwell_steps
         photoelectrons = light[:, pattern] * share
-        click = click_probability(law, photoelectrons)
-        miss = np.exp(log_no_click(law, photoelectrons))  # keeps its digits where a click is all but certain
+        click, miss = both_chances(law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
         reached = alpha[:, states]
         sums[0] += (reached * click).sum(axis=1)
         sums[1] += (reached * photoelectrons).sum(axis=1)

@@ -60,6 +60,16 @@ def click_probability(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
     return np.where(log_miss < -math.log(2), -np.expm1(log_miss), _small_p(law, mu, log_miss))
 
 
+def both_chances(law: ClickLaw, photoelectrons: ArrayLike) -> tuple[F64, F64]:
+    """Return (p, 1 - p) for `photoelectrons` (any shape), each accurate to a few ulp of its own, however small."""
+    mu = _mean(law, photoelectrons)
+    if _is_plain(law):
+        return np.asarray(-np.expm1(-mu)), np.asarray(np.exp(-mu))
+    log_miss = _log_survival(law, mu)
+    small, certain = _small_p(law, mu, log_miss), log_miss < -math.log(2)
+    return np.where(certain, -np.expm1(log_miss), small), np.where(certain, np.exp(log_miss), 1.0 - small)
+
+
 def log_no_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
     """log(1 - p) for `photoelectrons` (any shape); finite for every finite input."""
     mu = _mean(law, photoelectrons)

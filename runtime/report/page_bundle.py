@@ -60,14 +60,14 @@ def add_optics(page: Page, bundle: Bundle) -> None:
 
 
 def _add_automaton(page: Page, bundle: Bundle, automaton: Automaton) -> None:
-    """Add the patterns that most states show, how many states each slot has, and how sure states and leaves are."""
-    used = np.bincount(automaton.pattern, minlength=bundle.n_patterns)
-    most = np.argsort(-used, kind="stable")[: draw.PATTERNS_MAX]
-    shown = bundle.pattern_levels[most].astype(np.float64) * bundle.photons_per_level
+    """Add the patterns of the first states, how many states each slot has, and how sure states and leaves are."""
+    states = automaton.pattern[: draw.PATTERNS_MAX]
+    shown = bundle.pattern_levels[states].astype(np.float64)
+    shown /= np.maximum(shown.max(axis=1, keepdims=True), 1.0)
     page.figure(
-        draw.patterns(shown.reshape(-1, *bundle.image_shape), "photoelectrons per exposure\nand unit transmission"),
-        f"{len(most)} of {bundle.n_patterns} patterns, those of most states first (of {int(used[most[0]])} states the first), in "
-        f"{bundle.levels} whole levels, as they are with the light on all the time.",
+        draw.patterns(shown.reshape(-1, *bundle.image_shape), "share of the pattern's\nbrightest pixel"),
+        f"What the first {len(states)} of {automaton.n_states} states show, each pattern by its own brightest pixel; every walk begins in "
+        f"state 0. {bundle.n_patterns} patterns in {bundle.levels} whole levels.",
     )
     sure = automaton.posteriors.max(axis=1)
     states = sure[: automaton.n_states]

@@ -112,7 +112,7 @@ def test_an_automaton_s_page(tmp_path: Path) -> None:
     for text in (
         "exposures_longest",
         "states_of_most_used_patterns",
-        "those of most states first",
+        "every walk begins in state 0",
         "leaf_probability_median",
     ):
         assert text in words

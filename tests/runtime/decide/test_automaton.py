@@ -118,6 +118,7 @@ def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndar
 LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2, 1.5)]
 
 
+@pytest.mark.uncompiled
 @pytest.mark.parametrize("law", LAWS, ids=str)
 @pytest.mark.parametrize("automaton", [early_leaf(), diamond(), random_automaton(5, slots=8)])
 def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLaw) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from pans.runtime.instrument.click_law import (
     ClickLaw,
+    both_chances,
     click_law,
     click_probability,
     log_click,
@@ -76,6 +77,14 @@ def test_log_no_click_agrees_with_mpmath(law):
         click, miss = exact(law, mean)
         truth = mpmath.log1p(-click) if click < 0.5 else mpmath.log(miss)
         assert relative_error(found, truth) < RELATIVE, mean
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+def test_both_chances_agree_with_mpmath(law):
+    for mean, click, miss in zip(MEANS, *both_chances(law, MEANS), strict=True):
+        truth, missed = exact(law, mean)
+        assert relative_error(click, truth) < RELATIVE, mean
+        assert relative_error(miss, missed) < RELATIVE or (missed < mpmath.mpf("1e-300") and miss < 1e-300), mean
 
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
