@@ -10,7 +10,7 @@ from pathlib import Path
 
 import large_files
 import pytest
-from large_files import BUNDLES
+from large_files import AUTOMATA, BUNDLES
 from peak_memory import peak_of
 
 from pans.runtime.bundle.model import write_bundle
@@ -31,6 +31,21 @@ def demand_small(folder: Path, codes: tuple[int, ...], *words: str) -> None:
 def test_a_bundle_as_large_as_it_may_be(tmp_path: Path) -> None:
     write_bundle(large_files.large_table(), tmp_path / "b.pans")
     demand_small(tmp_path, (0, 1), "verify", "b.pans")
+
+
+def test_an_automaton_whose_patterns_unpack_to_the_most(tmp_path: Path) -> None:
+    write_bundle(large_files.large_automaton(), tmp_path / "b.pans")
+    demand_small(tmp_path, (0, 1), "verify", "b.pans")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", AUTOMATA)
+def test_every_kind_of_large_automaton_and_its_recording(name: str, tmp_path: Path) -> None:
+    write_bundle(AUTOMATA[name](), tmp_path / "b.pans")
+    demand_small(tmp_path, (0, 1), "info", "b.pans")
+    demand_small(tmp_path, (0, 1), "run", "b.pans", "--device", "sim:dmd-spad?scene=uniform&pace=fast", *RUN)
+    for command in ("verify", "replay", "info"):
+        demand_small(tmp_path, (0, 1), command, "run.pansrec")
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ class PatternMemory:
         _require(last < self.capacity, lambda: f"pattern {last}: memory holds {self.capacity}")
         if chunk.first_pixel == 0:  # before any of them is stored: a refused command stores nothing
             known = (self._patterns.get(index) for index in range(chunk.first_pattern, last + 1))
-            wanted = held + 2 * count * chunk.n_pixels - sum(one.levels.nbytes for one in known if one is not None)
+            wanted = held + 2 * count * chunk.n_pixels - sum(2 * len(one.levels) for one in known if one is not None)
             _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
         for row, packed in enumerate(chunk.rows):
             levels = np.unpackbits(packed, count=chunk.pixels, bitorder="little").astype(np.uint16)
@@ -88,10 +88,13 @@ class PatternMemory:
 
     def _new(self, chunk: PatternChunk) -> _Pattern:
         before = self._patterns.get(chunk.pattern)
-        wanted = self.held_bytes + 2 * chunk.n_pixels - (0 if before is None else before.levels.nbytes)
+        wanted = self.held_bytes + 2 * chunk.n_pixels - (0 if before is None else 2 * len(before.levels))
         _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
         self.held_bytes = wanted
-        pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, np.uint16))
+        dtype = (
+            np.uint8 if self.levels <= 256 else np.uint16
+        )  # until they are stacked: tens of thousands are tens of MiB
+        pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, dtype))
         return pattern
 
     def stack(self, n_patterns: int) -> NDArray[np.uint16]:

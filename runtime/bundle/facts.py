@@ -26,9 +26,8 @@ from .walks import check_expected, greatest_light, log_scores, walk_difference
 
 ENCODERS = ("active", "coherent", "incoherent", "automaton")  # coherent and incoherent are passive: nothing is shown
 PATTERNS_MAX = 65_535  # of an automaton
-PATTERN_CELLS_MAX = (
-    1 << 26
-)  # patterns times pixels of an automaton: its file may hold them as single bits, memory does not
+# Patterns times pixels of an automaton: single bits in the file, two bytes each in the host, and again in the simulated instrument.
+PATTERN_CELLS_MAX = 30_000_000
 FEATURES_MAX = 4096
 PIXELS_MAX = 1 << 22
 LEVELS_MAX = 65536

@@ -11,6 +11,7 @@ import numpy as np
 from bundles import made_bundle
 from models import model
 
+from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import Bundle, write_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.container import FILE_MAX_BYTES, JSON_VALUES_MAX, MIB
@@ -67,6 +68,31 @@ def large_matrix() -> Bundle:
     return passive_bundle(optics, pixels)
 
 
+def large_automaton() -> Bundle:
+    """As many pixels of 1-bit patterns as there may be: the file has one byte for sixteen of memory."""
+    return _layered(slots=2, width=37, shape=(768, 1024), levels=2)
+
+
+def many_states() -> Bundle:
+    """As many patterns of 28 x 28 pixels as there may be, each shown by one state."""
+    return _layered(slots=598, width=64, shape=(28, 28), levels=2)
+
+
+def _layered(slots: int, width: int, shape: tuple[int, int], levels: int) -> Bundle:
+    """An automaton of up to `width` states in each slot, in a bundle of random patterns, one for each of them."""
+    n = 1 + (slots - 1) * width
+    state = np.arange(n)
+    slot, place = (state + width - 1) // width, (state + width - 1) % width * (state > 0)
+    ahead = np.stack([2 * place, 2 * place + 1], axis=1) % width
+    successors = 1 + (slot * width)[:, None] + ahead
+    posteriors = np.random.default_rng(7).dirichlet(np.ones(10), n + width)
+    automaton = reachable_automaton(state, np.ones(n, int), 1, successors, posteriors)
+    patterns = np.random.default_rng(6).integers(0, levels, (n, shape[0] * shape[1])).astype(np.uint16)
+    light = {"levels": levels, "photons_per_level": 0.1 / (levels - 1)}
+    return made_bundle(n_classes=10, automaton=automaton, image_shape=shape, pattern_levels=patterns, **light)
+
+
+AUTOMATA: dict[str, Callable[[], Bundle]] = {one.__name__: one for one in (large_automaton, many_states)}
 BUNDLES: dict[str, Callable[[], Bundle]] = {
     one.__name__: one for one in (many_patterns, large_patterns, large_table, large_head, wide_results, large_matrix)
 }

@@ -11,7 +11,7 @@ from pans.runtime.bundle import Automaton, Bundle, reachable_automaton
 
 
 def early_leaf() -> Automaton:
-    """Three states, two slots: a click in slot 0 decides at once; else states 1 and 2 cannot both come, so only 1 does."""
+    """Two states, two slots: a click in slot 0 decides at once."""
     return Automaton(
         pattern=[0, 1],
         dwell=[4, 1],
