@@ -1,6 +1,6 @@
-"""`pans reproduce NAME`: the paper's tables and figures, ours beside the paper's, as Markdown, JSON and PNG.
+"""`pans reproduce NAME`: the paper's tables and figures, ours beside the paper's, and the frontier, as Markdown, JSON and PNG.
 
-Owns the arguments and what is refused; the pages are those of the package `paper`. Every figure is SIMULATED.
+Owns the arguments and what is refused; the pages are those of the packages `paper` and `frontier`. Every figure is SIMULATED.
 Finished rows lie in a cache folder: a killed run goes on, and several processes may share the rows of a table (`--rows`).
 """
 
@@ -12,11 +12,14 @@ from pathlib import Path
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder
-from pans.trainer.paper import PAGES, Asked, Made, Page, page_of, rewrite_page, write_page
+from pans.trainer import frontier, paper
+from pans.trainer.paper import Asked, Made, Page, rewrite_page, write_page
 from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
+PAGES = (*paper.PAGES, *frontier.NAMES)
+SEEDS_MAX = 100
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -31,6 +34,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="another draw of a drawn task (default 0); the page of draw 0 names the finished cells of others beside its own",
     )
+    words = "of frontier: how many seeds each row is measured with (default 5); finished ones are kept"
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help=words)
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     words = "write NAME.json, the pictures and the tables of NAME.md there; what NAME.md says around the tables stays"
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", help=words)
@@ -74,6 +79,11 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
+def page_of(name: str) -> Page:
+    """Return the page of that name, of the paper or of the frontier."""
+    return frontier.PAGES[name] if name in frontier.NAMES else paper.page_of(name)
+
+
 def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
     if args.out is None:
         raise UsageError("--from-json reads and writes a folder", remedy="name it by -o DIR")
@@ -91,13 +101,15 @@ def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
 def _measured(name: str, args: argparse.Namespace) -> tuple[Page, Made]:
     _check(name, args)
     rows, dark = (None if wanted is None else tuple(wanted) for wanted in (args.rows, args.dark))
-    asked = Asked(name, args.cache, rows, args.data_dir, args.collect, say, dark, args.data_seed)
+    asked = Asked(name, args.cache, rows, args.data_dir, args.collect, say, dark, args.data_seed, args.seeds, args.out)
     page = page_of(name)
     return page, page.measure(asked)
 
 
 def _check(name: str, args: argparse.Namespace) -> None:
-    """Refuse rows, dark counts and draws that a table does not have."""
+    """Refuse rows, dark counts, draws and seeds that a table does not have."""
+    if not 1 <= args.seeds <= SEEDS_MAX:
+        raise UsageError(f"--seeds is {args.seeds}, allowed: 1 to {SEEDS_MAX}")
     if name in ACTIVE:
         known = [row.features for row in ACTIVE[name]]
         if args.rows is not None and not {*known} & {*args.rows}:

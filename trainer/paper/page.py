@@ -37,7 +37,8 @@ Draw = Callable[[Path], None]
 class Asked:
     """One page: finished parts lie in `cache`; `rows` are the only numbers of patterns wanted; with `collect` nothing is made.
 
-    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are of the tables over dark counts alone.
+    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are of the tables over dark counts alone; `seeds` (how many) and
+    `results` (folder of other pages, whose rows are taken from there) are of the frontier.
     """
 
     name: str
@@ -48,6 +49,8 @@ class Asked:
     report: Callable[[str], None] = say
     dark: tuple[float, ...] | None = None
     data_seed: int = 0
+    seeds: int = 5
+    results: Path | None = None
 
     def wants(self, features: int) -> bool:
         """Return whether the row of that many patterns was asked for."""

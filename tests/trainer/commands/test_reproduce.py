@@ -9,7 +9,7 @@ from tree import ROOT
 pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.cli import main
-from pans.trainer.paper import PAGES
+from pans.trainer.commands.reproduce import PAGES
 
 
 def test_the_command_lists_collects_and_refuses(tmp_path, capsys):

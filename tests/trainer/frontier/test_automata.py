@@ -1,0 +1,104 @@
+"""Rows of automata and of fixed patterns held to photons: trained once, found again as bundles, and never another recipe's."""
+
+# ruff: noqa: E402  (what follows needs torch)
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.errors import UsageError
+from pans.trainer.adaptive import train as adaptive_train
+from pans.trainer.adaptive.options import AutomatonOptions
+from pans.trainer.frontier import automata, fixed, ways
+from pans.trainer.paper import Asked
+from pans.trainer.paper.tables import FIRST
+from pans.trainer.tasks.registry import Objects, Task
+
+BUDGET = {"photons": 2.0}
+
+
+@pytest.fixture(scope="module")
+def halves() -> Task:
+    rng = np.random.default_rng(8)
+    labels = rng.integers(0, 2, 1500)
+    bright = 190 * (np.arange(4)[None, None] // 2 == labels[:, None, None])
+    images = (rng.integers(0, 60, (1500, 4, 4)) + bright).astype(np.uint8)
+    parts = [Objects(images[at], labels[at]) for at in (slice(1200), slice(1200, 1500))]
+    return Task("halves", ("left", "right"), *parts, "0" * 64, "made here")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """The recipe with few exposures and states, so that a training takes a second."""
+
+    def of(**given):
+        return AutomatonOptions(exposures=4, states=3, grow_epochs=1, tune_epochs=1, epochs=1, reroutes=0, **given)
+
+    monkeypatch.setattr("pans.trainer.adaptive.options.AutomatonOptions", of)
+    return of
+
+
+def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_path, quick, monkeypatch):
+    asked = Asked("frontier", tmp_path, report=lambda _: None)
+    row = automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=0)
+    path = automata.bundle_path(tmp_path, "frontier-halves-automaton-2", 0)
+    bundle, digest = load_bundle(path)
+    assert row["sha256"] == digest
+    assert row["exposures"] == row["all"]["exposures_mean"] <= 4
+    assert row["all"]["accuracy_mean"] == pytest.approx(bundle.expected["accuracy"], abs=1e-6)
+    assert row["all"]["accuracy_mean"] > 0.6
+    assert row[FIRST]["objects"] == 200
+    assert bundle.provenance["command"] == "pans reproduce frontier"
+    assert [path.suffix for path in tmp_path.iterdir()] == [".pans"]  # no checkpoint is left
+
+    def never(*_args, **_named):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(adaptive_train, "train_automaton", never)
+    again = automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=0)
+    assert {**again, "training_seconds": 0} == {**row, "training_seconds": 0}
+    assert again["training_seconds"] > 0
+    point = ways.Point("halves", ways.AUTOMATON, 2.0, tuple(BUDGET.items()))
+    assert point.stem == "frontier-halves-automaton-2"
+    kept = ways.row_of(asked, point, 0, halves)
+    assert kept == ways.row_of(asked, point, 0, None)
+    assert kept is not None
+    assert (kept["all"]["accuracy_mean"], kept["exposures"]) == (row["all"]["accuracy_mean"], row["exposures"])
+    with pytest.raises(AssertionError, match="trained again"):  # another seed, another recipe
+        automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=1)
+    with pytest.raises(AssertionError, match="trained again"):
+        automata.automaton_row(asked, "frontier-halves-automaton-2", halves, {"photons": 3.0}, seed=0)
+
+
+def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(halves, tmp_path, quick):
+    asked = Asked("frontier", tmp_path, report=lambda _: None)
+    path = automata.bundle_path(tmp_path, "mine", 0)
+    path.write_bytes(b"something of somebody")
+    with pytest.raises(Exception, match=r"mine-seed0\.pans"):
+        automata.automaton_row(asked, "mine", halves, BUDGET, seed=0)
+    assert path.read_bytes() == b"something of somebody"
+
+
+def test_fixed_patterns_are_held_to_photons(halves, tmp_path, monkeypatch):
+    whole = fixed.budget_recipe
+
+    def short(photons, features, seed):
+        from dataclasses import replace
+
+        return replace(whole(photons, features, seed), epochs=60, hidden=16, batch=128)
+
+    monkeypatch.setattr(fixed, "budget_recipe", short)
+    asked = Asked("frontier", tmp_path, report=lambda _: None)
+    row = fixed.budget_row(asked, tmp_path / "fixed.pans", halves, 3.0, 13, seed=2)
+    assert row["exposures"] == 13
+    assert row["all"]["photons_mean"] < 4.0
+    assert load_bundle(tmp_path / "fixed.pans")[0].provenance["options"]["seed"] == 2
+    json.dumps(row)
+    (tmp_path / "other.pans").write_bytes(b"mine")
+    with pytest.raises(UsageError, match=r"other\.pans"):
+        fixed.budget_row(asked, tmp_path / "other.pans", halves, 3.0, 13, seed=2)

@@ -1,0 +1,90 @@
+"""Automata for the frontier: trained once, kept as bundles in the cache, measured exactly.
+
+Owns the bundle's place and what is asked of one found there: the recipe must be the present one. Training and export are those of
+`pans train --encoder automaton`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.paper.page import Asked, Row, check_cached_bundle
+from pans.trainer.paper.tables import FIRST, FIRST_OBJECTS
+from pans.trainer.tasks.registry import Task
+
+if TYPE_CHECKING:
+    from pans.trainer.adaptive.options import AutomatonOptions
+
+PROFILE = "ideal"
+
+
+def bundle_path(cache: Path, stem: str, seed: int) -> Path:
+    """Return where the automaton of a point (`Point.stem`) and seed is kept."""
+    return cache / f"{stem}-seed{seed}.pans"
+
+
+def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any], seed: int) -> Row:
+    """Return the figures of an automaton of that budget (see `recipe`), trained now unless its bundle is in the cache."""
+    from pans.trainer.export.automaton import measure_walks
+
+    options = recipe(budget, seed)
+    path = bundle_path(asked.cache, stem, seed)
+    seconds = None
+    if _trained(path, options) is None:
+        seconds = _train(asked, path, task, options)
+    bundle, digest = load_bundle(path)
+    assert bundle.automaton is not None
+    walked = measure_walks(bundle, task.test, load_profile(PROFILE))
+    whole, first = asdict(walked.figures()), asdict(walked.figures(FIRST_OBJECTS))
+    facts: Row = {"sha256": digest, "states": bundle.automaton.n_states, "patterns_shown": len(bundle.pattern_levels)}
+    seconds = bundle.provenance.get("training_seconds") if seconds is None else seconds
+    return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}
+
+
+def recipe(budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
+    """Return the options for a budget (`photons` or `clicks`) and perhaps a size; by default that of the budget, spelt out."""
+    from pans.trainer.adaptive.options import AutomatonOptions, with_defaults
+
+    options = AutomatonOptions(seed=seed, **budget)
+    exposures, states = with_defaults(options)
+    return replace(options, exposures=exposures, states=states)
+
+
+def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
+    """The bundle at `path` if it is an automaton trained by `options` on the profile, else None."""
+    if not path.is_file():
+        return None
+    bundle, _ = load_bundle(path)
+    found = bundle.provenance.get("options")
+    wanted = asdict(options).items()  # `pans train` adds threads and device
+    same = isinstance(found, dict) and wanted <= found.items() and bundle.provenance.get("profile") == PROFILE
+    return bundle if same and bundle.automaton is not None else None
+
+
+def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions) -> float:
+    from pans.trainer.adaptive.train import train_automaton
+    from pans.trainer.device import keep_freed_memory
+    from pans.trainer.export.automaton import export_automaton
+
+    check_cached_bundle(path)
+    keep_freed_memory()
+    started, profile, checkpoint = time.process_time(), load_profile(PROFILE), path.with_suffix(".checkpoint")
+
+    def said(progress: Any) -> None:
+        if progress.done % 8 == 0:
+            asked.report(f"{path.stem}: {progress.stage}, {progress.done} of {progress.steps}")
+
+    goes_on = checkpoint.is_file()
+    trained = train_automaton(task, profile, options, checkpoint=checkpoint, resume=goes_on, report=said)
+    seconds = time.process_time() - started
+    provenance: dict[str, Any] = {"command": "pans reproduce frontier", "options": asdict(options)}
+    provenance |= {"training_seconds": round(seconds, 1)} if not goes_on else {}
+    export_automaton(path, trained, task, profile, name=path.stem, provenance=provenance, force=True)
+    checkpoint.unlink(missing_ok=True)
+    return seconds

@@ -1,0 +1,114 @@
+"""What the rows of the frontier say: means over seeds, how far a way is ahead of direct imaging, and the paper's click budgets.
+
+Owns the arithmetic; made of rows alone, never measures.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable
+from itertools import pairwise
+
+from pans.trainer.paper.page import Row, Rows, at
+from pans.trainer.paper.tables import ACTIVE, FIRST
+
+from .fixed import PAPER
+from .ways import AUTOMATA, DIRECT, STOPPING, TASKS
+
+SUMMED = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
+
+
+def by_point(rows: Rows) -> Rows:
+    """Return one row per task, way and level: means over its seeds, `se_seeds` of the accuracy (None of one seed), `seeds`."""
+    groups: dict[tuple[str, str, float], Rows] = {}
+    for row in rows:
+        if "all" in row or FIRST in row:
+            groups.setdefault((row["task"], row["way"], row["level"]), []).append(row)
+    return [_mean(found) for found in groups.values()]
+
+
+def _mean(found: Rows) -> Row:
+    first = found[0]
+    whole: Row = {key: first[key] for key in ("task", "way", "level", "bound") if key in first}
+    whole |= {"seeds": len(found), "exposures": statistics.fmean(row["exposures"] for row in found)}
+    for part in ("all", FIRST):
+        rows = [row[part] for row in found if part in row]
+        if rows:
+            means = {key: statistics.fmean(row[key] for row in rows) for key in SUMMED if key in rows[0]}
+            accuracies = [row["accuracy_mean"] for row in rows]
+            spread = statistics.stdev(accuracies) / math.sqrt(len(rows)) if len(rows) > 1 else None
+            whole[part] = means | {"se_seeds": spread, "objects": rows[0].get("objects")}
+    return whole
+
+
+def error_of(row: Row) -> float:
+    """Return the standard error of a point's accuracy on all images: from its seeds, where there are several, and from its objects."""
+    return math.hypot(row["all"]["se_seeds"] or 0.0, row["all"].get("accuracy_se_objects", 0.0))
+
+
+def margins(points: Rows) -> Rows:
+    """Return all points of other ways within the levels of exact direct imaging, with `beside`, `ahead` and `error` at their own photons.
+
+    Direct imaging is interpolated in the logarithm of the photons between neighbouring levels. Both errors count, as if the
+    images were drawn for each: they are the same, so the true error is smaller.
+    """
+    found = []
+    for point in points:
+        if point["way"] in (DIRECT, STOPPING) or "all" not in point:
+            continue
+        beside = direct_at([row for row in points if row["task"] == point["task"]], point["all"]["photons_mean"])
+        if beside is not None:
+            ahead = point["all"]["accuracy_mean"] - beside["accuracy_mean"]
+            error = math.hypot(error_of(point), beside["error"])
+            found.append(point | {"beside": beside, "ahead": ahead, "error": error})
+    return found
+
+
+def direct_at(points: Iterable[Row], photons: float) -> Row | None:
+    """Return accuracy and error of exact direct imaging at that many photons, None beyond its levels."""
+    curve = sorted((row for row in points if row["way"] == DIRECT), key=lambda row: float(row["all"]["photons_mean"]))
+    for low, high in pairwise(curve):
+        x0, x1 = (math.log(row["all"]["photons_mean"]) for row in (low, high))
+        if x0 - 1e-6 <= math.log(photons) <= x1 + 1e-6:
+            share = (math.log(photons) - x0) / (x1 - x0)
+            parts = [(1 - share, low), (share, high)]
+            accuracy = sum(weight * row["all"]["accuracy_mean"] for weight, row in parts)
+            return {"accuracy_mean": accuracy, "error": max(error_of(row) for _, row in parts)}
+    return None
+
+
+def largest(found: Rows) -> Rows:
+    """Return, per task, the automaton that is farthest ahead of exact direct imaging."""
+    best = []
+    for name in TASKS:
+        automata = [row for row in found if row["task"] == name and row["way"] in AUTOMATA]
+        if automata:
+            best.append(max(automata, key=lambda row: float(row["ahead"])))
+    return best
+
+
+def click_budgets(points: Rows) -> Rows:
+    """Return the paper's rows, each with `ours`: of the automata with no more clicks on all images, the one that comes nearest to them.
+
+    It is chosen by clicks, not by accuracy. Rows without one have no `ours`.
+    """
+    found = []
+    for name in TASKS:
+        for printed in ACTIVE[name]:
+            paper = next(
+                row for row in points if (row["task"], row["way"], row["level"]) == (name, PAPER, printed.features)
+            )
+            below = [row for row in points if row["task"] == name and row["way"] in AUTOMATA]
+            below = [row for row in below if row["all"]["clicks_mean"] <= printed.clicks]
+            line = {"task": name, "features": printed.features, "paper": paper}
+            if below:
+                ours = max(below, key=lambda row: float(row["all"]["clicks_mean"]))
+                line |= {"ours": ours, "ahead": ours["all"]["accuracy_mean"] - paper[FIRST]["accuracy_mean"]}
+            found.append(line)
+    return found
+
+
+def missing(rows: Rows) -> Rows:
+    """Return the rows that say what is not measured yet."""
+    return [row for row in rows if at(row, "missing") is not None]

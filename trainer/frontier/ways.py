@@ -1,0 +1,174 @@
+"""The ways to decide that are measured for the frontier, their recipes, and the row of one of them.
+
+Owns levels and recipes; each row is one task, way, level and seed, made once and kept in the cache folder under a name that says which,
+with the recipe it was made by. All recipes were chosen on the last 10 000 training images, none of them by test images. SIMULATED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+from pans.trainer.baselines.common import silent
+from pans.trainer.baselines.options import BaselineOptions
+from pans.trainer.baselines.rows import baseline_rows
+from pans.trainer.paper.page import Asked, Row, kept
+from pans.trainer.paper.tables import ACTIVE, FIRST
+from pans.trainer.tasks.registry import Task
+
+from .automata import automaton_row, bundle_path
+from .fixed import FIXED_BUDGET, budget_row
+
+TASKS = tuple(ACTIVE)
+AUTOMATON, SMALL, HELD_TO_CLICKS = "automaton", "small automaton", "automaton, held to clicks"
+AUTOMATA = (AUTOMATON, SMALL, HELD_TO_CLICKS)
+DIRECT, STOPPING = "direct, exact posterior", "direct, stops when sure"
+MASKS, HADAMARD = "trained masks, counts", "Hadamard pairs, network"
+AUTOMATON_PHOTONS = (4.0, 6.0, 10.0, 17.0, 40.0)
+SMALL_PHOTONS = (2.4, 4.0, 6.0, 10.0, 17.0, 40.0)
+SMALL_SIZE = (("exposures", 24), ("states", 64))  # trained in less than a minute of one core
+DIRECT_PHOTONS = (2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 17.0, 25.0, 40.0, 65.0, 100.0)
+STOPPING_PHOTONS = (4.0, 6.0, 10.0, 17.0, 40.0, 65.0, 100.0)
+BUDGET_PHOTONS = (10.0, 17.0, 40.0)  # of fixed patterns held to photons
+BUDGET_FEATURES = 32
+NETWORK_PHOTONS = (4.0, 10.0, 17.0, 40.0, 100.0)
+MASKS_EPOCHS, HADAMARD_EPOCHS = 20, 10
+# masks by task and photons: of 8, 16, 32 (and 64 from 40 photons on) the best on held-back training images
+MASKS_OF: dict[str, dict[float, int]] = {
+    "fashion-mnist": {4.0: 16, 10.0: 16, 17.0: 16, 40.0: 32, 100.0: 32},
+    "mnist": {4.0: 16, 10.0: 32, 17.0: 32, 40.0: 64, 100.0: 64},
+}
+PAIRS_OF: dict[str, dict[float, int]] = {
+    "fashion-mnist": {4.0: 16, 10.0: 16, 17.0: 16, 40.0: 16, 100.0: 36},
+    "mnist": {4.0: 16, 10.0: 16, 17.0: 16, 40.0: 36, 100.0: 64},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One way at one level of one task: a budget of photons (of clicks, where held to them), and the recipe but for the seed."""
+
+    task: str
+    way: str
+    level: float
+    recipe: tuple[tuple[str, Any], ...]
+
+    @property
+    def stem(self) -> str:
+        """What its files in the cache are called, but for the seed."""
+        words = self.way.replace(",", "").replace(" ", "-").lower()
+        return f"frontier-{self.task}-{words}-{self.level:g}"
+
+
+def points() -> Iterator[Point]:
+    """Yield all points, those that take least time first."""
+    for name in TASKS:
+        for photons in NETWORK_PHOTONS:
+            masks = BaselineOptions("fsi", "deep", features=MASKS_OF[name][photons], epochs=MASKS_EPOCHS, trials=5)
+            yield _baseline(name, MASKS, photons, masks)
+            pairs = BaselineOptions(
+                "hadamard", "counts", features=PAIRS_OF[name][photons], epochs=HADAMARD_EPOCHS, trials=5
+            )
+            yield _baseline(name, HADAMARD, photons, pairs)
+        for photons in DIRECT_PHOTONS:
+            yield _baseline(name, DIRECT, photons, BaselineOptions("direct", "bayes", trials=1))
+    for name in TASKS:
+        for photons in SMALL_PHOTONS:
+            yield Point(name, SMALL, photons, (("photons", photons), *SMALL_SIZE))
+    for name in TASKS:
+        for photons in AUTOMATON_PHOTONS:
+            yield Point(name, AUTOMATON, photons, (("photons", photons),))
+    for name in TASKS:
+        for photons in BUDGET_PHOTONS:
+            yield Point(name, FIXED_BUDGET, photons, (("photons", photons), ("features", BUDGET_FEATURES)))
+    for name in TASKS:
+        for photons in STOPPING_PHOTONS:
+            yield _baseline(name, STOPPING, photons, BaselineOptions("direct", "stopping", trials=1))
+    for name in TASKS:
+        for row in ACTIVE[name]:
+            yield Point(name, HELD_TO_CLICKS, row.clicks, (("clicks", row.clicks),))
+
+
+def _baseline(task: str, way: str, photons: float, options: BaselineOptions) -> Point:
+    return Point(task, way, photons, tuple(asdict(options).items()))
+
+
+def row_of(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | None:
+    """Return the row of a point, from the cache or made now of `task`; None where it is not there and no task is given.
+
+    Rows of stopping are made for all its levels at once: they are read off the same photons. None for a level that it cannot reach.
+    """
+    if point.way == STOPPING:
+        return _stopping_row(asked, point, seed, task)
+    path = asked.cache / f"{point.stem}-seed{seed}.json"
+    make = dict if task is None else partial(_made, asked, point, seed, task)
+    found = kept(path, {"way": point.way, "seed": seed, **dict(point.recipe)}, make, collect=task is None)
+    return None if found is None else _plain(found, point, seed)
+
+
+def _stopping_row(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | None:
+    path = asked.cache / f"frontier-{point.task}-stopping-seed{seed}.json"
+
+    def make() -> Row:
+        assert task is not None
+        asked.report(f"frontier: {point.task}, {point.way}, all levels, seed {seed}")
+        rows = baseline_rows(task, _options(point, seed), STOPPING_PHOTONS, silent)
+        return {"rows": {f"{row['photons_asked']:g}": row for row in rows}}
+
+    made_with = {"levels": STOPPING_PHOTONS, "seed": seed, **dict(point.recipe)}
+    found = kept(path, made_with, make, collect=task is None)
+    row = None if found is None else found["rows"].get(f"{point.level:g}")
+    return None if row is None else _plain(row, point, seed)
+
+
+def _options(point: Point, seed: int) -> BaselineOptions:
+    return BaselineOptions(**(dict(point.recipe) | {"seed": seed}))
+
+
+def _made(asked: Asked, point: Point, seed: int, task: Task) -> Row:
+    asked.report(f"frontier: {point.task}, {point.way}, {point.level:g}, seed {seed}")
+    if point.way in AUTOMATA:
+        return automaton_row(asked, point.stem, task, dict(point.recipe), seed)
+    if point.way == FIXED_BUDGET:
+        path = bundle_path(asked.cache, point.stem, seed)
+        return budget_row(asked, path, task, point.level, BUDGET_FEATURES, seed)
+    return next(iter(baseline_rows(task, _options(point, seed), [point.level], silent)))
+
+
+KEYS = (
+    "accuracy_mean",
+    "accuracy_std",
+    "accuracy_se_objects",
+    "clicks_mean",
+    "photons_mean",
+    "illumination",
+    "objects",
+    "trials",
+)
+
+
+def _plain(found: Row, point: Point, seed: int) -> Row:
+    """Return what the page keeps of a row."""
+    whole = found.get("all", found)
+    facts: Row = {
+        key: found[key] for key in ("sha256", "floor", "confidence", "states", "patterns_shown") if key in found
+    }
+    return {
+        "task": point.task,
+        "way": point.way,
+        "level": point.level,
+        "seed": seed,
+        "exposures": found["exposures"] if "exposures" in found else _exposures(point),
+        "cpu_seconds": found.get("training_seconds", found.get("cpu_seconds", found.get("seconds"))),
+        "all": {key: whole[key] for key in KEYS if key in whole},
+        FIRST: {key: found[FIRST][key] for key in KEYS if key in found[FIRST]},
+        **facts,
+    }
+
+
+def _exposures(point: Point) -> int:
+    """Exposures of a baseline: one frame; one per mask; two per pair."""
+    options = dict(point.recipe)
+    return {"fsi": 1, "hadamard": 2}.get(options["paradigm"], 0) * options["features"] or 1
