@@ -91,12 +91,11 @@ def mixture(measurement: Measurement, floor: float, left_out: I64 | None = None)
 
 @numba.njit(cache=True, nogil=True)
 def _hear(log_joint: F32, log_rates: F32, totals: F32, pixels: NDArray[np.int32], waits: F32) -> None:
-    """Add one photon to each row of `log_joint`, (rows, objects), and take the largest of the row from it."""
+    """Add one photon to each row of `log_joint`, (rows, objects)."""
     for i in range(len(log_joint)):
         row, of_pixel, wait = log_joint[i], log_rates[pixels[i]], waits[i]
         for j in range(len(row)):
             row[j] += of_pixel[j] - wait * totals[j]
-        row -= row.max()
 
 
 def follow(known: Mixture, heard: Arrivals, report: Report = silent) -> Course:
@@ -111,10 +110,13 @@ def follow(known: Mixture, heard: Arrivals, report: Report = silent) -> Course:
     place, taken = np.arange(min(_ROWS, len(alive))), min(_ROWS, len(alive))  # into `alive`
     step = np.zeros(len(place), np.int64)
     log_joint = np.zeros((len(place), len(known.totals)), np.float32)
+    scratch = np.empty_like(log_joint)
     while len(place):
         who = alive[place]
         _hear(log_joint, known.log_rates, known.totals, heard.pixels[who, step], waits[place, step])
-        masses = np.add.reduceat(np.exp(log_joint), known.starts, axis=1).astype(np.float64)
+        log_joint -= log_joint.max(axis=1, keepdims=True)
+        weights = np.exp(log_joint, out=scratch[: len(place)])
+        masses = np.add.reduceat(weights, known.starts, axis=1).astype(np.float64)
         best = masses.argmax(axis=1)
         lost = (masses.sum(axis=1) - masses[np.arange(len(best)), best]) / masses.sum(axis=1)
         labels[who, step], doubt[who, step] = known.labels[best], np.maximum(lost, 0)
