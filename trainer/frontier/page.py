@@ -14,7 +14,7 @@ from pans.trainer.tasks.registry import Task, load_task
 from . import pictures, plots
 from .automata import bundle_path
 from .fixed import PAPER, fixed_rows, paper_rows
-from .summary import by_point, click_budgets, largest, margins, missing
+from .summary import by_point, click_budgets, commands, largest, margins, missing
 from .ways import AUTOMATON, TASKS, Point, points, row_of
 
 SHOWN = ("fashion-mnist", 10.0)  # task and photons of the automaton that the pictures explain
@@ -93,6 +93,7 @@ def frontier_tables(rows: Rows) -> list[Table]:
             Table(columns("point_printed"), printed, f"## {title}, the paper's simulation, one shot"),
             Table(columns("point_margin"), beside, f"## {title}, ahead of exact direct imaging at equal photons"),
         ]
+    tables.append(Table(columns("point_command"), commands(rows), "## Commands"))
     lacking = missing(rows)
     return [*tables, Table(columns("point_missing"), lacking, "## Not measured yet")] if lacking else tables
 

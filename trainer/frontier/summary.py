@@ -112,3 +112,12 @@ def click_budgets(points: Rows) -> Rows:
 def missing(rows: Rows) -> Rows:
     """Return the rows that say what is not measured yet."""
     return [row for row in rows if at(row, "missing") is not None]
+
+
+def commands(rows: Rows) -> Rows:
+    """Return the first row of each task and way that has a command of its own."""
+    first: dict[tuple[str, str], Row] = {}
+    for row in rows:
+        if "command" in row:
+            first.setdefault((row["task"], row["way"]), row)
+    return list(first.values())

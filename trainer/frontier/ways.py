@@ -61,9 +61,23 @@ class Point:
         words = self.way.replace(",", "").replace(" ", "-").lower()
         return f"frontier-{self.task}-{words}-{self.level:g}"
 
+    def command(self, seed: int) -> str:
+        """Return the command that measures the point alone."""
+        given = dict(self.recipe)
+        if self.way == FIXED_BUDGET:
+            return "pans reproduce frontier"  # the whole recipe is `fixed.budget_recipe`
+        if self.way in AUTOMATA:
+            words = " ".join(f"--{key} {value:g}" for key, value in given.items())
+            return f"pans train {self.task} --encoder automaton --profile ideal {words} --seed {seed} -o NAME.pans"
+        options = {key: given[key] for key in ("method", "features", "epochs", "trials") if given[key] is not None}
+        if given["paradigm"] == "direct":
+            del options["features"]
+        words = " ".join(f"--{key} {value}" for key, value in options.items())
+        return f"pans baseline {given['paradigm']} --task {self.task} {words} --photons {self.level:g} --seed {seed}"
+
 
 def points() -> Iterator[Point]:
-    """Yield all points, those that take least time first."""
+    """Yield all points, in the order in which they are measured."""
     for name in TASKS:
         for photons in NETWORK_PHOTONS:
             masks = BaselineOptions("fsi", "deep", features=MASKS_OF[name][photons], epochs=MASKS_EPOCHS, trials=5)
@@ -160,6 +174,7 @@ def _plain(found: Row, point: Point, seed: int) -> Row:
         "way": point.way,
         "level": point.level,
         "seed": seed,
+        "command": point.command(seed),
         "exposures": found["exposures"] if "exposures" in found else _exposures(point),
         "cpu_seconds": found.get("training_seconds", found.get("cpu_seconds", found.get("seconds"))),
         "all": {key: whole[key] for key in KEYS if key in whole},

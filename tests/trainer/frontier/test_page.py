@@ -3,6 +3,7 @@
 # ruff: noqa: E402  (what follows needs torch)
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from dataclasses import replace
@@ -16,12 +17,16 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.trainer.baselines import rows as baseline_rows
+from pans.trainer.commands.baseline import BASELINE
+from pans.trainer.commands.reproduce import REPRODUCE
+from pans.trainer.commands.train import TRAIN
 from pans.trainer.frontier import PAGES, fixed, page, summary, ways
 from pans.trainer.paper import Asked
 from pans.trainer.paper.page import BEGIN, END, Row, generated
 from pans.trainer.paper.tables import ACTIVE, FIRST
 from pans.trainer.tasks.registry import Objects, Task
 
+COMMANDS = {"train": TRAIN, "baseline": BASELINE, "reproduce": REPRODUCE}
 RESULTS = ROOT / "docs" / "results"
 
 
@@ -149,6 +154,19 @@ def test_points_differ_in_the_names_of_their_files_and_cover_every_budget():
         assert clicks == [row.clicks for row in ACTIVE[name]]
         photons = [point.level for point in found if (point.task, point.way) == (name, ways.AUTOMATON)]
         assert photons == [4, 6, 10, 17, 40]
+
+
+def test_every_command_is_one_that_the_parser_takes():
+    for point in ways.points():
+        words = point.command(3).split()[1:]
+        parser = argparse.ArgumentParser()
+        COMMANDS[words[0]].configure(parser)
+        args = parser.parse_args(words[1:])
+        if words[0] == "reproduce":
+            continue
+        assert args.seed == 3
+        wanted = args.photons if words[0] == "train" else args.photons[0]
+        assert (wanted or args.clicks) == point.level
 
 
 def test_a_page_of_nothing_measured_says_so_and_has_the_papers_rows(tmp_path, capsys):
