@@ -1,6 +1,6 @@
 """What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures.
 
-Owns the passes without gradient: recounted leaves and the figures of held-back objects. In float32 products unless told otherwise.
+Owns the pass without gradient over given objects; decisions are those of the machine's class counts.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from .machine import COUNT_FLOOR, Machine, Sight, forward
+from .machine import Machine, Sight, forward
 from .objects import Block
 
 
@@ -23,17 +23,6 @@ class Figures:
     photons: float
     illumination: float
     exposures: float
-
-
-def recount(machine: Machine, sight: Sight, blocks: list[Block]) -> None:
-    """Set the class counts of all leaves to those of the objects in `blocks`."""
-    with torch.no_grad():
-        fresh = [torch.full_like(counts, COUNT_FLOOR) for counts in machine.counts]
-        for block in blocks:
-            for counts, leaves in zip(fresh, forward(machine, sight, block.grey).leaves):
-                counts += leaves @ block.one_hot.T
-        for counts, new in zip(machine.counts, fresh):
-            counts.copy_(new)
 
 
 def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:

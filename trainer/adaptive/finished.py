@@ -12,13 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import Profile
-from pans.trainer.model.exposure import top_limits
 
 from .light import Bits
 from .machine import Machine
 from .posteriors import Posteriors
-
-TOP_QUANTILE = 0.999  # of the states' brightness: the brightest few are dimmed to it, so that one does not set the exposure for all
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,19 +41,16 @@ class Grid:
     by_level: bool
 
 
-def bit_grid(machine: Machine, profile: Profile) -> Grid:
-    """Return the grid for the one-bit patterns of `machine`: the top that they need, within the exposures of the profile."""
-    low, high = top_limits(profile)
-    light = torch.cat([level.light.shown()[1].flatten() for level in machine.levels if isinstance(level.light, Bits)])
-    wanted = float(torch.quantile(light.double().cpu(), TOP_QUANTILE))
+def bit_grid(top: float, profile: Profile) -> Grid:
+    """Return the grid for one-bit patterns of which the brightest pixel gives `top` photoelectrons in a whole exposure."""
     steps = dwell_steps(profile)
     by_level = steps == 1 and profile.projector.levels > 2
-    return Grid(min(high, max(low, wanted)), profile.projector.levels - 1 if by_level else steps, by_level)
+    return Grid(top, profile.projector.levels - 1 if by_level else steps, by_level)
 
 
 def dwell_steps(profile: Profile) -> int:
     """Return in how many steps the projector of `profile` can shorten its light."""
-    return int(getattr(profile.projector, "dwell_steps", 1))
+    return profile.projector.dwell_steps
 
 
 def to_grid(machine: Machine, grid: Grid) -> None:

@@ -60,36 +60,45 @@ class Bits:
     """Patterns of one bit, lit where `lean` is above 0, and the photoelectrons of their lit pixels: exp(`log_light`), (states, 1).
 
     With one brightness for all, `log_light` is one tensor (1, 1) that all levels share. The brightness stays from `bottom` to `top`.
+    With `rows` (states,), `lean` is a pool (patterns, pixels) that all levels share, and a state shows the pattern of its row.
     """
 
     lean: Tensor
     log_light: Tensor
     bottom: float = BRIGHTNESS_MIN
     top: float = BRIGHTNESS_MAX
+    rows: Tensor | None = None
 
     def parameters(self) -> list[Tensor]:
         """Return what an optimiser changes."""
         return [self.lean, self.log_light]
 
+    def own(self) -> Tensor:
+        """Return the pixels' parameters of every state, (states, pixels)."""
+        return self.lean if self.rows is None else self.lean[self.rows]
+
     def shown(self) -> tuple[Tensor, Tensor]:
         """Return (mask, scale)."""
-        return torch.gt(self.lean, 0, out=torch.empty_like(self.lean)), self.scale()
+        lean = self.own()
+        return torch.gt(lean, 0, out=torch.empty_like(lean)), self.scale()
 
     def scale(self) -> Tensor:
         """Return the brightness of every state, (states, 1)."""
-        return self.log_light.exp().expand(len(self.lean), 1)
+        return self.log_light.exp().expand(len(self.lean) if self.rows is None else len(self.rows), 1)
 
     def take(self, slope: Tensor, light_slope: Tensor | None) -> None:
         """Set the gradients from those of the mask (times the scale) and of the logarithm of the scale; `slope` is used up.
 
         The gradient of a bit is 1 / (1 + 2 lean**2)**2, which is near that of sigmoid(4 lean) and takes an eighth of the time.
         """
-        bend = torch.square(self.lean).mul_(2.0).add_(1.0).square_()
-        self.lean.grad = torch.div(slope, bend, out=bend)
+        bend = torch.square(self.own()).mul_(2.0).add_(1.0).square_()
+        gradient = torch.div(slope, bend, out=bend)
+        if self.rows is not None:
+            before = torch.zeros_like(self.lean) if self.lean.grad is None else self.lean.grad
+            gradient = before.index_add_(0, self.rows, gradient)
+        self.lean.grad = gradient
         assert light_slope is not None
-        if (
-            len(self.log_light) != len(self.lean) or self.log_light.grad is not None
-        ):  # shared: a sum over states and levels
+        if len(self.log_light) != len(slope) or self.log_light.grad is not None:  # one for all: a sum
             light_slope = light_slope.sum(dim=0, keepdim=True)
             light_slope = light_slope if self.log_light.grad is None else self.log_light.grad + light_slope
         self.log_light.grad = light_slope

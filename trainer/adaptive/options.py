@@ -45,6 +45,7 @@ class AutomatonOptions:
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted versions of every training image, which the epochs take in turn (distort.py)
     grey: bool = False  # patterns in all levels of the projector, instead of one bit and a brightness
+    patterns: int = 0  # at most so many different patterns, which states share; 0: as many as the projector holds
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
 
 
@@ -59,6 +60,7 @@ LIMITS = {
     "epochs": (1, 100_000),
     "reroutes": (0, 1000),
     "shift_px": (0, 65536),
+    "patterns": (0, 65_535),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
 }
@@ -69,6 +71,16 @@ def photons_wanted(options: AutomatonOptions) -> float:
     if options.photons is not None:
         return options.photons
     return DEFAULT_PHOTONS if options.clicks is None else PHOTONS_PER_CLICK * options.clicks
+
+
+def states_at_most(exposures: int, states: int) -> int:
+    """Return how many states an automaton can have: twice as many from exposure to exposure, and `states` at most."""
+    return sum(min(1 << min(level, 32), states) for level in range(exposures))
+
+
+def patterns_at_most(options: AutomatonOptions, profile: Profile) -> int:
+    """Return how many patterns may be shown: what was asked for, within the projector's memory."""
+    return min(options.patterns or profile.projector.pattern_memory, profile.projector.pattern_memory)
 
 
 def price_of(photons: float) -> float:
@@ -134,10 +146,18 @@ def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
             f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",
             remedy="choose a sequential profile, such as ideal or dmd-spad",
         )
-    if exposures * states > STATES_MAX + states:
+    most = states_at_most(exposures, states)
+    if most > STATES_MAX:
         raise PlanError(
-            f"{exposures} exposures of {states} states are {exposures * states} states, allowed at most {STATES_MAX}",
+            f"{exposures} exposures of {states} states are up to {most} states, allowed at most {STATES_MAX}",
             remedy=f"--states {STATES_MAX // exposures}, or fewer",
+        )
+    few = patterns_at_most(options, profile)
+    if few < most and (options.grey or (profile.projector.dwell_steps == 1 and profile.projector.levels > 2)):
+        raise PlanError(
+            f"{few} patterns for up to {most} states: on {profile.name} a state's brightness is part of its pattern, so "
+            "that states cannot share one",
+            remedy="fewer --exposures or --states, or a profile with projector.dwell_steps",
         )
     if options.clicks is not None and options.clicks >= exposures:
         raise UsageError(f"--clicks is {options.clicks}, allowed: below {exposures}, one click per exposure at most")

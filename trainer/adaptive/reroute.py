@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .light import Bits, Grey
+from .light import Grey, Light
 from .machine import COUNT_FLOOR, Machine, Sight, forward, leaf_losses
 from .objects import Block
 from .outcomes import no_click
@@ -159,10 +159,14 @@ def _copy_node(machine: Machine, number: int, source: int, target: int, counts: 
     if source >= n_states or target >= n_states:
         return
     level = machine.levels[number + 1]
-    light = level.light
-    rows = [light.root] if isinstance(light, Grey) else [light.lean]
-    if isinstance(light, Bits) and len(light.log_light) > 1:
-        rows.append(light.log_light)
-    for tensor in rows:
+    for tensor in _by_state(level.light):
         tensor[target] = tensor[source]
     level.successors[:, target] = level.successors[:, source]
+
+
+def _by_state(light: Light) -> list[Tensor]:
+    """The tensors of which a state has a row of its own."""
+    if isinstance(light, Grey):
+        return [light.root]
+    own = [light.lean if light.rows is None else light.rows]
+    return own if len(light.log_light) == 1 else [*own, light.log_light]

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
+
 from pans.trainer.device import here
 
 from .light import Bits, Grey, Light
@@ -22,8 +24,8 @@ def machine_state(machine: Machine) -> dict[str, Any]:
 
 
 def machine_from(state: dict[str, Any]) -> Machine:
-    """Return the machine of `machine_state`; a brightness that all levels share is one tensor again."""
-    shared: dict[str, Any] = {}
+    """Return the machine of `machine_state`; a tensor that several levels shared is one tensor again."""
+    shared: dict[int, Tensor] = {}
     levels = [Level(_light_from(level, shared), here(level["successors"])) for level in state["levels"]]
     return Machine(levels, [here(counts) for counts in state["counts"]])
 
@@ -31,15 +33,15 @@ def machine_from(state: dict[str, Any]) -> Machine:
 def _light_state(light: Light) -> dict[str, Any]:
     if isinstance(light, Grey):
         return {"root": light.root, "top": light.top, "whole_levels": light.levels}
-    is_shared = light.log_light.shape[0] != light.lean.shape[0]
     limits = {"bottom": light.bottom, "top": light.top}
-    return {"lean": light.lean, "log_light": light.log_light, "shared": is_shared, **limits}
+    return {"lean": light.lean, "log_light": light.log_light, "rows": light.rows, **limits}
 
 
-def _light_from(level: dict[str, Any], shared: dict[str, Any]) -> Light:
+def _light_from(level: dict[str, Any], shared: dict[int, Tensor]) -> Light:
+    def once(tensor: Tensor) -> Tensor:
+        return shared.setdefault(tensor.data_ptr(), here(tensor))  # torch.load keeps what was one storage one
+
     if "root" in level:
         return Grey(here(level["root"]), level["top"], level["whole_levels"])
-    log_light = here(level["log_light"])
-    if level["shared"]:
-        log_light = shared.setdefault("log_light", log_light)
-    return Bits(here(level["lean"]), log_light, level["bottom"], level["top"])
+    rows = None if level["rows"] is None else here(level["rows"])
+    return Bits(once(level["lean"]), once(level["log_light"]), level["bottom"], level["top"], rows)

@@ -25,21 +25,32 @@ from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 
-from .figures import Figures, figures, recount
+from .figures import Figures, figures
 from .finished import Finished, bit_grid, dwell_steps, finished, to_grid
-from .grow import GrowOptions, Growth
+from .grow import GrowOptions, Growth, sum_of
 from .light import Bits, Grey, as_bits
-from .machine import Machine, Sight, forward
-from .objects import Augmentation, TrainingObjects
-from .options import AutomatonOptions, check_automaton_options, photons_wanted, price_at, price_of, with_defaults
+from .machine import COUNT_FLOOR, Machine, Sight, forward
+from .objects import Augmentation, Block, TrainingObjects
+from .options import (
+    AutomatonOptions,
+    check_automaton_options,
+    patterns_at_most,
+    photons_wanted,
+    price_at,
+    price_of,
+    with_defaults,
+)
 from .posteriors import Posteriors, calibrated, node_counts
 from .reroute import reroute
+from .share import share_patterns
 from .state import machine_from, machine_state
 from .tune import Price, Tuning
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
+REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
 REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
+TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
 UNDER_BUDGET = 0.99  # of the budget is what the held-back objects may take: others take a little more or less
 DIMMINGS = 4  # steps of the search for the brightness that meets the budget
 STAGES = ("grow", "grey", "shown")
@@ -151,10 +162,7 @@ class _Run:
     def sight(self, products: torch.dtype = torch.float32) -> Sight:
         """How the instrument sees objects at the exposure that the present brightest pixel needs."""
         low, high = top_limits(self.profile)
-        top = low
-        if self.stage == "shown":
-            light = self.machine.levels[0].light
-            top = bit_grid(self.machine, self.profile).top if isinstance(light, Bits) else light.top
+        top = self.machine.levels[0].light.top if self.stage == "shown" else low
         law = click_law(self.profile, exposure_us_of(self.profile, min(high, max(low, top))))
         if self.options.dark is not None:
             law = replace(law, dark_per_exposure=self.options.dark)
@@ -188,6 +196,15 @@ class _Run:
         right = float(counts.amax(dim=1).sum()) / n
         return Progress("grow", len(growth.levels), self.steps, loss, right, clicks, photons, price)
 
+    def _masses(self) -> list[torch.Tensor]:
+        """How often every state is reached, by some of the objects."""
+        blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)[:REACH_BLOCKS]
+        with torch.no_grad():
+            passes = [forward(self.machine, self.sight(self.products), block.grey) for block in blocks]
+            levels = range(len(self.machine.levels))
+            return [sum_of(passed.steps[level].alpha.sum(dim=1) for passed in passes) for level in levels]
+
+    @torch.no_grad()
     def start_showing(self) -> None:
         """Turn grey patterns into what the projector shows: one bit and a brightness, or whole levels."""
         if self.stage != "grey":
@@ -213,6 +230,9 @@ class _Run:
                 bits.log_light, bits.bottom = typical, low
             bits.settle()
             level.light = bits
+        most = patterns_at_most(self.options, self.profile)
+        if most < sum(len(light) for light in lights):
+            share_patterns(self.machine, most, self._masses(), mean, new_generator(self.options.seed + 1))
 
     def tune(self, stage: str, epochs: int, rate: float, keep: Callable[[], None]) -> None:
         """Train all levels together for the rest of a stage's epochs."""
@@ -226,6 +246,8 @@ class _Run:
                 self.tuning.restore(self.saved_tuning)
                 self.saved_tuning = None
         while self.epoch < epochs:
+            if stage == "shown" and not self.options.grey:
+                self._choose_top()
             self.tuning.sight = self.sight(self.products)
             if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
                 self._reroute()
@@ -236,6 +258,21 @@ class _Run:
             figures_told = told.loss, told.accuracy, told.clicks, told.photons, told.price
             self.report(Progress(stage, before + self.epoch, self.steps, *figures_told))
             keep()
+
+    def _choose_top(self) -> None:
+        """Set the brightness of the top, which sets the exposure, by what most objects meet; brighter states are dimmed to it.
+
+        One bright state that is hardly ever reached would else bring its dark counts to every exposure.
+        """
+        lights = torch.cat([level.light.shown()[1].flatten() for level in self.machine.levels])  # type: ignore[union-attr]
+        masses, order = torch.cat(self._masses()), lights.argsort()
+        below = masses[order].cumsum(0) / masses.sum()
+        low, high = top_limits(self.profile)
+        top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
+        for level in self.machine.levels:
+            level.light.top = min(high, max(low, top))
+            with torch.no_grad():
+                level.light.settle()
 
     def _reroute(self) -> None:
         states = sum(level.n_states for level in self.machine.levels)
@@ -251,22 +288,20 @@ class _Run:
 
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
-        blocks = self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
         self._meet_budget(held_back)
-        grid = None if self.options.grey else bit_grid(self.machine, self.profile)
+        grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
-        recount(self.machine, sight, blocks)
+        posteriors = self._posteriors(sight, held_back)
         measured = figures(self.machine, sight, held_back)
-        posteriors = self._posteriors(sight)
         arrays = finished(self.machine, posteriors, self.profile, grid)
         return TrainedAutomaton(
             arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
         )
 
-    def _meet_budget(self, held_back: list[Any]) -> None:
+    def _meet_budget(self, held_back: list[Block]) -> None:
         """Dim or brighten all patterns alike until the held-back objects take 99 % of the budget; a few percent at most."""
         if self.price.budget is None:
             return
@@ -278,11 +313,13 @@ class _Run:
                 return
             scale_light(self.machine, wanted**1.1)
 
-    def _posteriors(self, sight: Sight) -> Posteriors:
+    def _posteriors(self, sight: Sight, held_back: list[Block]) -> Posteriors:
+        """Calibrated posteriors of all nodes; the machine's leaves are counted anew."""
         fitted = node_counts(self.machine, sight, self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True))
-        arrived = node_counts(self.machine, sight, self.objects.held_back(GROWTH_BLOCK, torch.float32))
         sizes = [*(level.n_states for level in self.machine.levels), 0]
-        return calibrated(fitted, arrived, sizes)
+        for counts, found, states in zip(self.machine.counts, fitted[1:], sizes[1:]):
+            counts.copy_(torch.from_numpy(found[states:]) + COUNT_FLOOR)
+        return calibrated(fitted, node_counts(self.machine, sight, held_back), sizes)
 
     # ---- checkpoints ----
 

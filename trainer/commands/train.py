@@ -87,6 +87,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         "--states", type=int, metavar="S", help="of an automaton: most states per exposure (default: by the budget)"
     )
     parser.add_argument(
+        "--patterns",
+        type=int,
+        metavar="P",
+        help="of an automaton: most different patterns, which states share (default: the projector's memory)",
+    )
+    parser.add_argument(
         "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"
     )
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
@@ -137,7 +143,7 @@ def _train(args: argparse.Namespace) -> int:
         return train_automaton_command(args, checkpoint)
     if args.features is None:
         raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
-    for name in ("exposures", "states", "grey"):
+    for name in ("exposures", "states", "patterns", "grey"):
         if getattr(args, name):
             raise UsageError(f"--{name} belongs to an automaton", remedy="add --encoder automaton, or leave it out")
     check_files(args, checkpoint)

@@ -31,6 +31,7 @@ TAKEN = (
     "clicks",
     "exposures",
     "states",
+    "patterns",
     "epochs",
     "seed",
     "batch",

@@ -174,6 +174,8 @@ def test_options_that_cannot_be(task):
     ):
         with pytest.raises(UsageError, match=error):
             check_automaton_options(replace(SMALL, **changes), task, IDEAL)
+    with pytest.raises(PlanError, match="states cannot share one"):
+        check_automaton_options(replace(SMALL, patterns=3), task, IDEAL)
     with pytest.raises(PlanError, match="65533"):
         check_automaton_options(replace(SMALL, exposures=200, states=500), task, IDEAL)
     with pytest.raises(UsageError, match="the light is the scene's own"):
@@ -188,3 +190,37 @@ def test_prices_fall_along_the_levels_and_sizes_grow_with_the_budget():
     assert all(before >= after for before, after in pairwise(prices))
     sizes = [default_size(photons) for photons in (3.0, 10.0, 40.0)]
     assert sizes == sorted(sizes)
+
+
+def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_path):
+    options, path, profile = replace(SMALL, patterns=5), tmp_path / "few.checkpoint", load_profile("dmd-spad")
+    whole = train_automaton(task, profile, options)
+    assert len(whole.arrays.pattern_levels) <= 5
+    assert len(whole.arrays.pattern) > 20
+    compare_walks(export_bundle(whole, task, profile), whole, task, profile)
+    assert whole.held_back.accuracy > 0.6
+
+    def stop(told):
+        if told.done == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_automaton(task, profile, options, checkpoint=path, report=stop)
+    resumed = train_automaton(task, profile, options, checkpoint=path, resume=True)
+    np.testing.assert_array_equal(resumed.arrays.pattern_levels, whole.arrays.pattern_levels)
+    np.testing.assert_array_equal(resumed.arrays.dwell, whole.arrays.dwell)
+
+
+def test_one_bright_state_does_not_set_the_exposure(task):
+    from pans.trainer.adaptive.train import _Run
+
+    run = _Run(task, load_profile("dmd-spad"), SMALL, lambda _: None, 0)
+    run.grow(lambda: None)
+    run.start_showing()
+    level = run.machine.levels[-1]
+    reached = [masses.clone() for masses in run._masses()][-1]
+    with torch.no_grad():
+        level.light.log_light[int(reached.argmin())] = 0.0  # a photoelectron per pixel, and more than 0.4 dark counts at 2 kHz
+    run._choose_top()
+    assert level.light.top < 0.9
+    assert float(level.light.scale().max()) <= level.light.top * (1 + 1e-6)
