@@ -220,7 +220,9 @@ def test_one_bright_state_does_not_set_the_exposure(task):
     level = run.machine.levels[-1]
     reached = [masses.clone() for masses in run._masses()][-1]
     with torch.no_grad():
-        level.light.log_light[int(reached.argmin())] = 0.0  # a photoelectron per pixel, and more than 0.4 dark counts at 2 kHz
+        level.light.log_light[int(reached.argmin())] = (
+            0.0  # a photoelectron per pixel, and more than 0.4 dark counts at 2 kHz
+        )
     run._choose_top()
     assert level.light.top < 0.9
     assert float(level.light.scale().max()) <= level.light.top * (1 + 1e-6)
