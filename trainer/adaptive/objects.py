@@ -38,12 +38,13 @@ class Block:
 class Augmentation:
     """How training images change from epoch to epoch: moved by whole pixels along and across the rows; `copies` distorted versions.
 
-    Epochs take the images as they are and their distorted versions in turn.
+    Epochs take the images as they are and their distorted versions in turn; `strength` scales the distortions (distort.py).
     """
 
     shift_px: int = 0
     offset_px: int = 0
     copies: int = 0
+    strength: float = 1.0
 
 
 class TrainingObjects:
@@ -91,7 +92,9 @@ class TrainingObjects:
         objects, way = self._fit, self._augmentation
         version = number % (way.copies + 1)
         if version:
-            objects = Objects(distorted(objects.images, [DISTORT_STREAM, self._seed, version]), objects.labels)
+            objects = Objects(
+                distorted(objects.images, [DISTORT_STREAM, self._seed, version], way.strength), objects.labels
+            )
         return shifted(objects, way.shift_px, way.offset_px, self._seed + 1000 * number)
 
     def _grey(self, images: np.ndarray) -> np.ndarray:

@@ -45,6 +45,7 @@ class AutomatonOptions:
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted versions of every training image, which the epochs take in turn (distort.py)
     grey: bool = False  # patterns in all levels of the projector, instead of one bit and a brightness
+    strength: float = 0.3  # of these distortions; at full strength they cost more than they bring
     patterns: int = 0  # at most so many different patterns, which states share; 0: as many as the projector holds
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
 
@@ -60,6 +61,7 @@ LIMITS = {
     "epochs": (1, 100_000),
     "reroutes": (0, 1000),
     "shift_px": (0, 65536),
+    "strength": (0, 10),
     "patterns": (0, 65_535),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
@@ -94,10 +96,16 @@ def default_size(photons: float) -> tuple[int, int]:
     return exposures, 256 if photons <= 12 else 384
 
 
-def with_defaults(options: AutomatonOptions) -> tuple[int, int]:
-    """Return exposures and states per level: those asked for, else those of the budget."""
-    exposures, states = default_size(photons_wanted(options))
-    return options.exposures or exposures, options.states or states
+def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int]:
+    """Return exposures and states per level: those asked for, else those of the budget, as far as the profile holds them."""
+    wanted, states = default_size(photons_wanted(options))
+    exposures = options.exposures or wanted
+    if options.states:
+        return exposures, options.states
+    most = min(profile.projector.pattern_memory, profile.projector.automaton_states or STATES_MAX)
+    while states > 1 and states_at_most(exposures, states) > most:
+        states -= 1
+    return exposures, states
 
 
 def price_at(options: AutomatonOptions, level: int) -> float:
@@ -140,7 +148,7 @@ def _check_task(task: Task) -> None:
 
 
 def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
-    exposures, states = with_defaults(options)
+    exposures, states = with_defaults(options, profile)
     if profile.mode != "sequential":
         raise PlanError(
             f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",

@@ -51,6 +51,7 @@ REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reach
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
 REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
+DARK_COUNTS = 0.15  # per decision: what longer exposures bring in light, they lose in dark counts
 UNDER_BUDGET = 0.99  # of the budget is what the held-back objects may take: others take a little more or less
 DIMMINGS = 4  # steps of the search for the brightness that meets the budget
 STAGES = ("grow", "grey", "shown")
@@ -141,9 +142,9 @@ class _Run:
         held_back: int,
     ) -> None:
         self.profile, self.options, self.report = profile, options, report
-        changes = Augmentation(options.shift_px, options.offset_px, options.copies)
+        changes = Augmentation(options.shift_px, options.offset_px, options.copies, options.strength)
         self.objects = TrainingObjects(task, profile, options.seed, changes, held_back)
-        self.exposures, self.states = with_defaults(options)
+        self.exposures, self.states = with_defaults(options, profile)
         self.stage, self.epoch = "grow", 0
         self.machine = Machine([], [])
         budget = options.photons if options.clicks is None else options.clicks
@@ -216,16 +217,25 @@ class _Run:
             for level, light in zip(self.machine.levels, lights):
                 level.light = Grey(light.clamp(max=top).sqrt(), top, self.profile.projector.levels)
         else:
-            self._start_bits(lights, low, high)
+            self._start_bits(lights, low)
         self.stage, self.epoch, self.tuning = "shown", 0, None
 
-    def _start_bits(self, lights: list[torch.Tensor], low: float, high: float) -> None:
+    def _highest_top(self) -> float:
+        """Return the brightest top that the profile allows and that brings no more than `DARK_COUNTS` to a decision."""
+        low, high = top_limits(self.profile)
+        rate_hz = self.profile.detector.dark_rate_hz
+        if rate_hz > 0:
+            exposure_s = DARK_COUNTS / self.exposures / rate_hz
+            high = min(high, max(low, self.profile.projector.peak_photoelectrons_hz * exposure_s))
+        return high
+
+    def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
         mean = self.objects.mean_transmission()
         shared = self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
-        made = [as_bits(light, mean) for light in lights]
+        top = self._highest_top()
+        made = [as_bits(light, mean, top) for light in lights]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
         for level, bits in zip(self.machine.levels, made):
-            bits.top = high
             if shared:
                 bits.log_light, bits.bottom = typical, low
             bits.settle()
@@ -267,7 +277,7 @@ class _Run:
         lights = torch.cat([level.light.shown()[1].flatten() for level in self.machine.levels])  # type: ignore[union-attr]
         masses, order = torch.cat(self._masses()), lights.argsort()
         below = masses[order].cumsum(0) / masses.sum()
-        low, high = top_limits(self.profile)
+        low, high = top_limits(self.profile)[0], self._highest_top()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
         for level in self.machine.levels:
             level.light.top = min(high, max(low, top))

@@ -58,6 +58,7 @@ NUMBERS = (
     ("shots", "K", "fit the head to 1 to K shots (default 1)"),
     ("shift_px", "X", "move training images by up to X along the rows (default 0)"),
     ("offset_px", "Y", "and by up to Y across them (default 0)"),
+    ("strength", "F", "of an automaton: of the distortions, times the usual (default 0.3)"),
     ("copies", "N", "add N distorted copies of every training image: turned, stretched, bent a little (default 0)"),
     ("seed", "N", "of everything random (default 0)"),
     ("hidden", "H", "hidden units of the head (default 512)"),
@@ -66,7 +67,11 @@ NUMBERS = (
     ("clamp", "L", "clamp photoelectrons early in training"),
     ("dark", "R", "dark photoelectrons per exposure in training, instead of the profile's"),
 )
-AS_GIVEN = ("features", "photons", "budget", "complex_field", "conserving", *(name for name, _, _ in NUMBERS))
+OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength")
+AS_GIVEN = (
+    *("features", "photons", "budget", "complex_field", "conserving"),
+    *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
+)
 
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
@@ -115,7 +120,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     defaults = {field.name: field.default for field in fields(Options)}
     for name, metavar, words in NUMBERS:
-        flag, default = "--" + name.replace("_", "-"), defaults[name]
+        flag, default = "--" + name.replace("_", "-"), defaults.get(name)
         kind = float if default is None else type(default)
         parser.add_argument(flag, type=kind, metavar=metavar, help=words)
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
@@ -143,7 +148,7 @@ def _train(args: argparse.Namespace) -> int:
         return train_automaton_command(args, checkpoint)
     if args.features is None:
         raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
-    for name in ("exposures", "states", "patterns", "grey"):
+    for name in OF_AUTOMATA:
         if getattr(args, name):
             raise UsageError(f"--{name} belongs to an automaton", remedy="add --encoder automaton, or leave it out")
     check_files(args, checkpoint)

@@ -38,6 +38,7 @@ TAKEN = (
     "shift_px",
     "offset_px",
     "copies",
+    "strength",
     "dark",
 )
 FOREIGN = (

@@ -63,22 +63,22 @@ def _check(images: NDArray[np.uint8], copies: int) -> None:
         )
 
 
-def distorted(images: NDArray[np.uint8], seed: list[int]) -> NDArray[np.uint8]:
-    """Return every image (n, height, width) distorted in its own way."""
+def distorted(images: NDArray[np.uint8], seed: list[int], strength: float = 1.0) -> NDArray[np.uint8]:
+    """Return every image (n, height, width) distorted in its own way; `strength` scales the sizes, of the displacement its square."""
     random = np.random.default_rng(seed)
-    parts = [_distorted(images[first : first + CHUNK], random) for first in range(0, len(images), CHUNK)]
+    parts = [_distorted(images[first : first + CHUNK], random, strength) for first in range(0, len(images), CHUNK)]
     return np.concatenate(parts)
 
 
-def _distorted(images: NDArray[np.uint8], random: np.random.Generator) -> NDArray[np.uint8]:
+def _distorted(images: NDArray[np.uint8], random: np.random.Generator, strength: float) -> NDArray[np.uint8]:
     n, height, width = images.shape
     turn, along, across, shear, x, y = (
-        torch.from_numpy(random.uniform(-most, most, (n,)).astype(np.float32))
+        torch.from_numpy((strength * random.uniform(-most, most, (n,))).astype(np.float32))
         for most in (TURN_RAD, STRETCH, STRETCH, SHEAR, 2 * SHIFT, 2 * SHIFT)  # the grid runs from -1 to 1
     )
     rows = (1 + along) * turn.cos(), shear - turn.sin(), x, turn.sin(), (1 + across) * turn.cos(), y
     grid = affine_grid(torch.stack(rows, dim=1).unflatten(1, (2, 3)), [n, 1, height, width], align_corners=False)
-    grid = grid + _displacements(random, n, (height, width))
+    grid = grid + strength**2 * _displacements(random, n, (height, width))
     shown = torch.from_numpy(images.astype(np.float32)).unsqueeze(1)
     moved = grid_sample(shown, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
     return moved.round().clamp(0, 255).to(torch.uint8).numpy()

@@ -12,7 +12,7 @@ from trainings import random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
 from pans.trainer.adaptive.figures import figures
-from pans.trainer.adaptive.light import Bits
+from pans.trainer.adaptive.light import Bits, as_bits
 from pans.trainer.adaptive.machine import Sight, backward, brought, forward
 from pans.trainer.adaptive.objects import Block
 from pans.trainer.adaptive.outcomes import no_click
@@ -155,3 +155,19 @@ def test_figures_are_means_over_the_objects():
     shown = [step.light[:, 0] for step in clear.steps]
     walked = sum(float(step.alpha.mean(dim=1) @ light) for step, light in zip(passed.steps, shown))
     assert found.illumination == pytest.approx(walked)
+
+
+@pytest.mark.parametrize("top", [1e6, 0.5, 0.3])
+def test_bits_made_from_grey_patterns_keep_their_light_within_the_top(top):
+    random = torch.Generator().manual_seed(1)
+    grey = torch.rand(20, 60, generator=random, dtype=torch.float64) ** 6
+    mean = torch.rand(60, generator=random, dtype=torch.float64)
+    bits = as_bits(grey, mean, top)
+    mask, scale = bits.shown()
+    torch.testing.assert_close(scale.squeeze(1) * (mask @ mean), grey @ mean)
+    assert float(scale.max()) <= top * (1 + 1e-9)
+    lit = mask.sum(dim=1)
+    assert bool((lit >= (grey > 0.2 * grey.amax(dim=1, keepdim=True)).sum(dim=1)).all())
+    darkest_lit = torch.where(mask > 0, grey, torch.inf).amin(dim=1)
+    brightest_dark = torch.where(mask > 0, 0.0, grey).amax(dim=1)
+    assert bool((darkest_lit >= brightest_dark).all())

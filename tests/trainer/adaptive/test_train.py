@@ -15,7 +15,14 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import PansError, PlanError, UsageError
 from pans.runtime.instrument.profile import load_profile, parse_profile
 from pans.trainer.adaptive.finished import Grid, to_grid
-from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options, default_size, price_at
+from pans.trainer.adaptive.options import (
+    AutomatonOptions,
+    check_automaton_options,
+    default_size,
+    price_at,
+    states_at_most,
+    with_defaults,
+)
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.export.automaton import compare_walks, export_automaton, measure_walks
 
@@ -190,6 +197,10 @@ def test_prices_fall_along_the_levels_and_sizes_grow_with_the_budget():
     assert all(before >= after for before, after in pairwise(prices))
     sizes = [default_size(photons) for photons in (3.0, 10.0, 40.0)]
     assert sizes == sorted(sizes)
+    small = load_profile("dmd-8bit-spad")
+    exposures, states = with_defaults(AutomatonOptions(photons=10.0), small)
+    assert states_at_most(exposures, states) <= small.projector.automaton_states < states_at_most(exposures, states + 1)
+    assert with_defaults(replace(SMALL, photons=10.0), small) == (6, 12)
 
 
 def test_states_share_few_patterns_and_a_resumed_training_still_does(task, tmp_path):
