@@ -7,6 +7,7 @@ looks one exposure ahead; what lies further ahead is tuned (tune.py).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,7 @@ class GrowOptions:
     epochs: int = 2
     rate: float = 0.03
     candidates: int = 6
+    top: float = math.inf  # most photoelectrons of a pixel
 
 
 class Growth:
@@ -51,7 +53,8 @@ class Growth:
     def grow(self, price: float) -> None:
         """Add a level whose light costs `price` per photoelectron."""
         roots = self._best_candidates(price).clamp(min=GLOW).sqrt()
-        light = Grey(roots)
+        light = Grey(roots, self.options.top)
+        light.settle()
         self._train(light, price)
         self._branch(light)
 
@@ -145,6 +148,7 @@ class Growth:
                 light.take(self.sight.mask_slope(slope, block.grey), None)
                 optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
                 optimiser.step()
+                light.settle()
                 done += 1
                 silent = torch.minimum((1 - share) * silent + share * n / len(block) * here_silent, whole - COUNT_FLOOR)
                 silent.clamp_(min=COUNT_FLOOR)

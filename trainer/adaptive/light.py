@@ -112,17 +112,15 @@ Light = Grey | Bits
 
 
 def as_bits(grey: Tensor, mean_object: Tensor, top: float = BRIGHTNESS_MAX) -> Bits:
-    """Return one-bit patterns made from grey ones, (states, pixels), which give the same light on `mean_object` (pixels,).
+    """Return one-bit patterns made from grey ones, which give the same light on the state's mean object; all (states, pixels).
 
     Lit are pixels above a part of the brightest one; more are, where the brightness would else exceed `top`.
     """
     brightest = grey.amax(dim=1, keepdim=True).clamp(min=1e-30)
-    wanted = (grey @ mean_object).unsqueeze(1)
+    wanted = (grey * mean_object).sum(dim=1, keepdim=True)
     values, order = grey.sort(dim=1, descending=True)
-    too_few = (
-        mean_object[order].cumsum(dim=1) < wanted / top
-    )  # that many of the brightest pixels do not bring the light
+    too_few = mean_object.gather(1, order).cumsum(dim=1) < wanted / top  # so many of the brightest pixels
     last = values.gather(1, too_few.sum(dim=1, keepdim=True).clamp(max=grey.shape[1] - 1))
     lean = (grey - torch.minimum(BIT_CUT * brightest, 0.999 * last)) / brightest
-    brought = ((lean > 0).to(grey.dtype) @ mean_object).clamp(min=1e-9).unsqueeze(1)
+    brought = ((lean > 0) * mean_object).sum(dim=1, keepdim=True).clamp(min=1e-9)
     return Bits(lean, (wanted / brought).clamp(min=BRIGHTNESS_MIN).log(), top=top)

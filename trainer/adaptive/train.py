@@ -9,7 +9,7 @@ information bottleneck (Slonim and Tishby 1999), sequential decisions on photons
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -175,7 +175,9 @@ class _Run:
         """Grow levels until there are as many as exposures."""
         if self.stage != "grow":
             return
-        options = GrowOptions(self.states, self.options.grow_epochs, candidates=self.options.candidates)
+        options = GrowOptions(
+            self.states, self.options.grow_epochs, candidates=self.options.candidates, top=self._highest_top()
+        )
         blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)
         with torch.no_grad():
             growth = Growth(blocks, self.sight(self.products), options, new_generator(self.options.seed))
@@ -205,6 +207,16 @@ class _Run:
             levels = range(len(self.machine.levels))
             return [sum_of(passed.steps[level].alpha.sum(dim=1) for passed in passes) for level in levels]
 
+    def _mean_objects(self) -> Iterator[torch.Tensor]:
+        """Yield level by level the mean transmission of the objects that reach a state, (states, pixels)."""
+        blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)[:REACH_BLOCKS]
+        sight = self.sight(self.products)
+        passes = [forward(self.machine, sight, block.grey) for block in blocks]
+        for level in range(len(self.machine.levels)):
+            alphas = [passed.steps[level].alpha for passed in passes]
+            sums = sum_of(sight.mask_slope(alpha, block.grey) for alpha, block in zip(alphas, blocks))
+            yield sums / sum_of(alpha.sum(dim=1, keepdim=True) for alpha in alphas).clamp(min=1e-9)
+
     @torch.no_grad()
     def start_showing(self) -> None:
         """Turn grey patterns into what the projector shows: one bit and a brightness, or whole levels."""
@@ -233,7 +245,7 @@ class _Run:
         mean = self.objects.mean_transmission()
         shared = self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
         top = self._highest_top()
-        made = [as_bits(light, mean, top) for light in lights]
+        made = [as_bits(light, own, top) for light, own in zip(lights, self._mean_objects())]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
         for level, bits in zip(self.machine.levels, made):
             if shared:
