@@ -142,8 +142,11 @@ class BulkSteps:
         state[place.MESSAGES] = state[place.EXPOSURES] = 0
         state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = core.windows.position
         state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
-        state[place.END_EXPOSURE], state[kernels.LAST_TICK] = min(core.end_exposure, (1 << 62)), core.last_tick
-        state[kernels.JITTER] = core.jitter_ticks
+        state[place.END_EXPOSURE], state[kernels.LAST_TICK] = (
+            min(core.end_exposure, (1 << 62)),
+            min(core.last_tick, _LARGEST),
+        )
+        state[kernels.JITTER] = min(core.jitter_ticks, _LARGEST)
 
     def _store(self) -> None:
         """Copy what the kernel did back."""
@@ -155,7 +158,9 @@ class BulkSteps:
                 state[place.EXPOSURES],
             )
             core.windows.go_on((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
-            core.last_tick, core.jitter_ticks = state[kernels.LAST_TICK], state[kernels.JITTER]
+            if state[kernels.LAST_TICK] != min(core.last_tick, _LARGEST):  # a larger one only Python's integers hold
+                core.last_tick = state[kernels.LAST_TICK]
+            core.jitter_ticks = max(core.jitter_ticks, state[kernels.JITTER])
         core.n_decisions, core.n_abstained = state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED]
 
     def hand_over(self) -> None:

@@ -94,6 +94,17 @@ def test_a_state_that_the_walk_does_not_pass_is_a_fault_and_decides_nothing(
     assert summary.wrong_patterns > 0 or summary.contradictions["stamp"] > 0
 
 
+@pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven"])
+def test_the_largest_ticks_are_taken_and_replayed(
+    mode: str, stage: Stage, parallel: Stage, walks: Stage, tmp_path: Path
+) -> None:
+    """The end of such a block lies beyond 63 bits: no kernel holds it."""
+    one = {"sequential": stage, "parallel": parallel, "device-driven": walks}[mode]
+    block = "FRAMES" if mode == "parallel" else "CLICKS"
+    for tick in (1 << 62, (1 << 63) - 1):
+        assert ended(one.run(tmp_path, 1, Mutation(block, "tick", *to(tick), most=3))).verdict == "FAIL"
+
+
 def test_a_device_that_follows_another_automaton_is_found(walks: Stage, tmp_path: Path) -> None:
     session = walks.run(tmp_path, 3, Mutation("STATE", "next_click", *to(4)))  # of state 0, which leads to 2
     summary = ended(session)
