@@ -30,10 +30,10 @@ def bundle_path(cache: Path, stem: str, seed: int) -> Path:
 
 
 def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any], seed: int) -> Row:
-    """Return the figures of an automaton of that budget (see `recipe`), trained now unless its bundle is in the cache."""
+    """Return the figures of an automaton of that budget (see `automaton_recipe`), trained now unless its bundle is in the cache."""
     from pans.trainer.export.automaton import measure_walks
 
-    options = recipe(budget, seed)
+    options = automaton_recipe(budget, seed)
     path = bundle_path(asked.cache, stem, seed)
     seconds = None
     if _trained(path, options) is None:
@@ -47,7 +47,7 @@ def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any]
     return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}
 
 
-def recipe(budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
+def automaton_recipe(budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
     """Return the options for a budget (`photons` or `clicks`) and perhaps a size; by default that of the budget, spelt out."""
     from pans.trainer.adaptive.options import AutomatonOptions, with_defaults
 

@@ -39,7 +39,7 @@ def quick(monkeypatch):
     def of(**given):
         return AutomatonOptions(exposures=4, states=3, grow_epochs=1, tune_epochs=1, epochs=1, reroutes=0, **given)
 
-    monkeypatch.setattr("pans.trainer.adaptive.options.AutomatonOptions", of)
+    monkeypatch.setattr("pans.trainer.adaptive.options.AutomatonOptions", of)  # where recipes are made
     return of
 
 
@@ -69,6 +69,9 @@ def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_p
     assert kept == ways.row_of(asked, point, 0, None)
     assert kept is not None
     assert (kept["all"]["accuracy_mean"], kept["exposures"]) == (row["all"]["accuracy_mean"], row["exposures"])
+    with monkeypatch.context() as patch:  # another default of the trainer: another recipe, and no row of it
+        patch.setattr("pans.trainer.adaptive.options.AutomatonOptions", lambda **given: quick(**given, half=5.0))
+        assert ways.row_of(asked, point, 0, None) is None
     with pytest.raises(AssertionError, match="trained again"):  # another seed, another recipe
         automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=1)
     with pytest.raises(AssertionError, match="trained again"):
