@@ -22,13 +22,12 @@ from pans.firmware_sim.testing import small_automaton_bundle, small_setup
 from pans.hw_profiles import __file__ as _profiles
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import BackEnd, Shown, bundle_bytes, load_bundle, make_bundle
-from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import PansError
 from pans.runtime.report.verify import verify_file
 
 from .contents import mutated_toml
 from .sealing import changed_bundle, changed_calibration, changed_recording
-from .uses import record_automaton, record_run, small_calibration, use_file
+from .uses import passive_bundle, record_automaton, record_flow, record_passive, record_run, small_calibration, use_file
 
 ANSWER_S = 2.0  # of processor time for one answer; the files have up to 140 kB
 MEMORY_MIB = 400
@@ -155,17 +154,7 @@ def _base_files() -> dict[str, _Kind]:
 def _bundles() -> list[bytes]:
     """The shipped bundle, a table alone, passive optics, a head that gives pictures back, automata of bits and of bytes."""
     shipped, _ = load_bundle(SHIPPED / "fashion10.pans")
-    rng = np.random.default_rng(1)
     facts: dict[str, Any] = {"task": "small", "provenance": {"seed": 1, "losses": [0.5, 0.25]}}
-    optics = Analyser("coherent", rng.normal(size=(3, 4)).astype(np.complex64), "field", "none", 10.0, 100.0)
-    passive = make_bundle(
-        name="passive",
-        classes=("a", "b"),
-        image_shape=(2, 2),
-        optics=optics,
-        back_end=BackEnd(table=rng.normal(size=(8, 2))),
-        **facts,
-    )
     picture = make_bundle(
         name="picture",
         picture_shape=(2, 5),
@@ -176,13 +165,18 @@ def _bundles() -> list[bytes]:
     )
     automata = [small_automaton_bundle(levels) for levels in (2, 8)]
     return [
-        bundle_bytes(bundle) for bundle in (shipped, small_setup()[1], small_setup()[1], passive, picture, *automata)
+        bundle_bytes(bundle)
+        for bundle in (shipped, small_setup()[1], small_setup()[1], passive_bundle(), picture, *automata)
     ]
 
 
 def _recordings() -> list[bytes]:
-    """Still objects, an automaton."""
-    return [_made(lambda folder, make=make: make(folder).read_bytes()) for make in (record_run, record_automaton)]  # type: ignore[misc]
+    """Still objects, passive optics, cells in flow, an automaton."""
+
+    def file_of(make: Callable[[Path], Path]) -> bytes:
+        return _made(lambda folder: make(folder).read_bytes())
+
+    return [file_of(make) for make in (record_run, record_passive, record_flow, record_automaton)]
 
 
 def _made(make: Callable[[Path], bytes]) -> bytes:

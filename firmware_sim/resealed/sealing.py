@@ -19,6 +19,7 @@ from pans.runtime.container import block_bytes, canonical_json, file_prologue
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.record.format import FORMAT_VERSION, MAGIC, MESSAGE, Kind
 from pans.runtime.record.log import LogReader
+from pans.runtime.wire.framing import FrameDecoder, encode_frame
 
 from .contents import mutated_array, mutated_bytes, mutated_json, mutated_protobuf
 
@@ -95,12 +96,13 @@ def _changed_payload(dice: random.Random, kind: int, payload: bytes) -> bytes:
         place = dice.randrange(len(lines))
         lines[place] = mutated_json(dice, json.loads(lines[place]))
         return b"\n".join(lines)
-    if kind in (Kind.MESSAGES, Kind.COMMANDS) and dice.random() < 0.8:
-        return _changed_message(dice, payload)
+    if kind in (Kind.MESSAGES, Kind.COMMANDS, Kind.ANSWERS) and payload and dice.random() < 0.8:
+        return _changed_message(dice, payload, wire=kind == Kind.COMMANDS)
     return mutated_bytes(dice, payload)
 
 
-def _changed_message(dice: random.Random, payload: bytes) -> bytes:
+def _changed_message(dice: random.Random, payload: bytes, *, wire: bool) -> bytes:
+    """Return a block of messages with one removed, doubled, at another time or changed; `wire`: frames as they were sent."""
     rows, position = [], 0
     while position < len(payload):
         host_ns, length = MESSAGE.unpack_from(payload, position)
@@ -117,8 +119,24 @@ def _changed_message(dice: random.Random, payload: bytes) -> bytes:
     elif kind < 0.5:
         rows[place] = dice.choice((0, -1, (1 << 63) - 1, -(1 << 63), host_ns - 10**12)), body
     else:
-        rows[place] = host_ns, mutated_bytes(dice, body)
+        rows[place] = (
+            host_ns,
+            _changed_frames(dice, body) if wire and dice.random() < 0.8 else mutated_bytes(dice, body),
+        )
     return b"".join(MESSAGE.pack(host_ns, len(body)) + body for host_ns, body in rows)
+
+
+def _changed_frames(dice: random.Random, data: bytes) -> bytes:
+    """Return frames as they go over the wire, the payload of one of them changed, under a checksum that fits."""
+    frames = FrameDecoder().feed(data)
+    if not frames:
+        return mutated_bytes(dice, data)
+    place = dice.randrange(len(frames))
+    payloads = [frame.payload for frame in frames]
+    payloads[place] = mutated_bytes(dice, payloads[place])
+    return b"".join(
+        encode_frame(frame.type, payload, frame.session, frame.flags) for frame, payload in zip(frames, payloads)
+    )
 
 
 def _blocks(data: bytes) -> list[tuple[int, bytes]]:

@@ -12,48 +12,104 @@ import tempfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pans.firmware_sim.scene.scene_file import open_scene
 from pans.firmware_sim.testing import small_automaton_bundle, small_setup
-from pans.runtime.bundle.model import Bundle, load_bundle, write_bundle
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_bundle, write_bundle
+from pans.runtime.bundle.optics import Analyser
 from pans.runtime.core.plan import build_plan
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.flow.settings import flow_limits, read_flow
+from pans.runtime.flow.settings import FlowSettings, flow_limits, read_flow
 from pans.runtime.instrument.calibration import load_calibration, now_utc, save_calibration
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import read_recording, replay
-from pans.runtime.record.format import Kind
-from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.record.sent_plan import never_armed, recorded_plan
 from pans.runtime.report.file_facts import file_facts
 
 RUN_EVERY = 20  # accepted bundles: one in that many, told by its bytes, is run through the whole loop
 RUN_PROFILES = ("ideal", "oled-qcmos", "dmd-spad")  # the last follows automata of 1-bit patterns
 DECISIONS = 3
+FLOW_SIDE, FLOW_FIELDS_PER_S, FLOW_S = 16, 20_000.0, 0.01
 
 
-def record_run(folder: Path, bundle: Path | None = None, profile: str = "ideal") -> Path:
-    """Return the recording of a small run in virtual time, written in `folder`."""
-    from pans.runtime.commands.carry_out import run_job
-    from pans.runtime.commands.job import Job
-
+def record_run(folder: Path, bundle: Path | None = None, profile: str = "ideal", more: str = "") -> Path:
+    """Return the recording of a small run in virtual time, written in `folder`; `more` stands behind the device's URL."""
     if bundle is None:
         bundle = folder / "small.pans"
         write_bundle(small_setup()[1], bundle)
+    return _record(folder, bundle, profile, f"scene=uniform{more}", decisions=DECISIONS)
+
+
+def record_passive(folder: Path) -> Path:
+    """Return the recording of a small run behind passive optics, written in `folder`."""
+    write_bundle(passive_bundle(), folder / "passive.pans")
+    return record_run(folder, folder / "passive.pans", more=f"&optics={folder / 'passive.pans'}")
+
+
+def record_flow(folder: Path) -> Path:
+    """Return the recording of a small run of cells in flow, written in `folder`: bright bars, one pattern for each third of the field."""
+    images = np.zeros((3, FLOW_SIDE, FLOW_SIDE), np.uint8)
+    levels = np.zeros((3, FLOW_SIDE, FLOW_SIDE), np.uint16)
+    for third in range(3):
+        rows = slice(FLOW_SIDE // 3 * third, FLOW_SIDE // 3 * (third + 1))
+        images[third, rows, 4:12], levels[third, rows, 4:12] = 220, 16
+    levels[0, 0, 0] = 255
+    np.savez(
+        folder / "cells.npz", images=images, labels=np.arange(3, dtype=np.int16), classes=np.array(["a", "b", "c"])
+    )
+    scene = f'kind = "cells"\nimages = "cells.npz"\nrate_hz = 2000.0\nvelocity_fields_per_s = {FLOW_FIELDS_PER_S}\noffset_px = 0\n'
+    (folder / "cells.toml").write_text(scene)
+    words = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    bundle = make_bundle(
+        name="thirds",
+        task="small",
+        classes=("a", "b", "c"),
+        image_shape=(FLOW_SIDE, FLOW_SIDE),
+        optics=Shown(256, levels.reshape(3, -1), 4.0 / 255),  # 2 us at the profile's light
+        back_end=BackEnd(table=4.0 * words),
+        provenance={},
+    )
+    write_bundle(bundle, folder / "thirds.pans")
+    flow = FlowSettings("cells", fields_per_s=FLOW_FIELDS_PER_S, onset_frames=4)
+    device = f"scene={folder / 'cells.toml'}"
+    return _record(folder, folder / "thirds.pans", "flow-snspd", device, flow=flow, seconds=FLOW_S)
+
+
+def passive_bundle() -> Bundle:
+    """Return a bundle of small passive optics with a table."""
+    rng = np.random.default_rng(1)
+    optics = Analyser("coherent", rng.normal(size=(3, 4)).astype(np.complex64), "field", "none", 10.0, 100.0)
+    return make_bundle(
+        name="passive",
+        task="small",
+        classes=("a", "b"),
+        image_shape=(2, 2),
+        optics=optics,
+        back_end=BackEnd(table=rng.normal(size=(8, 2))),
+        provenance={"seed": 1, "losses": [0.5, 0.25]},
+    )
+
+
+def _record(folder: Path, bundle: Path, profile: str, device: str, **more: Any) -> Path:
+    from pans.runtime.commands.carry_out import run_job
+    from pans.runtime.commands.job import Job
+
     loaded = load_profile(profile)
     job = Job(
         bundle_path=bundle,
-        device=f"sim:{profile}?scene=uniform&seed=1&pace=fast",
+        device=f"sim:{profile}?{device}&seed=1&pace=fast",
         profile=loaded,
         deadline_us=loaded.timing.decision_deadline_us,
         act_profile=loaded,
         record=folder / "run.pansrec",
-        decisions=DECISIONS,
         realtime=False,
         command="pans fuzz",
         shows=False,
+        **more,
     )
     run_job(job)
     return folder / "run.pansrec"
@@ -120,8 +176,9 @@ def _plannable(profile: Profile, bundle: Bundle) -> bool:
 
 def _use_recording(path: Path) -> None:
     recording = read_recording(path)
-    if recording.bundle_place and {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys():
-        recorded_plan(recording)
+    if recording.bundle_place:
+        if not never_armed(recording):
+            recorded_plan(recording)
         replay(recording, recording.bundle())
 
 

@@ -14,8 +14,10 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -43,6 +45,7 @@ from pans.runtime.wire.framing import FrameDecoder, encode_frame
 from pans.runtime.wire.messages import NO_OBJECT, DeviceState, MalformedMessage, MessageType
 
 OBJECTS = 12
+SESSIONS_AT_ONCE = 10  # that one process is given
 SHOTS = 1
 MAX_GROWTH_MIB = 300  # of the process, during any number of sessions: below 400 with the 100 that it starts with
 MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
@@ -302,6 +305,21 @@ def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str]
             session = stages[mode].run(Path(folder), number, *mutations)
             ended[_ending(session)] += 1
             wrong += [f"seed {number}, {mode}: {'; '.join(map(str, mutations))}: {what}" for what in session.wrong]
+    return ended, wrong
+
+
+def sessions_beside(seed: int, count: int, over: str, jobs: int) -> tuple[Counter[str], list[str]]:
+    """As `sessions`, in `jobs` processes: over a socket most of a session is waiting."""
+    if jobs == 1:
+        return sessions(seed, count, over)
+    firsts = range(seed, seed + count, SESSIONS_AT_ONCE)
+    counts = [min(SESSIONS_AT_ONCE, seed + count - first) for first in firsts]
+    ended: Counter[str] = Counter()
+    wrong: list[str] = []
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for some, found in pool.map(sessions, firsts, counts, [over] * len(counts)):
+            ended += some
+            wrong += found
     return ended, wrong
 
 

@@ -11,10 +11,11 @@ import argparse
 import math
 import shlex
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, say
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import check_outputs
@@ -64,7 +65,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     exposure_us = calibration_exposure_us(profile)
     model, guess = count_model(profile, exposure_us), profile_level(profile, exposure_us)
     first = design_run(profile, LADDER, guess, FIRST_STAGE_SHARE * args.seconds, args.seed)
-    core, _ = _measure(args.device, profile, first)
+    core, _, doubts = _measure(args.device, profile, first)
     with as_usage_error():
         found = fit_light(joined_counts(counts_of(core, first, profile)), model).level
     if found.value <= 0 or not math.isfinite(found.value):
@@ -73,9 +74,11 @@ def _calibrate(args: argparse.Namespace) -> int:
             remedy="check the light path: a clear field must stand before the detector, neither dark nor blinding",
         )
     second = design_run(profile, TELLING, found.value, (1 - FIRST_STAGE_SHARE) * args.seconds, args.seed + 1)
-    core, facts = _measure(args.device, profile, second)
+    core, facts, more = _measure(args.device, profile, second)
+    doubts += more
     with as_usage_error():
         values = calibration_values(counts_of(core, second, profile), model, second, profile)
+    values |= {"contradictions": dict(doubts)} if doubts else {}
     values |= {"command": shlex.join(["pans", *sys.argv[1:]]), "seed": args.seed, "device": facts}
     sha256 = save_calibration(args.out, values, force=args.force)
     payload = {
@@ -84,6 +87,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         **{key: value for key, value in values.items() if key != "channels"},
     }
     emit(args, payload, _words(args.out, values))
+    if doubts:
+        return EXIT_TIMING
     off = abs(values["efficiency"]["relative_to_profile"] - 1.0) > PEAK_OFF
     return EXIT_ALERT if off else EXIT_FINE
 
@@ -93,11 +98,12 @@ def _check(args: argparse.Namespace) -> None:
     check_outputs([args.out], inputs=[args.profile, *files_of_url(args.device)], force=args.force)
 
 
-def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any]]:
-    """Run one design through the ordinary session; return the core with its sums, and the device's facts."""
+def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any], Counter[str]]:
+    """Run one design through the ordinary session; return the core with its sums, the device's facts and what contradicts the evidence."""
     from pans.runtime.core.calibration import CalibrationCore
     from pans.runtime.link.base import open_link
     from pans.runtime.live import RunConfig, run_live
+    from pans.runtime.report.summary import contradictions_of
 
     core = CalibrationCore(design.plan, design.n_cycles)
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
@@ -107,7 +113,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     if result.ended != "completed":
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
     keep = ("serial", "firmware", "name", "simulated")
-    return core, {key: result.device[key] for key in keep if key in result.device}
+    facts = {key: result.device[key] for key in keep if key in result.device}
+    return core, facts, Counter(contradictions_of(result))
 
 
 def _words(path: Path, values: dict[str, Any]) -> str:
@@ -125,6 +132,9 @@ def _words(path: Path, values: dict[str, Any]) -> str:
         f"  dark            {dark:.3g} per exposure, 95 % {dark_ci[0]:.3g} to {dark_ci[1]:.3g}",
         f"  non-uniformity  {spread['relative']:.2%} ({found}, p = {spread['p_value']:.2g})",
     ]
+    if doubts := values.get("contradictions"):
+        kinds = ", ".join(f"{what} {count}" for what, count in sorted(doubts.items()))
+        lines.append(f"  FAULT           {sum(doubts.values())} messages contradict the evidence: {kinds}")
     return "\n".join(lines)
 
 

@@ -154,11 +154,13 @@ def find_objections(calibration: Calibration, profile: Profile, serial: str | No
 
 
 def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
-    """Return a sentence for each reason to distrust: none given, or stale."""
+    """Return a sentence for the first reason to distrust: none given, contradictory, or stale."""
     if calibration is None:
         return [
             "no calibration: the light and the dark rates are the profile's, not this instrument's (pans calibrate)"
         ]
+    if calibration.values.get("contradictions"):
+        return ["the calibration is of an instrument whose messages contradicted each other: calibrate again"]
     age = calibration.age_h(now)
     if age > max_age_h:
         return [f"the calibration is {age:.1f} h old, allowed are {max_age_h:g} h: calibrate again"]

@@ -66,8 +66,10 @@ def run_live(
     """
     started_ns = config.started_ns or time.perf_counter_ns()
 
+    failed: list[Connection] = []
+
     def prepare(opened: Link) -> Connection:
-        return open_session(opened, recorder, plan, bundle, profile.clock.tick_hz)
+        return open_session(opened, recorder, plan, bundle, profile.clock.tick_hz, failed)
 
     try:
         connection = prepare(link)
@@ -75,6 +77,7 @@ def run_live(
         link.close()
         raise
     run = LiveRun(connection, plan, core, len(bundle.classes), config, recorder, started_ns)
+    run.failed = failed
     try:
         core.warm_up()
         reader = connection.reader.thread_id
@@ -101,8 +104,10 @@ def run_live(
         run.connection.close()
 
 
-def open_session(link: Link, recorder: AnyRecorder | None, plan: Plan, bundle: Bundle, tick_hz: int) -> Connection:
-    """Open a session, check that it is the right device, and bring it to where ARM can follow."""
+def open_session(
+    link: Link, recorder: AnyRecorder | None, plan: Plan, bundle: Bundle, tick_hz: int, failed: list[Connection]
+) -> Connection:
+    """Open a session, check that it is the right device, and bring it to where ARM can follow; one that breaks goes to `failed`."""
     connection = Connection(link) if recorder is None else Connection(link, recorder.add_command, recorder.add_answer)
     try:
         facts = connection.handshake().facts
@@ -112,6 +117,7 @@ def open_session(link: Link, recorder: AnyRecorder | None, plan: Plan, bundle: B
         connection.decoder.use_kernels()
     except BaseException:
         connection.detach()
+        failed.append(connection)
         raise
     return connection
 

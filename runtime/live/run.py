@@ -124,6 +124,7 @@ class LiveRun:
         self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
         self.armed_after_s = 0.0
         self.start_ns = self.last_data_ns = 0
+        self.failed: list[Connection] = []  # those that broke before they could be armed
         self._counted: Connection | None = None
         self._taken_here = 0  # messages of the present connection that the core was given, or came before ARM
         self._recorder = recorder
@@ -392,15 +393,19 @@ class LiveRun:
         self._lease_due_ns = now_ns + self.config.lease_ms * NS_PER_MS // 4
 
     def count_decoded(self) -> None:
-        """Add up what the present connection's decoder has counted, once: before it goes, or at the end."""
+        """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""
+        while self.failed:
+            self._add_counters(self.failed.pop())
         if self._counted is not self.connection:
             self._counted = self.connection
-            counters = self.connection.decoder.counters
-            self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
-            session = self.connection.session.counters
-            self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
-            self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
-            self._reconcile(counters.frames)
+            self._add_counters(self.connection)
+            self._reconcile(self.connection.decoder.counters.frames)
+
+    def _add_counters(self, connection: Connection) -> None:
+        counters, session = connection.decoder.counters, connection.session.counters
+        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+        self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
+        self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
 
     def _reconcile(self, frames: int) -> None:
         """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""

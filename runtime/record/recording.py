@@ -110,7 +110,9 @@ class Recording:
         """Yield the events, in order."""
         for block in self.iter_blocks(Kind.EVENTS):
             for line in block.payload.splitlines():
-                yield parse_json_object(line, f"{self.path}: an event in block {block.index}")
+                yield _checked_event(
+                    parse_json_object(line, where := f"{self.path}: an event in block {block.index}"), where
+                )
 
     def bundle_data(self) -> bytes:
         """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
@@ -166,6 +168,16 @@ def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
         size = len(block.payload)
         raise DamagedFileError(f"{path}: block {block.index} has {size} bytes, allowed: a multiple of {dtype.itemsize}")
     return block.payload
+
+
+def _checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return an event that says of what kind it is; a decision that it names is a number."""
+    decision = event.get("decision", 0)
+    if not isinstance(event.get("kind"), str):
+        raise DamagedFileError(f"{where} does not say of what kind it is")
+    if not isinstance(decision, int) or not 0 <= decision < 1 << 63:
+        raise DamagedFileError(f"{where} names the decision {ascii(decision)[:40]}, allowed: its number")
+    return event
 
 
 def _start(file: Any, where: str) -> tuple[int, int]:

@@ -29,7 +29,6 @@ from pans.runtime.ranges import Range
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
-from .format import Kind
 from .log import LogEncoder
 from .parts import place_of
 from .pictures import PictureLog
@@ -152,11 +151,11 @@ def _rebuilt(
 def replay_faults(recording: Recording, bundle: Bundle) -> list[str]:
     """Return why `recording` could not be replayed with `bundle`, [] if it can; nothing is decided.
 
-    Nothing is said of a recording that holds no commands or no messages: it does not claim that it can be.
+    A recording of a run that never armed the device holds nothing to decide: its replay has no decisions, as it has.
     """
-    if not {Kind.MESSAGES, Kind.COMMANDS} <= recording.kinds.keys() or never_armed(recording):
-        return []
     try:
+        if never_armed(recording):
+            return []
         _, _, sent = _rebuilt(recording, bundle, None)
         place = place_of(recording)
         if place is not None:

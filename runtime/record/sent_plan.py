@@ -33,15 +33,18 @@ TICK_HZ = Range(1000, 10_000_000_000, whole=True)
 
 
 def never_armed(recording: Recording) -> bool:
-    """Whether the run ended before it armed the device, so that there was nothing to decide."""
+    """Whether the run ended before it armed the device, so that there was nothing to decide; DamagedFileError for what is no command."""
     if recording.n_decisions:
         return False
     decoder = FrameDecoder()
-    return not any(
-        frame.type == MessageType.COMMAND and decode_command(frame.payload).opcode == Opcode.ARM
-        for _, data in recording.commands()
-        for frame in decoder.feed(data)
-    )
+    try:
+        return not any(
+            frame.type == MessageType.COMMAND and decode_command(frame.payload).opcode == Opcode.ARM
+            for _, data in recording.commands()
+            for frame in decoder.feed(data)
+        )
+    except MalformedMessage as error:
+        raise DamagedFileError(f"{recording.path}: a command cannot be read: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,6 +70,7 @@ class HostSession:
         self._output: list[bytes] = []
         self._hello_due_ns: int | None = None
         self._hello_started_ns = 0
+        self._welcome_fault = ""  # of the latest one that could not be read
         self.next_id = 1  # of the next command
         self._waiting: deque[tuple[int, bytes]] = deque()  # not sent yet
         self._unacknowledged: deque[tuple[int, bytes]] = deque()
@@ -157,6 +158,11 @@ class HostSession:
         """Send what is due: HELLO, queued commands, retransmissions; LinkError when the device has been silent too long."""
         if self._hello_due_ns is not None and now_ns >= self._hello_due_ns:
             if now_ns - self._hello_started_ns > HELLO_GIVE_UP_NS:
+                if self._welcome_fault:
+                    raise DeviceError(
+                        f"the device's WELCOME cannot be read: {self._welcome_fault}",
+                        remedy="see docs/reference/protocol.md, section 3",
+                    )
                 raise LinkError(
                     f"no WELCOME within {HELLO_GIVE_UP_NS // NS_PER_MS} ms",
                     remedy="check that the device runs firmware of protocol 1 and that the port is the right one",
@@ -198,8 +204,10 @@ class HostSession:
             return True
         try:
             self._digest(frame, now_ns)
-        except wire.MalformedMessage:
+        except wire.MalformedMessage as error:
             self.counters.malformed += 1
+            if frame.type == MessageType.WELCOME:
+                self._welcome_fault = str(error)
             return False
         return frame.type == MessageType.STATUS
 

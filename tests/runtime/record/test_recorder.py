@@ -301,7 +301,7 @@ def test_buffers_are_written_when_full_and_lose_nothing(tmp_path: Path) -> None:
             recorder.add_message(host_ns, memoryview(data))
         for index in range(10_000):
             recorder.add_decision(decision(index))
-            recorder.add_event({"index": index})
+            recorder.add_event({"kind": "x", "index": index})
         recorder.close({})
     found = read_recording(path)
     assert list(found.messages()) == messages

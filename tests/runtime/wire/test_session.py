@@ -52,6 +52,17 @@ def test_hello_repeats_until_welcome_and_then_stops() -> None:
     assert sent(session) == []
 
 
+def test_a_welcome_that_cannot_be_read_is_named_when_no_other_comes() -> None:
+    session, broken = HostSession(NONCE), wire.encode_welcome({"tick_hz": 1}, NONCE)
+    (frame,) = FrameDecoder().feed(broken)
+    twice = b"\x82" + 2 * b"\xa7tick_hz\x01"  # the key stands twice
+    session.start(0)
+    session.on_frame(frame._replace(payload=frame.payload[:8] + twice), 0)
+    session.poll(4900 * MS)  # the next one may be right
+    with pytest.raises(DeviceError, match=r"WELCOME cannot be read: .*a key stands twice"):
+        session.poll(5200 * MS)
+
+
 def test_a_silent_device_ends_the_handshake_loudly() -> None:
     session = HostSession(NONCE)
     session.start(0)
