@@ -185,11 +185,14 @@ def place_new(beside: str | Path, target: str | Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make `folder` and those above it where they are missing; UsageError if that fails."""
+    """Make `folder` and those above it where they are missing, so that they survive a power cut; UsageError if that fails."""
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: the folder cannot be made: {error.strerror or error}") from error
+    for one in reversed(made):
+        sync_folder(one.parent)
 
 
 def _sync(path: Path) -> None:

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 from .errors import UsageError
-from .outputs import make_folder
+from .outputs import make_folder, sync_folder
 
 RUNS = Path("pans-runs")
 LATEST = "latest"
@@ -33,6 +33,7 @@ def new_run_folder(name: str, root: Path = RUNS) -> Path:
     while True:
         try:
             folder.mkdir()
+            sync_folder(root)
             break
         except FileExistsError:
             number += 1

@@ -1,7 +1,8 @@
 """A storage that fails at the n-th call, is full, tears a write or ends the process: no earlier file is lost, what is left is readable.
 
-The commands that write are run on a storage with faults (storage.py). The short form draws calls at random, from a seed that is printed;
-the long form (`-m slow`) takes every call of every command, with every fault.
+The commands that write are run on a storage with faults (storage.py), and on one that loses what was not synced (power_cut.py). The
+short form draws calls at random, from a seed that is printed; the long form (`-m slow`) takes every call of every command, with every
+fault.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from power_cut import Files, disk_of, states
 from storage import Ended, Fault, FaultyStorage, compiler
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
+from pans.runtime.commands.run_files import STATE_FORMAT, is_state_file
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.instrument.calibration import load_calibration
 from pans.runtime.record import read_recording
+from pans.runtime.record.part_index import read_index
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command
 
@@ -46,11 +50,15 @@ class Case:
     words: str
     leaves: tuple[str, ...]
     needs: str = ""
+    may: tuple[str, ...] = ()  # files that it may have rewritten: a run does not end because nobody can watch it
 
 
 RUN = f"run b.pans --device {DEVICE} --decisions 40 --no-realtime --trace TRACE"
 CASES = {
     "run": Case(f"{RUN} --out out/new", ("out/new/run.pansrec", "out/new/summary.md")),
+    "run --state": Case(
+        f"{RUN} --out out/new --state state.json", ("out/new/run.pansrec", "out/new/summary.md"), may=("state.json",)
+    ),
     "run in parts": Case(
         f"{RUN} --decisions 150 --rotate-mb 0.05 --out out", ("out/run-0001.pansrec", "out/run.parts.json")
     ),
@@ -91,6 +99,13 @@ class Bench:
         shutil.copytree(self.inputs, self.folder)
         return contents(self.folder)
 
+    def cut(self, case: Case) -> tuple[Ended, list[tuple[str, Files]]]:
+        """Run a command and return how it ended, and what a power cut leaves at any moment."""
+        disk, journal = disk_of(self.folder), self.trace.with_name("journal")
+        words = case.words.replace("TRACE", str(self.trace)).split()
+        ended = self.storage.noted(words, self.folder, journal)
+        return ended, states(disk, journal)
+
     def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0) -> Ended:
         words = case.words.replace("TRACE", str(self.trace)).split()
         return self.storage.run(words, self.folder, at, fault, error)
@@ -104,6 +119,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     for name, data in PRECIOUS.items():
         (inputs / name).write_bytes(data)
     shutil.copy(SHIPPED / "fashion10.pans", inputs / "b.pans")
+    (inputs / "state.json").write_text(f'{{"format":"{STATE_FORMAT}"}}')
     np.save(inputs / "p.npy", np.ones((2, 4)))
     np.save(inputs / "t.npy", np.zeros((4, 2)))
     rng = np.random.default_rng(0)
@@ -138,7 +154,7 @@ def judge(bench: Bench, case: Case, before: dict[str, bytes], ended: Ended, faul
     assert "Traceback" not in ended.said, ended.said
     for name, data in before.items():
         assert name in after, f"{name} is gone"
-        assert after[name] == data or name in case.leaves, f"{name} was changed"
+        assert after[name] == data or name in (*case.leaves, *case.may), f"{name} was changed"
     new = {name for name, data in after.items() if before.get(name) != data}
     hidden = {name for name in new if Path(name).name.startswith(".")}
     if ended.code in (0, 1):
@@ -160,6 +176,10 @@ def check_readable(path: Path, *, whole: bool) -> None:
         load_bundle(path)
     elif path.suffix == ".json" and path.name in ("c.json", "old.json"):
         load_calibration(path)
+    elif path.name == "state.json":
+        assert is_state_file(path)
+    elif path.name == "run.parts.json":
+        read_index(path)
     elif path.suffix == ".pansrec":
         verdict = verify_file(path)
         assert not verdict.damaged, verdict.violations
@@ -224,3 +244,58 @@ def test_a_call_of_every_command(name: str, bench: Bench) -> None:
 def test_every_call_of_every_command(name: str, bench: Bench) -> None:
     runs = tried(bench, name, None)
     print(f"{name}: {runs} runs")
+
+
+# ---- a power cut: what was not synced is lost ----
+
+CUT = [name for name in CASES if name not in ("export hdf5", "train")]  # which write without `write`
+DRAWN_CUTS = 4  # of each command, in the short form, and its end
+
+
+def lay_out(folder: Path, files: Files) -> None:
+    """Make `folder` hold `files` and nothing else."""
+    shutil.rmtree(folder)
+    for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+
+
+def judge_cut(bench: Bench, case: Case, before: Files, left: Files) -> None:
+    """Hold what a power cut left against what must be: nothing earlier is lost, whatever has a name can be read."""
+    for name, data in before.items():
+        assert left.get(name) == data or (name in (*case.leaves, *case.may) and left.get(name)), f"{name} is lost"
+    new = {name for name, data in left.items() if before.get(name) != data and not Path(name).name.startswith(".")}
+    lay_out(bench.folder, left)
+    for name in new:
+        assert left[name].strip(b"\0"), f"{name} is there without its content"
+        check_readable(bench.folder / name, whole=False)
+
+
+def cut_power(bench: Bench, name: str, drawn: int | None) -> int:
+    """Cut the power at every call of a command, or at `drawn` of them and at its end; return how many states were judged."""
+    case, chosen = CASES[name], random.Random(f"{SEED} cut {name}")
+    before = bench.fresh()
+    ended, cuts = bench.cut(case)
+    assert ended.code in (0, 1), ended
+    after = contents(bench.folder)
+    tried = cuts if drawn is None else chosen.sample(cuts[:-1], min(drawn, len(cuts) - 1))
+    for words, left in tried:
+        try:
+            judge_cut(bench, case, before, left)
+        except (AssertionError, pytest.fail.Exception) as wrong:
+            raise AssertionError(f"{name}: {words}, PANS_SEED={SEED}: {wrong}") from wrong
+    _, last = cuts[-1]
+    for one in case.leaves:
+        assert last.get(one) == after[one], f"{name}: {one} is lost at a power cut after the command has ended"
+    return len(tried)
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_a_power_cut_during_every_command(name: str, bench: Bench) -> None:
+    assert cut_power(bench, name, DRAWN_CUTS) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CUT)
+def test_a_power_cut_at_every_call_of_every_command(name: str, bench: Bench) -> None:
+    print(f"{name}: {cut_power(bench, name, None)} states")

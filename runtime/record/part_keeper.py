@@ -96,7 +96,7 @@ class PartKeeper:
         self.index_trouble = ""  # why the index is not the latest
         self._unmade = 0  # the part that could not be made, and is tried again
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._clear(overwrite)
+        self._replaced = self._claim(overwrite)
         self._thread = threading.Thread(target=self._keep, name="pans-keeper", daemon=True)
 
     def start(self) -> Recorder:
@@ -228,15 +228,33 @@ class PartKeeper:
             self.index_trouble = error.message
             raise
 
-    def _clear(self, overwrite: bool) -> None:
+    @property
+    def replaces(self) -> bool:
+        """Whether there are parts of another run, which go when this one has something to write."""
+        return bool(self._replaced)
+
+    def clear(self) -> None:
+        """Remove the parts of the run before; UsageError if that cannot be."""
+        while self._replaced:
+            _remove(self._replaced[-1])  # the index first: it sorts behind the parts
+            self._replaced.pop()
+
+    def _claim(self, overwrite: bool) -> list[Path]:
+        """Return the files that this run will replace; what was only made ahead goes at once."""
         there = files_of_parts(self._path)
         if there and not overwrite:
             raise refuse_existing(there[0])
-        try:
-            for old in there:
-                old.unlink(missing_ok=True)
-        except OSError as error:
-            raise UsageError(f"{there[0]}: cannot be replaced: {error.strerror or error}") from error
+        ahead = [old for old in there if old.name.startswith(".")]
+        for old in ahead:
+            _remove(old)
+        return [old for old in there if old not in ahead]
+
+
+def _remove(old: Path) -> None:
+    try:
+        old.unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"{old}: cannot be replaced: {error.strerror or error}") from error
 
 
 def files_of_parts(first: Path) -> list[Path]:

@@ -50,7 +50,10 @@ class PartedRecorder:
         bundle: bytes = b"",
         overwrite: bool = False,
     ) -> None:
-        """Begin part 1 beside `path` (see `part_path`); UsageError if parts are there already, unless `overwrite`: then they go."""
+        """Begin part 1 beside `path` (see `part_path`); UsageError if parts are there already.
+
+        With `overwrite` they go when there are messages, decisions or an end to write.
+        """
         self.path, self.limits = Path(path), limits
         self.watch_write: Callable[[int, int], None] | None = None
         self.parts = 0
@@ -59,7 +62,11 @@ class PartedRecorder:
         self.open_part = self.keeper.start()
         try:
             self._begin({"decisions": 0}, ())
-            self.keeper.name(self.open_part, 1)
+            self.open_part.sync()  # a part with a name says where it begins; later ones cannot be waited for (`parts.part_of`)
+            if self.keeper.replaces:
+                self.open_part.before_first = self._take_place
+            else:
+                self.keeper.name(self.open_part, 1)
         except PansError:
             with suppress(OSError, PansError):
                 self.__exit__(None, None, None)
@@ -74,6 +81,9 @@ class PartedRecorder:
             self.open_part.__exit__(*error)
         finally:
             self.keeper.close()
+            if self.open_part.before_first is not None:
+                with suppress(OSError):
+                    self.open_part.path.unlink(missing_ok=True)
 
     # -- the Recorder's calls ------------------------------------------------------------------------------------------
 
@@ -147,6 +157,7 @@ class PartedRecorder:
     def next_part(self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int) -> None:
         """Go on in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
         full = self.open_part
+        full.begin()
         full.flush()
         made = self.keeper.ready.get_nowait()
         facts = self._facts(full, full.written[1])
@@ -156,6 +167,10 @@ class PartedRecorder:
         self.keeper.name(made, self.parts)
         full.watch_write = None  # from here on it is written by the keeper, which delays nobody
         self.keeper.finish(full, facts, self.open_path)
+
+    def _take_place(self) -> None:
+        self.keeper.clear()
+        self.keeper.name(self.open_part, 1)
 
     def _begin(
         self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int = 0, before: PartFacts | None = None

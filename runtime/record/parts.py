@@ -14,6 +14,7 @@ from typing import Any
 
 from pans.runtime.errors import DamagedFileError, UsageError
 
+from .format import Kind
 from .part_keeper import INDEX_SUFFIX, chained
 from .parted_recorder import PART_EVENT
 from .recording import Recording
@@ -24,11 +25,14 @@ NUMBER_DIGITS_MAX = 10  # the index of a block is a u32, and a part has several
 def part_of(recording: Recording) -> Mapping[str, Any] | None:
     """Return how this part begins (number, first decision, what was before, place of the core), None for a recording that is whole.
 
+    None too for a part that a power cut left with its name and header alone: it holds nothing that could begin anywhere.
     DamagedFileError if it says that it is a part and does not say where it begins.
     """
     if "part" not in recording.header:
         return None
     event = next(recording.events(), None)
+    if event is None and not recording.complete and not {Kind.MESSAGES, Kind.DECISIONS} & recording.kinds.keys():
+        return None
     if event is None or event.get("kind") != PART_EVENT or not isinstance(event.get("place"), dict):
         raise DamagedFileError(f"{recording.path}: a part of a run that does not say where it begins")
     return event

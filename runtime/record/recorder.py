@@ -31,6 +31,7 @@ from .log import BLOCK_ROWS, LogEncoder
 
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
+_FIRST_KINDS = (Kind.MESSAGES, Kind.DECISIONS, Kind.END)  # with them a run has begun
 _COPIED_BYTES = MIB // 4  # of a block that is put together before it is written, in one call
 
 
@@ -45,11 +46,16 @@ class Recorder:
     ) -> None:
         """Create `path` (UsageError if it exists, unless `overwrite`) and write header and bundle to it.
 
-        The file is there with both or not at all.
+        The file is there with both or not at all. One that is replaced stays until there are messages, decisions or an end to write: a
+        device that refuses before that costs nobody a recording.
         `header` is JSON-able; `format_version`, `created_utc` and `bundle_sha256` are added where they are missing.
         """
         self.path = Path(path)
         self.watch_write: Callable[[int, int], None] | None = None  # told when a write began and ended, perf_counter_ns
+        self.before_first: Callable[[], None] | None = (
+            None  # called once, before messages, decisions or END are written
+        )
+        self._unplaced: Path | None = None  # where the file is until then, if it is to replace another one
         self._messages = ByteBuffer(Kind.MESSAGES, _MESSAGE_BUFFER_BYTES)
         self._commands = ByteBuffer(Kind.COMMANDS, _MESSAGE_BUFFER_BYTES)
         self._answers = ByteBuffer(Kind.ANSWERS, _EVENT_BUFFER_BYTES)
@@ -81,7 +87,10 @@ class Recorder:
             if bundle:
                 self._write_block(Kind.BUNDLE, bundle)
             self.sync()
-            _place(beside, self.path, overwrite)
+            if overwrite and os.path.lexists(self.path):
+                self.before_first, self._unplaced = self._take_place, beside
+                return
+            _place(beside, self.path, overwrite=False)
         except BaseException:
             self._file.close()
             with suppress(OSError):
@@ -94,7 +103,7 @@ class Recorder:
 
     def __exit__(self, *error: Any) -> None:
         if self._file.closed:
-            return
+            return self._drop_unplaced()
         try:
             self.flush()
         except PansError:
@@ -102,6 +111,7 @@ class Recorder:
                 raise
         finally:
             self._file.close()
+            self._drop_unplaced()
 
     @property
     def size_bytes(self) -> int:
@@ -206,6 +216,27 @@ class Recorder:
         self._file.close()
         return digest
 
+    def begin(self) -> None:
+        """Take the place of what is replaced, if that has not been done; RecordingError if it cannot be."""
+        taking, self.before_first = self.before_first, None
+        try:
+            if taking is not None:
+                taking()
+        except PansError as error:
+            self._file.close()
+            raise RecordingError(error.message, remedy=error.remedy) from error
+
+    def _take_place(self) -> None:
+        assert self._unplaced is not None
+        _place(self._unplaced, self.path, overwrite=True)
+        self._unplaced = None
+        sync_folder(self.path.parent)
+
+    def _drop_unplaced(self) -> None:
+        if self._unplaced is not None:
+            with suppress(OSError):
+                self._unplaced.unlink(missing_ok=True)
+
     def _add_bytes(self, buffer: ByteBuffer, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         if len(data) > MESSAGE_MAX_BYTES:
             raise UsageError(f"a message of {len(data)} bytes, allowed at most {MESSAGE_MAX_BYTES}")
@@ -243,6 +274,8 @@ class Recorder:
 
     def _framed(self, kind: Kind, payload: bytes | memoryview) -> tuple[bytes, bytes | memoryview, bytes]:
         """Return what stands before a payload, the payload, and what stands behind it: the next block."""
+        if self.before_first is not None and kind in _FIRST_KINDS:
+            self.begin()
         if len(payload) > LIMITS[kind]:
             raise UsageError(f"a {kind.name} block of {len(payload)} bytes, allowed at most {LIMITS[kind]}")
         head, tail, self._chain = block_ends(kind, self._n_blocks, self._chain, payload)

@@ -121,7 +121,9 @@ class StateFile:
 
     def _write(self) -> None:
         try:
-            self._beside.write_bytes(canonical_json(self._look() | self._left) + b"\n")
+            with open(self._beside, "wb", buffering=0) as file:
+                file.write(canonical_json(self._look() | self._left) + b"\n")
+                os.fsync(file.fileno())  # or a power cut leaves an empty file in place of the latest state
             os.replace(self._beside, self.path)
         except OSError as error:  # a run does not end because nobody can watch it
             self.trouble = str(error)

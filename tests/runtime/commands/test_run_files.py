@@ -10,7 +10,7 @@ import pytest
 from commands import json_of
 
 from pans.runtime import SHIPPED
-from pans.runtime.cli import main
+from pans.runtime.cli import EXIT_DEVICE, main
 from pans.runtime.record import read_recording
 from pans.runtime.run_folder import locked
 
@@ -119,3 +119,20 @@ def test_a_state_file_of_ours_is_rewritten(folder: Path, capsys: pytest.CaptureF
     for _ in range(2):
         json_of(capsys, *words("--state", "state.json"))
     assert b'"pans-state 1"' in Path("state.json").read_bytes()
+
+
+@pytest.mark.parametrize("parts", [(), ("--rotate-mb", "0.3")], ids=["one file", "parts"])
+def test_a_device_that_refuses_costs_no_recording(
+    parts: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    json_of(capsys, *words("--out", "a", *parts))
+    before = contents(Path("a"))
+    other = "sim:ideal?pace=fast&scene=fashion200"  # counts other ticks than the profile says
+    refused = ["run", "self.pans", "--device", other, "--profile", "oled-qcmos", "--decisions", "5"]
+    assert main([*refused, "--out", "a", "--force", *parts]) == EXIT_DEVICE
+    assert "the device" in capsys.readouterr().err
+    assert contents(Path("a")) == before
+    json_of(capsys, *words("--out", "a", "--force", "--shots", "2", *parts))
+    after = contents(Path("a"))
+    assert before.keys() == after.keys()
+    assert all(before[name] != after[name] for name in before)
