@@ -43,6 +43,7 @@ class _Disk:
     names: dict[str, _File] = field(default_factory=dict)
     durable: dict[str, _File] = field(default_factory=dict)
     folders: set[str] = field(default_factory=set)  # those that are durable
+    made: set[str] = field(default_factory=set)  # folders that may not be
     numbers: dict[int, _File] = field(default_factory=dict)
 
     def take(self, entry: Entry) -> None:
@@ -60,15 +61,15 @@ class _Disk:
             self.names[entry.to] = self.names[path] if what == "L" else self.names.pop(path)
         elif what == "U":
             self.names.pop(path, None)
+        elif what == "M":
+            self.made.add(path)
         elif what == "D":
             self._sync_names(path)
 
     def _sync_names(self, folder: str) -> None:
         self.durable = {path: file for path, file in self.durable.items() if str(Path(path).parent) != folder}
         self.durable |= {path: file for path, file in self.names.items() if str(Path(path).parent) == folder}
-        self.folders |= {
-            str(parent) for path in self.names for parent in Path(path).parents if str(parent.parent) == folder
-        }
+        self.folders |= {made for made in self.made if str(Path(made).parent) == folder}
 
     def strict(self) -> Files:
         kept = {path: file.synced for path, file in self.durable.items() if self._is_reachable(path)}

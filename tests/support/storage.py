@@ -52,7 +52,11 @@ class FaultyStorage:
         shim = folder / "storage_faults.so"
         source = str(HERE / "storage_faults.c")
         subprocess.run([compiler(), "-shared", "-fPIC", "-O1", "-o", str(shim), source, "-ldl"], check=True)
-        environment = {**os.environ, "LD_PRELOAD": str(shim), "PYTHONPATH": str(HERE)}
+        environment = {
+            **os.environ,
+            "LD_PRELOAD": str(shim),
+            "PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
+        }
         words = [sys.executable, str(HERE / "storage.py"), str(shim), str(folder)]
         self._errors = folder / "server.txt"
         with self._errors.open("wb") as errors:
