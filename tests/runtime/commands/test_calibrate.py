@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pans.firmware_sim.trials.fields import Evidence, MutatedLink, Mutation, by
+from pans.firmware_sim.checks.mutation import Mutation, by
+from pans.firmware_sim.trials.fields import Evidence, MutatedLink
 from pans.runtime.cli import EXIT_TIMING, main
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
 from pans.runtime.link import base
