@@ -133,6 +133,7 @@ class LiveRun:
         self._started_ns = started_ns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
         self._granted_until = 0
+        self._over_ns = 0  # when the plan has long been done
 
     def now_ns(self) -> int:
         """The link's host clock."""
@@ -159,6 +160,8 @@ class LiveRun:
         if isinstance(self._recorder, PartedRecorder):
             self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
         self.last_data_ns = now_ns + ARM_LEAD_NS
+        planned_ns = round((n_cycles + 1) * self.plan.cycle_us * NS_PER_US)
+        self._over_ns = now_ns + ARM_LEAD_NS + planned_ns + SILENCE_NS if n_cycles else 1 << 63
         self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         if not self.reconnects:
             self.start_ns = now_ns + ARM_LEAD_NS
@@ -261,6 +264,8 @@ class LiveRun:
             return f"the device went dark by itself: reason {status.reason}"
         if self.config.seconds and now_ns - self.start_ns >= self.config.seconds * NS_PER_S:
             return "time is up"
+        if looked_ns > self._over_ns and self.core.contradictions["beyond_plan"]:
+            return "the device goes on beyond its plan"
         if idle and looked_ns - session.heard_ns > UNHEARD_NS:
             raise LinkError("the device fell silent")
         if idle and looked_ns - self.last_data_ns > SILENCE_NS + self.plan.cycle_us * NS_PER_US:

@@ -145,6 +145,15 @@ def test_a_welcome_that_cannot_be_meant_is_refused(name: str, value: Any, stage:
     assert name in session.error
 
 
+def test_a_device_that_never_ends_its_plan_does_not_keep_the_host(
+    stage: Stage, parallel: Stage, tmp_path: Path
+) -> None:
+    for one in (stage, parallel):
+        summary = ended(one.run(tmp_path, 1, Mutation("ARM", "n_cycles", *by(1_000_000))))
+        assert summary.ended == "the device goes on beyond its plan"
+        assert (summary.verdict, _exit_code(summary)) == ("FAIL", 4)
+
+
 def test_any_field_of_any_message_is_taken_or_refused_without_a_traceback() -> None:
     seed = secrets.randbelow(1 << 40)
     _, wrong = sessions(seed, 30)
