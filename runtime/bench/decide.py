@@ -40,6 +40,7 @@ from .rows import (
     percentiles_us,
     repeated,
 )
+from .walks import decide_rows, made_automaton
 
 BATCH = 20_000
 PICTURES = 2_000
@@ -51,12 +52,15 @@ BACKENDS = ("table", "count-table", "sparse", "int8", "onnx", "int8-onnx", "floa
 
 
 def bench_decide(options: BenchOptions) -> list[Row]:
-    """Return the rows of every bundle (the shipped one unless others are given), then of streams."""
+    """Return the rows of every bundle (the shipped one and a made-up automaton unless others are given), then of streams."""
     paths = options.bundles or (options.first_bundle,)
-    rows: list[Row] = []
+    rows: list[Row] = [] if options.bundles else decide_rows(made_automaton(), options.quick)
     for number, path in enumerate(paths):
         bundle, _ = load_bundle(path)
         inputs = options.inputs[number] if number < len(options.inputs) else None
+        if bundle.automaton is not None:
+            rows += decide_rows(bundle, options.quick)
+            continue
         if bundle.picture_shape is not None:
             rows.append(_picture_row(bundle, PICTURES // 10 if options.quick else PICTURES))
             continue

@@ -31,6 +31,7 @@ from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, FrameBlock, Mark, encode_frames, encode_mark
 
 from .rows import BenchOptions, Row, copy_ns, cpu_time
+from .walks import made_automaton, stream_rows
 
 SESSION = 0x5EED
 PAYLOAD_BYTES = 16_384
@@ -45,9 +46,13 @@ MIB = 1 << 20
 
 
 def bench_ingest(options: BenchOptions) -> list[Row]:
-    """Return the rows of decoding at several densities of zeros, then of the whole way for several windows."""
+    """Return the rows of decoding at several densities of zeros, of sequential streams, then of the whole way for several windows."""
     rows: list[Row] = [_decode_row(zeros) for zeros in ZEROS] + [_plain_row(), _crc_row(), _copy_row()]
     bundle, _ = load_bundle(options.first_bundle)
+    rows += stream_rows(bundle, options.quick)
+    if bundle.automaton is not None:
+        return rows  # the rest is of parallel measurements
+    rows += [] if options.bundles else stream_rows(made_automaton(), options.quick)
     for shots, backend in ((1, "table"), (2, "auto"), (5, "auto"), (10, "auto"), (20, "auto")):
         if backend == "table" and bundle.table is None:
             backend = "auto"

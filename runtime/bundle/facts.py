@@ -118,8 +118,12 @@ class Bundle:
         """Return what each state of the automaton shows, float64 (states,): photoelectrons per unit transmission, dwell included."""
         if self.automaton is None:
             raise ValueError(f"{self.name} has no automaton")
+        return self.light_of(self.automaton)
+
+    def light_of(self, automaton: Automaton) -> NDArray[np.float64]:
+        """Return what each state of an `automaton` over these patterns shows, as `state_light`."""
         whole = self.pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64) * self.photons_per_level
-        return whole[self.automaton.pattern] * (self.automaton.dwell / self.automaton.dwell_steps)
+        return whole[automaton.pattern] * (automaton.dwell / automaton.dwell_steps)
 
 
 def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:

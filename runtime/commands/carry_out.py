@@ -263,15 +263,18 @@ def _watched(
 
 
 def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
-    from pans.runtime.report.summary import summarise
+    from pans.runtime.report.summary import summarise, walk_figures
 
     frames = job.shots * (1 if job.flow is None else job.flow.pool)
+    walks = walk_figures(result, ready.plan, ready.bundle, job.profile.name, job.confidence)
+    shown = None if walks is None else walks.illumination_mean
     return summarise(
         result,
-        illumination=ready.bundle.illumination() * frames,
+        illumination=ready.bundle.illumination() * frames if shown is None else shown,
         expected_decisions=ready.expected_decisions,
         flow=None if ready.flow_run is None else ready.flow_run.figures(),
         dark=ready.dark.figures(result.dark),
+        walks=walks,
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,10 @@ from pans.runtime.wire.messages import Mark, MessageType
 
 from . import stream_kernels as kernels
 from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag, Output
+from .follower import Follower
 from .plan import Plan
 from .stream_kernels import DecisionTables, MarkArrays, WindowArrays
-
-if TYPE_CHECKING:
-    from .still import Core
+from .window import DecisionWindows
 
 ROWS_PER_BATCH = 8192
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
@@ -36,16 +35,27 @@ Rows = npt.NDArray[np.void]
 
 
 class BulkSteps:
-    """The compiled steps of `core`; all memory is allocated here, before arming. `rows_max` decisions are given at once."""
+    """The compiled steps of `core`, whose windows are `windows`; all memory is allocated here, before arming.
 
-    def __init__(self, core: Core, plan: Plan, decider: Decider, shots: int, rows_max: int = ROWS_PER_BATCH) -> None:
-        self.core = core
+    `rows_max` decisions are given at once.
+    """
+
+    def __init__(
+        self,
+        core: Follower,
+        windows: DecisionWindows,
+        plan: Plan,
+        decider: Decider,
+        shots: int,
+        rows_max: int = ROWS_PER_BATCH,
+    ) -> None:
+        self.core, self.windows = core, windows
         self._decider, self._shots = decider, shots
         self._rows: Rows = np.zeros(rows_max, DECISION_DTYPE)
         self.tables = decision_tables(decider, shots, plan)
         self._counts = np.zeros((0 if self.tables.labels.size else rows_max, decider.n_features), np.int64)
         self._marks, self._told = _no_marks(), _no_marks()  # as the kernel knows them, and as the core does
-        windows, sequential = core.windows, plan.mode != "parallel"
+        sequential = plan.mode != "parallel"
         self._windows = WindowArrays(
             *windows.arrays(),
             np.zeros(-(-decider.n_features // 8), np.uint64),
@@ -140,7 +150,7 @@ class BulkSteps:
         state[kernels.N_ROWS], state[kernels.START_TICK] = 0, min(core.start_tick, _LARGEST)
         state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE], state[place.DROPS] = core.tracker.position
         state[place.MESSAGES] = state[place.EXPOSURES] = 0
-        state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = core.windows.position
+        state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT] = self.windows.position
         state[kernels.N_DECISIONS], state[kernels.N_ABSTAINED] = core.n_decisions, core.n_abstained
         state[place.END_EXPOSURE], state[kernels.LAST_TICK] = (
             min(core.end_exposure, (1 << 62)),
@@ -157,7 +167,7 @@ class BulkSteps:
                 state[place.MESSAGES],
                 state[place.EXPOSURES],
             )
-            core.windows.go_on((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
+            self.windows.go_on((state[kernels.VISIT], state[kernels.NEXT_WINDOW], state[kernels.OBJECT]))
             if state[kernels.LAST_TICK] != min(core.last_tick, _LARGEST):  # a larger one only Python's integers hold
                 core.last_tick = state[kernels.LAST_TICK]
             core.jitter_ticks = max(core.jitter_ticks, state[kernels.JITTER])

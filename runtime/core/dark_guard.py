@@ -102,13 +102,18 @@ class DarkGuard:
 
         What it says holds from this decision on; `news` has the findings.
         """
-        if self.lit is None:
-            return
         if not self._parallel:
-            self._any_click[0] = counts.sum()
-            counts = self._any_click
-        self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
-        self._look_for_dead()
+            self.take_clicks(int(counts.sum()), number)
+        elif self.lit is not None:
+            self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
+            self._look_for_dead()
+
+    def take_clicks(self, clicks: int, number: int) -> None:
+        """As `take_object` with one detector, of which only the sum of its clicks counts."""
+        if self.lit is not None:
+            self._any_click[0] = clicks
+            self.lit.take_object(self._any_click, -1 if number == NO_OBJECT else number)
+            self._look_for_dead()
 
     def news(self) -> list[Finding]:
         """Return what was found with objects, once."""

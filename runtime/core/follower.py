@@ -75,6 +75,7 @@ class Follower:
         self.contradictions: Counter[str] = (
             Counter()
         )  # messages that the plan or others exclude, by what is wrong in them
+        self.n_classes = n_classes
         self.start_tick = 0
         self.completed = False
         self.tracker = StreamTracker()

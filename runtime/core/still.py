@@ -13,28 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.decide.backends import Decider
+from pans.runtime.instrument.channel_health import Finding
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
 
+from .bulk_steps import BulkSteps
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
-from .follower import ANY_CLASS, Follower
+from .follower import ANY_CLASS, Follower, Place
 from .plan import Plan
 from .window import DecisionWindows, Window
 
 NO_FLAGS = DecisionFlag(0)
+_NOT_MEASURED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN)
 
 
 class Core(Follower):
     """Stream tracker, windows and back end joined up, for objects that stand still."""
 
     def __init__(self, plan: Plan, decider: Decider, shots: int, n_cycles: int, guard: DarkGuard | None = None) -> None:
-        self.n_classes = decider.n_classes or ANY_CLASS  # 0: pictures
-        super().__init__(plan, n_cycles, self.n_classes)
+        super().__init__(plan, n_cycles, decider.n_classes or ANY_CLASS)  # 0: pictures
         self.guard = guard  # of the dark counts; None: they are only added up
         self.windows = DecisionWindows(plan, decider.n_features, shots)
         self.shots = shots
         self._decider = decider
         self._visits_before = 0  # in streams that have ended
+        self._steps: BulkSteps | None = None  # once warmed up, where they give all that is asked for
+        self._session_known = False  # to them
 
     @property
     def tallies(self) -> NDArray[np.int64]:
@@ -46,6 +51,45 @@ class Core(Follower):
         self.windows.warm_up()
         if self.guard is not None:
             self.guard.warm_up()
+        if not self.windows.parallel and (self.guard is None or self.guard.policy == "warn"):
+            steps = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, self.windows.n_windows + 1)
+            steps.warm_up()
+            self._steps = steps if steps.tables.labels.size else None  # others decide one by one, as `step` does
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output:
+        """See Follower."""
+        self._session_known = False
+        return super().begin(start_tick, n_cycles)
+
+    def part(self) -> Place | None:
+        """See Follower."""
+        self._session_known = False  # of the marks that are forgotten here the compiled steps must not know either
+        return super().part()
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
+        """See Follower: an ordinary block of one detector's exposures is one call of a kernel."""
+        if self._steps is None:
+            return super().step_messages(messages, place)
+        if not self._session_known:
+            self._steps.begin(messages.frame(place).session)
+            self._session_known = True
+        next_exposure = self.tracker.next_exposure
+        stop, rows, _ = self._steps.take(messages, place, blocks=1)
+        if stop == place:
+            return 1, self._steps.step(messages.frame(place))
+        events = [] if self.guard is None else self._watched(self.guard, next_exposure, rows)
+        return stop - place, Output([Decision(*row) for row in rows.tolist()], events, self.last_tick)
+
+    def _watched(self, guard: DarkGuard, first: int, rows: NDArray[np.void]) -> list[Finding]:
+        """Let the guard, which only warns, see the block from exposure `first` on that the kernel has taken, and its decisions."""
+        assert self._steps is not None
+        n = self.tracker.next_exposure - first
+        block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], self._steps.stamps[:n], self._steps.bits[:n])
+        events = guard.take(block)
+        for row in rows:
+            if not row["flags"] & _NOT_MEASURED:
+                guard.take_clicks(int(row["clicks"]), int(row["object"]))
+        return events
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""

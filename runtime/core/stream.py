@@ -43,13 +43,13 @@ class StreamCore:
         self.decoder = BulkDecoder()
         self.wrong_session = 0
         self._session = session
-        self._steps = BulkSteps(self.core, plan, decider, shots, ROWS_PER_BATCH)
+        self._steps = BulkSteps(self.core, self.core.windows, plan, decider, shots, ROWS_PER_BATCH)
         self._steps.begin(session)
 
     def warm_up(self) -> None:
         """Compile or load every kernel of the path, before arming."""
         self.decoder.warm_up()
-        self.core.warm_up()
+        self.core.windows.warm_up()
         self._steps.warm_up()
         self._steps.begin(self._session)
 

@@ -39,7 +39,7 @@ MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABST
     N_STATE,
 ) = range(
     LAST_TICK + 1, LAST_TICK + 12
-)  # STEPS: blocks that may be taken before the kernel returns, 0: any number; KIND: of the plan's blocks
+)  # STEPS: blocks that may be taken before the kernel returns, and then no marks, 0: any number; KIND: of the plan's blocks
 ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_messages` returns
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
@@ -145,6 +145,8 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
         kind = buffer[start]
         payload = start + _U(stream.BODY_HEADER)
         if kind == stream.MARK:
+            if state[STEPS]:
+                return ODD  # a live run looks into the core's own marks
             if not _take_mark(buffer, payload, stop, state, marks):
                 return ODD
         elif kind == stream.FRAMES:

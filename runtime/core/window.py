@@ -134,6 +134,14 @@ class DecisionWindows:
         """Take over a `position` to which a kernel has brought the same arrays."""
         self._visit, self._next_window, self._object = position
 
+    def walk_state(self, visit: int, window: int, step: int) -> int:
+        """Return the state that a walk must show in its exposure number `step`; -1 when it is over, or what came before is not known."""
+        if visit != self._visit:
+            return 0 if step == 0 else -1
+        state = int(self.walks.nodes[window])
+        known = 0 <= state < len(self.walks.successors) and self._seen[window, 0] == step
+        return state if known else -1
+
     @property
     def half_seen(self) -> bool:
         """Whether a window that is not settled holds exposures already."""

@@ -9,9 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pans.runtime.instrument.calibration import MAX_AGE_H
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from pans.runtime.instrument.dark_rate import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
 
@@ -58,7 +62,7 @@ class RunResult:
     realtime: dict[str, Any]
     device: dict[str, Any]
     slot_jitter_us: float
-    wrong_patterns: int
+    wrong_patterns: int  # late slots among them
     armed_after_s: float
     seconds: float
     ended: str
@@ -69,5 +73,8 @@ class RunResult:
     contradictions: dict[str, int] = field(
         default_factory=dict
     )  # messages that the evidence excludes, by what is wrong
+    late_slots: int = 0  # that stayed dark because the host named no state in time
+    turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
+    states_shown: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # exposures of each state
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)

@@ -191,7 +191,7 @@ class GateQueue:
             else:
                 self.counters.done += 1
         for refusal in refusals.values():
-            self._journal.note("gate_refused", **refusal._asdict())
+            self._journal.refused(refusal)
 
     def _refuse(self, action: Action, why: str) -> None:
         self.counters.refused += 1

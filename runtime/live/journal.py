@@ -12,10 +12,15 @@ from typing import Any
 from pans.runtime.core.decision import CoreEvent
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import AnyRecorder
+from pans.runtime.wire.messages import Opcode
+from pans.runtime.wire.session import Refusal
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
-TROUBLE = ("blame", "gap", "link_lost", "clock_step", "gate_refused", "parts_trouble", "beyond_plan", "contradiction")
+TROUBLE = (
+    *("blame", "gap", "link_lost", "clock_step", "gate_refused", "show_refused"),
+    *("parts_trouble", "beyond_plan", "contradiction"),
+)
 
 
 class Journal:
@@ -59,7 +64,12 @@ class Journal:
             self.recorder.add_clock(samples)
 
     def refusals(self, connection: Connection) -> None:
-        """Note the gates that the device has refused."""
+        """Note the pulses and the names of states that the device has refused."""
         refusals = connection.session.refusals
         while refusals:
-            self.note("gate_refused", **refusals.popleft()._asdict())
+            self.refused(refusals.popleft())
+
+    def refused(self, refusal: Refusal) -> None:
+        """Note a command that the device has refused, and that nobody waits for."""
+        kind = "show_refused" if refusal.opcode == Opcode.SHOW else "gate_refused"
+        self.note(kind, command_id=refusal.command_id, status=refusal.status, text=refusal.text)

@@ -15,10 +15,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, WRONG_PATTERNS
+from pans.runtime.core.still import Core
+from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
 from pans.runtime.errors import LinkError, RecordingError
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.dark_rate import DarkMonitor
@@ -173,4 +176,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         late_cause=dict(run.lateness.incidents.causes),
         lost_cause=dict(run.lateness.incidents.missing),
         events=run.journal.events,
+        late_slots=int(tallies[LATE_SLOTS]),
+        turn_us={} if run.driver is None else run.driver.turns.summary(),
+        states_shown=run.core.windows.walks.shown if isinstance(run.core, Core) else np.zeros(0, np.int64),
     )

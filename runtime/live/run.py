@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Protocol
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any
 
 from pans.runtime.core.decision import Output
-from pans.runtime.core.follower import Place
 from pans.runtime.core.plan import Plan
+from pans.runtime.core.still import Core
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.link.connection import ARM_LEAD_NS, Arrived, Connection
 from pans.runtime.record import AnyRecorder, PartedRecorder
@@ -29,8 +26,6 @@ from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import (
     DeviceState,
-    Frame,
-    Mark,
     MessageType,
     Opcode,
     StateReason,
@@ -38,12 +33,14 @@ from pans.runtime.wire.messages import (
     pack_body,
 )
 from pans.runtime.wire.schema import MalformedMessage
-from pans.runtime.wire.tracker import Gap, StreamTracker
+from pans.runtime.wire.tracker import Gap
 
 from .config import RunConfig
+from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
 from .journal import Journal
 from .lateness import Lateness
+from .live_core import LiveCore as LiveCore
 from .tally import RunTally
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
@@ -56,46 +53,13 @@ UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every se
 SILENCE_NS = 5 * NS_PER_S  # without clicks
 
 
-class LiveCore(Protocol):
-    """What a live run needs of a core (core.Core is one): stream frames in, outputs out, deterministic, no clock.
-
-    `tracker` accounts for the stream, `marks` are the objects' marks by number, `tallies` int64 (window.N_TALLIES,) the dark
-    exposures, dark clicks and wrong patterns, in that order.
-    """
-
-    start_tick: int
-    completed: bool
-    n_decisions: int
-    jitter_ticks: int
-    tracker: StreamTracker
-    contradictions: Counter[str]
-
-    @property
-    def marks(self) -> Mapping[int, Mark]: ...
-
-    @property
-    def tallies(self) -> npt.NDArray[np.int64]: ...
-
-    def warm_up(self) -> None: ...
-
-    def begin(self, start_tick: int, n_cycles: int) -> Output: ...
-
-    def step(self, frame: Frame) -> Output: ...
-
-    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]: ...
-
-    def end(self) -> Output: ...
-
-    def cycles_left(self, n_cycles: int) -> int: ...
-
-    def part(self) -> Place | None: ...
-
-
 Watcher = Callable[["LiveRun", Output], None]
 
 
 class LiveRun:
     """One run in progress: what `run_live` calls in turn, and what a live view may look at."""
+
+    driver: HostDriver | None = None  # of an automaton that the host follows
 
     def __init__(
         self,
@@ -112,6 +76,8 @@ class LiveRun:
         self.tally = RunTally(n_classes, config.shots)
         self.journal = Journal(recorder)
         self.gates = GateQueue(recorder, self.journal)
+        if plan.drive == "host" and plan.automaton is not None and isinstance(core, Core):
+            self.driver = HostDriver(core, WalkPlace(plan, plan.automaton))
         self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
         self.ended = ""
@@ -157,6 +123,8 @@ class LiveRun:
         self.settle(self.core.begin(start_tick, n_cycles))
         arm = Arm(start_tick, n_cycles, self.config.lease_ms)
         self.connection.session.submit(Opcode.ARM, pack_arm(arm))
+        if self.driver is not None:
+            self.driver.begin(self.connection)
         if isinstance(self._recorder, PartedRecorder):
             self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
         self.last_data_ns = now_ns + ARM_LEAD_NS
@@ -287,6 +255,7 @@ class LiveRun:
                 continue
             decoded_ns = self.now_ns()
             output = self.core.step(what)
+            self._drive(arrival_ns)
             self._taken_here += 1
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
@@ -308,12 +277,21 @@ class LiveRun:
         while place < n:
             decoded_ns = self.now_ns()
             taken, output = self.core.step_messages(messages, place)
+            self._drive(arrival_ns)
             self._taken_here += taken
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self._recorder is not None:
                 self._recorder.add_messages(arrival_ns, messages, place, taken)
             self._book(output, arrival_ns, decoded_ns, outputs)
             place += taken
+
+    def _drive(self, arrival_ns: int) -> None:
+        """Where the host drives: name the next state before anything else is done with what has come."""
+        if self.driver is not None and not self.stops and self._broken is None:
+            try:
+                self.driver.turn(self.connection, arrival_ns)
+            except LinkError as error:
+                self._broken = error
 
     def _book(self, output: Output, arrival_ns: int, decoded_ns: int, outputs: list[Output]) -> None:
         """Account for what a step brought."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
 
-_ABSTAINED = int(DecisionFlag.ABSTAINED)
+_ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
 
 
@@ -42,7 +42,8 @@ class RunTally:
         self.shots = shots
         self.decisions = 0
         self.abstained = 0
-        self.clicks = 0
+        self.unsure = 0  # of them because no class was as sure as was asked for
+        self.clicks = self.exposures = 0  # exposures: of walks
         self.photons = 0.0
         self.photons_known = 0
         self._trials: dict[int, list[int]] = {}  # window within the visit -> [decided, right]
@@ -53,11 +54,13 @@ class RunTally:
         """Count one decision; `photons_per_shot` is NaN where the instrument does not know it."""
         self.decisions += 1
         self.clicks += decision.clicks
+        self.exposures += decision.exposures
         if not math.isnan(photons_per_shot):
             self.photons += photons_per_shot * self.shots
             self.photons_known += 1
         if decision.flags & _ABSTAINED or decision.label == NO_LABEL:
             self.abstained += 1
+            self.unsure += bool(decision.flags & _AMBIGUOUS)
         if decision.truth < 0 or decision.truth >= len(self.confusion):
             return
         right = int(decision.label == decision.truth)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
@@ -36,8 +37,11 @@ class Exposures(NamedTuple):
     object: int
     first: int  # number of the first exposure in its stream
     start_tick: NDArray[np.int64]  # (n,): begin of each exposure
-    pattern: NDArray[np.uint16]  # (n,): the pattern shown, DARK_PATTERN in a dark slot; 0 where all shine at once
+    pattern: NDArray[np.uint16]  # (n,): the pattern shown, DARK_PATTERN in the dark; 0 where all shine at once
     clicks: NDArray[np.bool_]  # (n, channels)
+    state: NDArray[
+        np.uint16
+    ]  # (n,): of the automaton, as the device stamped it, DARK_PATTERN in the dark; the pattern where there is none
 
 
 def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mark]:
@@ -59,13 +63,21 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mar
 
 def _exposures(block: ClickBlock | FrameBlock, arrival_ns: int, stream: int, plan: Plan) -> Exposures:
     if isinstance(block, ClickBlock):
-        pattern, clicks = block.patterns, block.bits[:, None].astype(bool)
+        state, clicks = block.patterns, block.bits[:, None].astype(bool)
+        pattern = state if plan.automaton is None else _patterns_of(state, plan.automaton)
     else:
         bits = np.unpackbits(block.words, axis=1, bitorder="little")
         slot = (block.exposure_index + np.arange(len(bits))) % plan.slots_per_cycle
         pattern, clicks = plan.slot_pattern[slot], bits[:, : plan.n_patterns].astype(bool)
+        state = pattern
     ticks = block.tick + np.arange(len(clicks), dtype=np.int64) * block.period_ticks
-    return Exposures(arrival_ns, stream, block.object_index, block.exposure_index, ticks, pattern, clicks)
+    return Exposures(arrival_ns, stream, block.object_index, block.exposure_index, ticks, pattern, clicks, state)
+
+
+def _patterns_of(state: NDArray[np.uint16], automaton: Automaton) -> NDArray[np.uint16]:
+    """The pattern of each stamped state; stamps that are none (dark, or of no state at all) stand as they are."""
+    known = state < automaton.n_states
+    return np.where(known, automaton.pattern[np.where(known, state, 0)], state)
 
 
 class ClickList(NamedTuple):
@@ -76,6 +88,7 @@ class ClickList(NamedTuple):
     object: NDArray[np.int64]
     channel: NDArray[np.int64]  # of the detector
     pattern: NDArray[np.int64]  # shown; DARK_PATTERN: none
+    state: NDArray[np.int64]  # of the automaton; the pattern where there is none
     stream: NDArray[np.int64]
     exposures: int
     first_tick: int
@@ -84,23 +97,24 @@ class ClickList(NamedTuple):
 
 def click_list(recording: Recording, plan: Plan) -> ClickList:
     """Return the clicks of `recording` as arrays."""
-    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(6)]
+    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(7)]
     exposures, first_tick, last_tick = 0, 0, 0
     for item in iter_exposures(recording, plan):
         if isinstance(item, Mark):
             continue
         row, channels = np.nonzero(item.clicks)
         same = np.full(len(row), item.object), np.full(len(row), item.stream)
+        shown = item.pattern[row], item.state[row]
         for column, values in zip(
-            columns, (item.start_tick[row], item.first + row, same[0], channels, item.pattern[row], same[1])
+            columns, (item.start_tick[row], item.first + row, same[0], channels, *shown, same[1])
         ):
             column.append(np.asarray(values, np.int64))
         first_tick = first_tick if exposures else int(item.start_tick[0])
         last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
         exposures += len(item.clicks)
     empty = [np.zeros(0, np.int64)]
-    start, number, thing, channel, shown, stream = (np.concatenate(column or empty) for column in columns)
-    return ClickList(start, number, thing, channel, shown, stream, exposures, first_tick, last_tick)
+    start, number, thing, channel, pattern, state, stream = (np.concatenate(column or empty) for column in columns)
+    return ClickList(start, number, thing, channel, pattern, state, stream, exposures, first_tick, last_tick)
 
 
 def is_dark(pattern: NDArray[np.integer]) -> NDArray[np.bool_]:

@@ -141,7 +141,11 @@ def _rebuilt(
             decider = pictures.over(decider)
         core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)
         in_bulk = pictures is None and isinstance(core, Core) and (core.guard is None or core.guard.policy == "warn")
-        return core, BulkSteps(core, plan, decider, shots) if in_bulk and isinstance(core, Core) else None, sent
+        return (
+            core,
+            BulkSteps(core, core.windows, plan, decider, shots) if in_bulk and isinstance(core, Core) else None,
+            sent,
+        )
     except _NOT_REBUILT as error:
         raise DamagedFileError(
             f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"

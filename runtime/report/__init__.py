@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .file_page import page_of
+    from .page_run import page_of
     from .summary import Summary, summarise
     from .verify import FileVerdict, verify_file
 
@@ -24,7 +24,7 @@ __getattr__ = lazy_names(
     {
         "FileVerdict": ".verify",
         "Summary": ".summary",
-        "page_of": ".file_page",
+        "page_of": ".page_run",
         "summarise": ".summary",
         "verify_file": ".verify",
     },

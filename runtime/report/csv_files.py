@@ -22,10 +22,11 @@ from pans.runtime.safe_text import csv_cell
 
 DECISIONS = (
     *("decision", "tick", "time_us", "exposure", "object", "first_shot", "clicks", "label", "class"),
-    *("truth", "probability", "flags", "flag_names"),
+    *("truth", "probability", "flags", "flag_names", "exposures"),
 )
 CLICKS = (
     *("exposure_start_tick", "exposure_start_us", "exposure", "object", "channel", "pattern", "dark_slot", "stream"),
+    "state",
 )
 FILES = ("decisions.csv", "clicks.csv", "timings.csv", "about.json")
 TIMINGS = ("decision", "device_end_ns", "arrival_ns", "decided_ns", "recorded_ns", "end_to_decided_us")
@@ -43,7 +44,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
             DECISIONS,
             (_decision_row(row, clicks.first_tick, us, classes) for row in recording.decisions()),
         ),
-        "clicks.csv": (CLICKS, _click_rows(clicks, us)),
+        "clicks.csv": (CLICKS, _click_rows(clicks, us, walks=plan.automaton is not None)),
         "timings.csv": (TIMINGS, (_timing_row(row) for row in recording.timings())),
     }
     written = []
@@ -81,15 +82,19 @@ def _decision_row(row: Any, first_tick: int, us: float, classes: tuple[str, ...]
         int(row["truth"]) if row["truth"] >= 0 else "",
         repr(float(row["probability"])) if known else "",
         *(int(flags), "|".join(str(flag.name) for flag in flags)),
+        int(row["exposures"]) or "",
     ]
 
 
-def _click_rows(clicks: ClickList, us: float) -> Iterable[Sequence[Any]]:
+def _click_rows(clicks: ClickList, us: float, *, walks: bool) -> Iterable[Sequence[Any]]:
     dark = is_dark(clicks.pattern)
     pattern = [("" if unlit else str(shown)) for shown, unlit in zip(clicks.pattern.tolist(), dark.tolist())]
     since = [f"{value * us:.3f}" for value in (clicks.start_tick - clicks.first_tick).tolist()]
     numbers = (column.tolist() for column in (clicks.exposure, clicks.object, clicks.channel))
-    return zip(clicks.start_tick.tolist(), since, *numbers, pattern, dark.astype(int).tolist(), clicks.stream.tolist())
+    unlit = dark.tolist()
+    state = [str(state) if walks and not off else "" for state, off in zip(clicks.state.tolist(), unlit)]
+    streams = clicks.stream.tolist()
+    return zip(clicks.start_tick.tolist(), since, *numbers, pattern, dark.astype(int).tolist(), streams, state)
 
 
 def _timing_row(row: Any) -> list[Any]:

@@ -9,7 +9,7 @@ import importlib
 import io
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ DPI = 90
 PATTERNS_MAX = 64
 CLASSES_MAX = 100
 LEAST_US = 0.1
+DARK_EDGE, CLICK_EDGE = "0.45", "C3"  # of a tree: no click, click
 
 
 def pyplot(what: str = "a report") -> Any:
@@ -232,4 +233,77 @@ def over_time(edges_s: F64, panels: Mapping[str, Mapping[str, NDArray[np.int64]]
         axis.set(ylabel=f"{title}\nper {edges_s[1] - edges_s[0]:.3g} s", xlim=(edges_s[0], edges_s[-1]), ylim=(0, None))
         axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     axes[-1, 0].set_xlabel("seconds since the first decision")
+    return _done(figure)
+
+
+class TreeNode(NamedTuple):
+    """A state of the tree: its level, which share of the walks came there, clicks per exposure, and the places of its two successors.
+
+    A place is -1 where the successor is not drawn.
+    """
+
+    state: int
+    level: int
+    share: float
+    rate: float
+    leads: tuple[int, ...]
+
+
+def tree(pictures: F64, nodes: list[TreeNode]) -> bytes:
+    """Draw patterns (n, height, width) at the places of `nodes`, a level below the other, with edges between them."""
+    levels = 1 + max(node.level for node in nodes)
+    width, height = 9.6, 1.9 * levels + 0.3
+    figure = pyplot().figure(figsize=(width, height))
+    where = _places(nodes, levels)
+    size = min(
+        0.78 / levels, 0.9 / max(sum(node.level == level for node in nodes) for level in range(levels)) * width / height
+    )
+    canvas = figure.add_axes((0, 0, 1, 1))
+    canvas.set(xlim=(0, 1), ylim=(0, 1))
+    canvas.set_axis_off()
+    for (x, y), node in zip(where, nodes):
+        for click, lead in enumerate(node.leads):
+            if lead >= 0:
+                to = where[lead]
+                colour = CLICK_EDGE if click else DARK_EDGE
+                canvas.plot([x, to[0]], [y, to[1]], color=colour, lw=1.4, zorder=0)
+    high = float(pictures.max()) or 1.0
+    for (x, y), node, picture in zip(where, nodes, pictures):
+        wide = size * height / width
+        axis = figure.add_axes((x - wide / 2, y - size / 2, wide, size * 0.8))
+        axis.imshow(picture, cmap="magma", vmin=0, vmax=high, interpolation="nearest")
+        axis.set(xticks=[], yticks=[])
+        rate = "never shown" if np.isnan(node.rate) else f"{100 * node.rate:.1f} % click"
+        axis.set_title(f"{100 * node.share:.0f} % of walks\n{rate}", fontsize=6.5, pad=2)
+    for label, colour in (("no click", DARK_EDGE), ("click", CLICK_EDGE)):
+        canvas.plot([], [], color=colour, lw=1.4, label=label)
+    canvas.legend(loc="upper right", fontsize=8, frameon=False)
+    return _done(figure, "png")
+
+
+def _places(nodes: list[TreeNode], levels: int) -> list[tuple[float, float]]:
+    """Centres in the figure: levels from above, the states of one side by side, each below the middle of those that lead to it."""
+    wanted: dict[int, list[float]] = {0: [0.5]}
+    where: dict[int, tuple[float, float]] = {}
+    for level in range(levels):
+        here = sorted(
+            (number for number, node in enumerate(nodes) if node.level == level),
+            key=lambda at: np.mean(wanted.get(at, [0.5])),
+        )
+        for side, number in enumerate(here):
+            x = (side + 0.5) / len(here)
+            where[number] = (x, 1 - (level + 0.55) / levels)
+            for click, lead in enumerate(nodes[number].leads):
+                wanted.setdefault(lead, []).append(x + (click - 0.5) * 1e-3)
+    return [where[number] for number in range(len(nodes))]
+
+
+def lengths(exposures: NDArray[np.int64], clicks: NDArray[np.int64]) -> bytes:
+    """Draw how many walks took 1, 2, ... exposures, and how many gave 0, 1, ... clicks."""
+    figure, axes = _new(9.0, 2.8, 1, 2)
+    left, right = axes[0]
+    left.bar(1 + np.arange(len(exposures)), exposures, color="C0")
+    left.set(xlabel="exposures of a walk", ylabel="walks", xlim=(0, len(exposures) + 1))
+    right.bar(np.arange(len(clicks)), clicks, color="C1")
+    right.set(xlabel="clicks of a walk", ylabel="walks")
     return _done(figure)

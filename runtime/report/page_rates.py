@@ -1,4 +1,4 @@
-"""The report page's part on clicks over time: rates of patterns or channels, and dark counts.
+"""The report page's part on clicks over time: rates of patterns, channels or steps of a walk, and dark counts.
 
 Owns the sums per time bin, from recorded messages; never draws (figures.py).
 """
@@ -25,25 +25,31 @@ F64 = NDArray[np.float64]
 
 
 class Rates(NamedTuple):
-    """Clicks and exposures per time bin and pattern or channel, and of the dark slots, (bins, channels) and (bins,)."""
+    """Clicks and exposures per time bin and pattern, channel or step of a walk, and in the dark, (bins, channels) and (bins,).
+
+    Of an automaton also clicks and exposures of each state in the whole run, (states,).
+    """
 
     edges_s: F64
     clicks: F64
     exposures: F64
     dark_clicks: F64
     dark_exposures: F64
+    state_clicks: F64
+    state_exposures: F64
 
 
 def count_rates(recording: Recording, plan: Plan) -> Rates:
     """Sum clicks and exposures over at most `BINS` equal stretches of device time; a clock that went back starts no new bin."""
-    n = plan.n_patterns
+    n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
+    of_states = np.zeros((2, 0 if plan.automaton is None else plan.automaton.n_states))
     sums: list[tuple[int, F64, F64, int, int]] = []
     for item in iter_exposures(recording, plan):
         if isinstance(item, Exposures):
-            sums.append((int(item.start_tick[0]), *_sums(item, plan, n)))
+            sums.append((int(item.start_tick[0]), *_sums(item, plan, n, of_states)))
     if not sums:
         empty = np.zeros((1, n))
-        return Rates(np.array([0.0, 1.0]), empty, empty, np.zeros(1), np.zeros(1))
+        return Rates(np.array([0.0, 1.0]), empty, empty, np.zeros(1), np.zeros(1), *of_states)
     ticks = np.array([row[0] for row in sums], np.int64)
     seconds = np.maximum(ticks - ticks[0], 0) * plan.tick_us * 1e-6
     per_pattern = sum(float(row[2].sum()) for row in sums) / n
@@ -53,17 +59,25 @@ def count_rates(recording: Recording, plan: Plan) -> Rates:
     totals = [np.zeros((len(edges) - 1, n)) for _ in range(2)] + [np.zeros(len(edges) - 1) for _ in range(2)]
     for total, column in zip(totals, range(1, 5)):
         np.add.at(total, which, np.array([row[column] for row in sums], np.float64))
-    return Rates(edges, *totals)
+    return Rates(edges, totals[0], totals[1], totals[2], totals[3], *of_states)
 
 
-def _sums(item: Exposures, plan: Plan, n: int) -> tuple[F64, F64, int, int]:
-    """Clicks and exposures of one message per pattern or channel; clicks and exposures in the dark."""
+def _sums(item: Exposures, plan: Plan, n: int, of_states: F64) -> tuple[F64, F64, int, int]:
+    """Clicks and exposures of one message per pattern, channel or step; clicks and exposures in the dark. `of_states` (2, states) are
+    added to.
+    """
     dark = is_dark(item.pattern)
     lit = item.clicks[~dark]
     if plan.mode == "parallel":
         clicks, exposures = lit.sum(axis=0).astype(np.float64), np.full(n, float(len(lit)))
         return clicks, exposures, int(item.clicks[dark].sum()), int(dark.sum()) * n
-    shown = np.minimum(item.pattern[~dark], n - 1)
+    shown = item.pattern[~dark]
+    if plan.automaton is not None:
+        states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
+        np.add.at(of_states[0], states, lit[:, 0])
+        np.add.at(of_states[1], states, 1)
+        shown = plan.automaton.depth[states]
+    shown = np.minimum(shown, n - 1)
     clicks = np.bincount(shown, weights=lit[:, 0], minlength=n).astype(np.float64)
     return clicks, np.bincount(shown, minlength=n).astype(np.float64), int(item.clicks[dark].sum()), int(dark.sum())
 
@@ -71,7 +85,7 @@ def _sums(item: Exposures, plan: Plan, n: int) -> tuple[F64, F64, int, int]:
 def add_rates(page: Page, plan: Plan, rates: Rates, summary: Mapping[str, Any]) -> None:
     """Add clicks per exposure over time, and the dark counts."""
     page.heading("Clicks over time")
-    what = "channel" if plan.mode == "parallel" else "pattern"
+    what = "channel" if plan.mode == "parallel" else "pattern" if plan.automaton is None else "step of the walk"
     page.figure(
         draw.click_rates(rates.edges_s, rates.clicks, rates.exposures, what),
         f"Clicks per exposure of each {what}, {len(rates.clicks)} bins over the run; right: the mean with its standard error.",

@@ -1,4 +1,4 @@
-"""The report page of a recording: which figures stand on it, and where they come from.
+"""The report page of any file that has one, and that of a recording: which figures stand on it, and where they come from.
 
 Owns the order of the sections and the sums behind the drawings; never draws (figures.py) and never judges: the verdict is the
 recorded one. Every figure is computed from the recorded messages, decisions and times, except where it says "as the run summed it up".
@@ -7,21 +7,25 @@ recorded one. Every figure is computed from the recorded messages, decisions and
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.core.decision import DecisionFlag
-from pans.runtime.record import Recording
+from pans.runtime.errors import UsageError
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.sent_plan import recorded_plan
 
 from . import figures as draw
 from .page import Page
-from .page_bundle import add_optics
+from .page_bundle import add_optics, bundle_page
 from .page_flow import add_late, add_passages, is_flow
 from .page_rates import add_rates, count_rates
+from .page_walks import add_walks
+from .verify import file_kind
 
 EVENTS_SHOWN = 200
 EVENTS_OF_A_KIND = 30
@@ -36,6 +40,10 @@ _TITLES = {
     "clicks_mean": "clicks per decision",
     "photons_mean": "photons per decision (expected photoelectrons)",
     "illumination": "illumination per decision (sum of pattern intensities)",
+    "drive": "the automaton was driven by the",
+    "exposures_mean": "exposures per walk",
+    "abstained_below_confidence": "abstained below the confidence that was asked for",
+    "late_slots": "slots that stayed dark because their state was named too late",
     "late": "late decisions",
     "lost": "lost exposures",
 }
@@ -51,6 +59,17 @@ _SHOWN_ELSEWHERE = {
     "dark",
     "clock",
 }
+
+
+def page_of(path: str | Path) -> bytes:
+    """Return one self-contained HTML page of a recording or a bundle; UsageError for another kind of file or a missing one."""
+    kind = file_kind(path)
+    if kind == "recording":
+        return recording_page(read_recording(path, salvage=True))
+    if kind == "bundle":
+        bundle, sha256 = load_bundle(path)
+        return bundle_page(bundle, sha256, Path(path))
+    raise UsageError(f"{path} is a {kind}", remedy="reports are made of recordings and bundles; `pans info` shows this")
 
 
 def recording_page(recording: Recording) -> bytes:
@@ -78,6 +97,8 @@ def recording_page(recording: Recording) -> bytes:
     add_late(page, recording)
     plan = recorded_plan(recording)
     rates = count_rates(recording, plan)
+    if plan.automaton is not None and bundle is not None:
+        add_walks(page, recording, bundle, plan.automaton, rates)
     add_rates(page, plan, rates, summary)
     _clock(page, recording)
     _events(page, recording)

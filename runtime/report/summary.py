@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.plan import Plan
 from pans.runtime.instrument.dark_rate import DarkReport
 from pans.runtime.live import RunResult
 from pans.runtime.live.dark_run import DarkFigures
@@ -19,11 +21,34 @@ MAX_VERDICTS = 20  # of a summary; the recording has them all
 
 
 @dataclass(frozen=True, slots=True)
+class WalkFigures:
+    """The keys of the contract that a run with an automaton has besides. None where it is not known."""
+
+    drive: str  # device or host
+    confidence: float  # at which a walk was to end; 0.0: none
+    exposures_mean: float | None  # of a walk, dark ones left out
+    illumination_mean: float | None  # per decision, photoelectrons per unit transmission, of the states that were shown
+    abstained_below_confidence: int
+    late_slots: int  # that stayed dark because the host named no state in time
+    turn_us: dict[str, float] | None  # from a block's arrival until the next state's name had left; host-driven only
+    turn_budget_us: float | None  # from the end of an exposure to the beginning of the next one
+    expected: dict[str, Any] | None  # as the bundle says it: for its profile, task and split
+    expected_off_stderr: (
+        float | None
+    )  # measured accuracy less the expected one, in standard errors, on the same profile
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures under the contract's keys."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
 class Summary:
     """What a run came to. The fields are the contract's keys in their order; what `tally` and `flow` hold stands beside the others."""
 
     tally: TallyFigures
     flow: FlowFigures | None  # of passing objects: its figures replace those of still ones
+    walks: WalkFigures | None  # of an automaton: its figures stand beside the others
     illumination: float  # per decision, photoelectrons per unit transmission
     late: int
     late_blame: dict[str, int]
@@ -74,7 +99,8 @@ class Summary:
     def as_json(self) -> dict[str, Any]:
         """Return the summary under the contract's keys, in their order."""
         facts = asdict(self.tally) | ({} if self.flow is None else self.flow.as_json())
-        for field in fields(self)[2:]:
+        facts |= {} if self.walks is None else self.walks.as_json()
+        for field in fields(self)[3:]:
             facts[field.name] = getattr(self, field.name)
         return facts | {"dark": asdict(self.dark)}
 
@@ -86,6 +112,7 @@ def summarise(
     expected_decisions: int,
     flow: FlowFigures | None = None,
     dark: DarkFigures | None = None,
+    walks: WalkFigures | None = None,
 ) -> Summary:
     """Return the summary of `result`; `illumination` is per decision, in photoelectrons per unit transmission."""
     timing = result.timing
@@ -95,6 +122,7 @@ def summarise(
     return Summary(
         tally=result.tally.figures(),
         flow=flow,
+        walks=walks,
         illumination=illumination,
         late=timing.late,
         late_blame=timing.blame,
@@ -150,10 +178,14 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     if contradictions := contradictions_of(result):
         kinds = ", ".join(f"{what} {count}" for what, count in sorted(contradictions.items()))
         faults.append(f"{sum(contradictions.values())} messages contradict the evidence: {kinds}")
-    if result.wrong_patterns:
-        faults.append(f"{result.wrong_patterns} exposures showed another pattern than planned")
-    if tally.abstained and aborts_are_faults:
-        faults.append(f"{tally.abstained} decisions abstained")
+    wrong = result.wrong_patterns - (result.late_slots if result.turn_us else 0)
+    if wrong:
+        faults.append(f"{wrong} exposures showed another pattern than planned")
+    if wrong != result.wrong_patterns:
+        longest = f"the longest turn took {result.turn_us['max']:.0f} us"
+        faults.append(f"{result.late_slots} slots stayed dark because the host named their state too late; {longest}")
+    if tally.abstained > tally.unsure and aborts_are_faults:
+        faults.append(f"{tally.abstained - tally.unsure} decisions abstained")
     if expected_decisions and tally.decisions != expected_decisions:
         faults.append(f"{tally.decisions} of {expected_decisions} decisions were made; the run ended: {result.ended}")
     if result.dark.alarm:
@@ -178,3 +210,33 @@ def gate_faults(gates: Mapping[str, int]) -> list[str]:
 
 def _plain_device(device: Mapping[str, Any]) -> dict[str, Any]:
     return {str(key): value for key, value in device.items() if isinstance(value, (str, int, float, bool))}
+
+
+def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, confidence: float) -> WalkFigures | None:
+    """Return the figures of a run of `plan` on `profile`; None where the patterns are fixed."""
+    if plan.automaton is None:
+        return None
+    tally, expected = result.tally, bundle.expected
+    hosted = plan.drive == "host"
+    light = float(result.states_shown @ bundle.light_of(plan.automaton))
+    figures, off = tally.figures(), None
+    if expected is not None and expected["profile"] == profile and not confidence:
+        off = _in_standard_errors(figures.accuracy, figures.accuracy_stderr_objects, expected)
+    return WalkFigures(
+        drive=plan.drive,
+        confidence=confidence,
+        exposures_mean=tally.exposures / tally.decisions if tally.decisions else None,
+        illumination_mean=light / tally.decisions if tally.decisions else None,
+        abstained_below_confidence=tally.unsure,
+        late_slots=result.late_slots,
+        turn_us=result.turn_us if hosted else None,
+        turn_budget_us=(plan.slot_period_ticks - plan.exposure_ticks) * plan.tick_us if hosted else None,
+        expected=None if expected is None else dict(expected),
+        expected_off_stderr=off,
+    )
+
+
+def _in_standard_errors(accuracy: float | None, stderr: float | None, expected: Mapping[str, Any]) -> float | None:
+    if accuracy is None or not stderr:
+        return None
+    return (accuracy - float(expected["accuracy"])) / stderr

@@ -17,7 +17,7 @@ from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown
 
 from .summary import Summary
-from .words import flow_rows
+from .words import flow_rows, walk_rows
 
 
 def write_markdown(
@@ -71,6 +71,8 @@ def _figures(summary: Summary) -> list[str]:
     ]
     if summary.flow is not None:
         rows += flow_rows(summary.flow.passages, summary.flow.gates)
+    if summary.walks is not None:
+        rows += walk_rows(summary.walks)
     return [
         "## Results",
         "",

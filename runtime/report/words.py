@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pans.runtime.flow.matching import PassageFigures, Share
     from pans.runtime.live.flow_run import FlowFigures
 
-    from .summary import Summary
+    from .summary import Summary, WalkFigures
 
 
 def closing_words(summary: Summary, recording: str, report: str) -> str:
@@ -30,11 +30,56 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
         f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
         f"max {latency['max']:.0f} us; late {summary.late}, lost {summary.lost}",
         *([] if summary.flow is None else flow_words(summary.flow)),
+        *([] if summary.walks is None else walk_words(summary.walks)),
         *(f"  fault         {one_line(fault)}" for fault in summary.faults),
         f"  recording     {one_line(recording)}",
         f"  report        {one_line(report)}",
     ]
     return "\n".join(lines)
+
+
+def walk_rows(walks: WalkFigures) -> list[tuple[str, str]]:
+    """Return name and text of the figures that only an automaton has."""
+    rows = [
+        ("driven by", f"the {walks.drive}"),
+        ("exposures of a walk, dark ones left out", _mean(walks.exposures_mean)),
+    ]
+    if walks.confidence:
+        rows.append((f"abstained below a confidence of {walks.confidence:g}", str(walks.abstained_below_confidence)))
+    if walks.turn_us is not None:
+        turns = ", ".join(f"{name} {value:.0f}" for name, value in walks.turn_us.items())
+        rows.append(("slots that stayed dark because their state was named too late", str(walks.late_slots)))
+        rows.append((f"host's turns in us, of {walks.turn_budget_us:.0f} that the plan leaves", turns))
+    if walks.expected is not None:
+        one, off = walks.expected, walks.expected_off_stderr
+        where = f"{one['profile']}, {one['objects']} objects of {one['split']}"
+        rows.append((f"expected accuracy ({where})", f"{one['accuracy']:.2%} at {one['clicks']:.2f} clicks"))
+        if off is not None:
+            rows.append(("measured less expected accuracy, in standard errors", f"{off:+.2f}"))
+    return rows
+
+
+def walk_words(walks: WalkFigures) -> list[str]:
+    """Return the lines of an automaton's closing words."""
+    lines = [f"  walks         {_mean(walks.exposures_mean)} exposures each, driven by the {walks.drive}"]
+    if walks.confidence:
+        lines.append(
+            f"  confidence    {walks.confidence:g}: {walks.abstained_below_confidence} decisions abstained below it"
+        )
+    if walks.turn_us is not None:
+        turn = walks.turn_us
+        lines.append(
+            f"  host's turn   p50 {turn['p50']:.0f} us, p99 {turn['p99']:.0f} us, p99.9 {turn['p999']:.0f} us, max {turn['max']:.0f} us "
+            f"of {walks.turn_budget_us:.0f} us; late slots {walks.late_slots}"
+        )
+    if walks.expected is not None:
+        one, off = walks.expected, walks.expected_off_stderr
+        beside = "" if off is None else f"; measured {off:+.2f} standard errors from it"
+        lines.append(
+            f"  expected      {one['accuracy']:.2%} at {one['clicks']:.2f} clicks, {one['photons']:.2f} photons "
+            f"({one_line(one['profile'])}, {one_line(one['split'])}){beside}"
+        )
+    return lines
 
 
 def flow_rows(passages: PassageFigures, gates: Mapping[str, int]) -> list[tuple[str, str]]:

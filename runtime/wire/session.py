@@ -52,6 +52,7 @@ class Refusal(NamedTuple):
     command_id: int
     status: int
     text: str
+    opcode: int = Opcode.GATE
 
 
 class HostSession:
@@ -74,7 +75,7 @@ class HostSession:
         self.next_id = 1  # of the next command
         self._waiting: deque[tuple[int, bytes]] = deque()  # not sent yet
         self._unacknowledged: deque[tuple[int, bytes]] = deque()
-        self._may_be_refused: set[int] = set()
+        self._may_be_refused: dict[int, int] = {}  # opcodes by id
         self._retry_due_ns = 0
         self._retry_after_ns = RETRY_FIRST_NS
         self._oldest_ns = 0
@@ -98,7 +99,7 @@ class HostSession:
         if not self.has_room:
             raise LinkError(f"{MAX_WAITING} commands wait for a device that acknowledges none", remedy="check the link")
         if may_be_refused:
-            self._may_be_refused.add(self.next_id)
+            self._may_be_refused[self.next_id] = opcode
         command_id = self.next_id
         self.next_id += 1
         self._waiting.append((command_id, wire.encode_command(command_id, opcode, body, self.nonce)))
@@ -263,14 +264,13 @@ class HostSession:
             acknowledged, _ = self._unacknowledged.popleft()
             self._oldest_ns, self._retry_after_ns = now_ns, RETRY_FIRST_NS
             self._retry_due_ns = now_ns + RETRY_FIRST_NS
-            allowed = acknowledged in self._may_be_refused
-            self._may_be_refused.discard(acknowledged)
+            allowed = self._may_be_refused.pop(acknowledged, None)
             if not ack.refuses(acknowledged):
                 continue
             named = acknowledged == ack.refused_id
             status, text = (ack.status, ack.text) if named else (UNKNOWN_STATUS, "the reason was lost on the way")
-            if allowed:
-                self.refusals.append(Refusal(acknowledged, status, text))
+            if allowed is not None:
+                self.refusals.append(Refusal(acknowledged, status, text, allowed))
                 continue
             name = AckStatus(status).name if status in set(AckStatus) else str(status)
             raise DeviceError(f"the device refused command {acknowledged} ({name}): {text}")

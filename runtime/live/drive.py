@@ -1,0 +1,81 @@
+"""The host's turn in a run that it drives: after each exposure the next state's name leaves at once.
+
+Owns which exposure comes next, what is sent (SHOW) and how long each turn takes; where a walk stands the core says, and what is late the
+stamps say. All bodies but
+their exposure are packed before arming, so that a turn is one look at the walk, one pack and one write.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pans.runtime.bundle.automaton import Automaton
+from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
+from pans.runtime.core.still import Core
+from pans.runtime.core.window import DecisionWindows
+from pans.runtime.link.connection import Connection
+from pans.runtime.timing.ledger import LatencyHistogram
+from pans.runtime.wire.automata import Show, pack_show
+from pans.runtime.wire.messages import Opcode
+
+_EXPOSURE_BYTES = 8  # of SHOW: the exposure, u64, stands first
+
+
+class WalkPlace:
+    """The slots of one plan's walks, `automaton` that it runs."""
+
+    def __init__(self, plan: Plan, automaton: Automaton) -> None:
+        self.automaton = automaton
+        adaptive = plan.slot_pattern == ADAPTIVE_PATTERN
+        slots = np.flatnonzero(adaptive)
+        self._next_step = np.concatenate([[0], np.cumsum(adaptive)]).tolist()  # by slot: steps of the walk before it
+        self._slot_of = slots.tolist()
+        self._slots, self._walks = plan.slots_per_cycle, plan.cycles_per_object
+
+    def following(self, windows: DecisionWindows, next_exposure: int) -> tuple[int, int]:
+        """Return exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
+        cycle, slot = divmod(next_exposure, self._slots)
+        step = self._next_step[slot]
+        if step < len(self._slot_of):
+            state = windows.walk_state(cycle // self._walks, cycle % self._walks, step)
+            if state >= 0:
+                return cycle * self._slots + self._slot_of[step], state
+        return (cycle + 1) * self._slots + self._slot_of[0], 0
+
+
+class HostDriver:
+    """Names states to the device of one run, across reconnections: `begin` after each ARM, `turn` after each block."""
+
+    def __init__(self, core: Core, place: WalkPlace) -> None:
+        self.turns = LatencyHistogram()  # from the arrival of a block until its SHOW had left
+        self._core, self._place = core, place
+        automaton = place.automaton
+        shown = zip(automaton.pattern.tolist(), automaton.dwell.tolist())
+        self._tails = [
+            pack_show(Show(0, state, pattern, dwell, automaton.dwell_steps))[_EXPOSURE_BYTES:]
+            for state, (pattern, dwell) in enumerate(shown)
+        ]
+        self._sent = (-1, -1)
+
+    def begin(self, connection: Connection) -> None:
+        """Name the first state of the first walk, behind ARM; it leaves with it."""
+        self._sent = (-1, -1)
+        self._submit(connection)
+
+    def turn(self, connection: Connection, arrival_ns: int) -> None:
+        """Name what follows the exposures that the core has taken, unless that has been said."""
+        if self._submit(connection):
+            session, now_ns = connection.session, connection.link.now_ns
+            session.poll(now_ns())
+            connection.flush()
+            self.turns.add(now_ns() - arrival_ns)
+
+    def _submit(self, connection: Connection) -> bool:
+        core = self._core
+        following = self._place.following(core.windows, core.tracker.next_exposure)
+        if following == self._sent or following[0] >= core.end_exposure:
+            return False
+        exposure, state = self._sent = following
+        body = exposure.to_bytes(_EXPOSURE_BYTES, "little") + self._tails[state]
+        connection.session.submit(Opcode.SHOW, body, may_be_refused=True)
+        return True

@@ -1,0 +1,92 @@
+"""The page and the exports of a run with an automaton: its tree, walks and states are those of the recorded messages."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from automata import automaton_bundle, random_automaton
+from commands import json_of, page_of, words_of
+
+from pans.runtime.bundle.model import write_bundle
+from pans.runtime.record import Recording, read_recording
+from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.report.page_rates import count_rates
+from pans.runtime.report.page_walks import _first_states, _reliability, _tree_of
+from pans.runtime.wire.messages import DARK_PATTERN, MessageType, decode_clicks, unpack_body
+
+
+@pytest.fixture
+def recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Recording:
+    write_bundle(
+        automaton_bundle(random_automaton(4, slots=6, width=5), levels=2, photons_per_level=0.7), tmp_path / "walk.pans"
+    )
+    images = np.random.default_rng(2).integers(0, 256, (30, 2, 2)).astype(np.uint8)
+    labels = np.arange(30, dtype=np.int16) % 3
+    np.savez(tmp_path / "tiny.npz", images=images, labels=labels, classes=np.array(["c0", "c1", "c2"]))
+    device = f"sim:dmd-spad?scene={tmp_path / 'tiny.npz'}&seed=5&pace=fast"
+    words = ("--device", device, "--decisions", 60, "--trials", 2, "--out", tmp_path / "run")
+    json_of(capsys, "", "run", tmp_path / "walk.pans", *words, code=None)
+    return read_recording(tmp_path / "run" / "run.pansrec")
+
+
+def shown_states(recording: Recording) -> list[tuple[int, int]]:
+    """Every lit exposure's stamp and click, message by message."""
+    found = []
+    for _, body in recording.messages():
+        frame = unpack_body(body)
+        if frame.type == MessageType.CLICKS:
+            block = decode_clicks(frame.payload)
+            found += list(zip(block.patterns.tolist(), block.bits.tolist()))
+    return [(stamp, bit) for stamp, bit in found if stamp != DARK_PATTERN]
+
+
+def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) -> None:
+    plan = recorded_plan(recording)
+    assert plan.automaton is not None
+    states = shown_states(recording)
+    times, clicks = Counter(state for state, _ in states), Counter(state for state, bit in states if bit)
+    nodes = _first_states(plan.automaton)
+    tree = _tree_of(plan.automaton, nodes, count_rates(recording, plan))
+    assert [node.state for node in tree] == nodes.tolist()
+    assert tree[0].share == 1.0
+    for node in tree:
+        assert node.share == times[node.state] / times[0]
+        assert np.isnan(node.rate) if not times[node.state] else node.rate == clicks[node.state] / times[node.state]
+        for outcome, lead in enumerate(node.leads):
+            successor = int(plan.automaton.successors[node.state, outcome])
+            assert lead == (nodes.tolist().index(successor) if successor in nodes else -1)
+
+
+def test_the_page_has_the_walks(recording: Recording, tmp_path: Path) -> None:
+    words = words_of(page_of(recording.path, tmp_path))
+    decisions = recording.decisions()
+    assert f"{decisions['exposures'].mean():.2f} exposures of 6 at most" in words
+    assert "the automaton was driven by the" in words
+    assert "step of the walk" in words
+
+
+def test_reliability_is_that_of_the_decisions() -> None:
+    probability = np.array([0.05, 0.32, 0.38, 0.38, 1.0], np.float32)
+    right = np.array([False, True, False, True, True])
+    bins = _reliability(probability, right)
+    assert [round(share, 3) for _, _, share in bins] == [0.2, 0.6, 0.2]
+    assert [accuracy for _, accuracy, _ in bins] == pytest.approx([0, 2 / 3, 1])
+    assert bins[1][0] == pytest.approx(0.36)
+
+
+def test_exports_have_states_and_exposures(
+    recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    json_of(capsys, "export", recording.path, "--format", "csv", "-o", tmp_path / "csv")
+    plan = recorded_plan(recording)
+    assert plan.automaton is not None
+    with (tmp_path / "csv" / "clicks.csv").open(newline="") as file:
+        clicks = [row for row in csv.DictReader(file) if row["dark_slot"] == "0"]
+    assert [int(row["state"]) for row in clicks] == [state for state, bit in shown_states(recording) if bit]
+    assert [int(row["pattern"]) for row in clicks] == plan.automaton.pattern[[int(r["state"]) for r in clicks]].tolist()
+    with (tmp_path / "csv" / "decisions.csv").open(newline="") as file:
+        assert [int(row["exposures"]) for row in csv.DictReader(file)] == recording.decisions()["exposures"].tolist()
