@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.cli import say
@@ -29,6 +30,7 @@ from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
 from pans.runtime.record import Recorder
 
 from .rows import BenchOptions, Row, table_text
+from .walks import made_automaton
 
 SLOTS_US = (1000.0, 100.0)
 DEADLINE_US = 10_000.0
@@ -39,22 +41,37 @@ RECOVER_S = 30.0
 
 
 def bench_loop(options: BenchOptions) -> list[Row]:
-    """Return one row for each slot length, with and without asking for real-time privileges; each takes `seconds`."""
+    """Return one row for each slot length, with and without asking for real-time privileges, then for an automaton, driven by the device
+    and by the host; each takes `seconds`. A bundle of an automaton has the latter alone.
+    """
     bundle, _ = load_bundle(options.first_bundle)
-    runs = [(slot, realtime) for slot in SLOTS_US for realtime in (True, False)]
+    walks = made_automaton() if bundle.automaton is None else bundle
+    runs = [_Asked(bundle, slot, realtime) for slot in SLOTS_US for realtime in (True, False)]
+    runs = runs if bundle.automaton is None else []
+    runs += [_Asked(walks, SLOTS_US[0], True, drive) for drive in ("device", "host")]
     rows = []
     with _busy(BUSY_PROCESSES if options.load else 0):
-        for slot_us, realtime in runs:
-            rows.append(_run(bundle, slot_us, realtime, options.seconds, options.load))
+        for asked in runs:
+            rows.append(_run(asked, options.seconds, options.load))
             say(table_text(rows[-1:]))
     return rows
 
 
-def _run(bundle: Bundle, slot_us: float, realtime: bool, seconds: float, load: bool) -> Row:
+class _Asked(NamedTuple):
+    """What one run is to be: exposures of `slot_us`, and who drives an automaton."""
+
+    bundle: Bundle
+    slot_us: float
+    realtime: bool
+    drive: str = "auto"
+
+
+def _run(asked: _Asked, seconds: float, load: bool) -> Row:
+    bundle, slot_us, realtime, drive = asked
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
         profile = _profile(bundle, slot_us, path)
-        plan = build_plan(profile, bundle)
+        plan = build_plan(profile, bundle, drive=drive)
         core = Core(plan, make_decider(bundle), 1, 0)
         others = _children()
         link = open_link(f"sim:{path}?scene=fashion200&seed=1&pace=real")
@@ -69,13 +86,21 @@ def _run(bundle: Bundle, slot_us: float, realtime: bool, seconds: float, load: b
             recorder.close({})
         cpu_s = time.process_time() - started
     latency = result.timing.total.summary()
-    asked = "real time asked for" if realtime else "ordinary"
+    wanted = "real time asked for" if realtime else "ordinary"
+    walks: Row = {}
+    if drive == "host":
+        turns = {f"turn_{name}_us": round(value, 1) for name, value in result.turn_us.items()}
+        budget_us = round((plan.slot_period_ticks - plan.exposure_ticks) * plan.tick_us, 1)
+        walks = {**turns, "turn_budget_us": budget_us, "late_slots": result.late_slots}
+    slots_hz = 1e6 / (plan.slot_period_ticks * plan.tick_us)
+    driven = "" if plan.automaton is None else f", an automaton driven by the {drive}"
     granted = {name: value for name, value in result.realtime.items() if name in ("sched_fifo", "mlockall")}
     return {
-        "name": f"SIMULATED loop, {1e6 / slot_us:.0f} slots/s, {asked}{', under load' if load else ''}",
+        "name": f"SIMULATED loop, {slots_hz:.0f} slots/s, {wanted}{driven}{', under load' if load else ''}",
         **{f"{name}_us": round(value, 1) for name, value in latency.items()},
         "deadline_us": DEADLINE_US,
         "decisions": result.tally.decisions,
+        **walks,
         "late": result.timing.late,
         "blame": dict(result.timing.blame),
         "late_cause": dict(result.late_cause),

@@ -38,7 +38,12 @@ from .rows import Row, cpu_time, latencies_us, per_item_ns, percentiles_us
 
 SESSION = 0x5EED
 CLICK, DARK_CLICK = 0.15, 0.01  # about what walks of trained automata and dark slots give
-SLOTS, WIDTH, CLASSES, PATTERNS, PIXELS = 48, 256, 10, 1000, 16  # of the made-up automaton
+SLOTS, WIDTH, CLASSES, PATTERNS = 48, 256, 10, 1000  # of the made-up automaton
+SIDE, LIT_SHARE, LIT_PHOTONS = (
+    28,
+    0.05,
+    0.02,
+)  # pixels of its patterns; which share is lit, with how many photoelectrons
 TICK_HZ = 1_000_000
 READ_BYTES = 1 << 18
 WORDS = 20_000
@@ -58,10 +63,10 @@ def made_automaton() -> Bundle:
     posteriors = rng.dirichlet(np.full(CLASSES, 0.3), n_states + n_leaves)
     pattern = rng.integers(0, PATTERNS, n_states)
     automaton = reachable_automaton(pattern, np.ones(n_states, np.int64), 1, successors, posteriors)
-    shown = Shown(2, np.eye(PIXELS, dtype=np.int64)[np.arange(PATTERNS) % PIXELS], 0.1)
+    shown = Shown(2, (rng.random((PATTERNS, SIDE * SIDE)) < LIT_SHARE).astype(np.int64), LIT_PHOTONS)
     names = [str(number) for number in range(CLASSES)]
     return make_bundle(
-        name=f"made-up automaton of {automaton.n_states} states", task="speed", classes=names, image_shape=(4, 4), optics=shown,
+        name=f"made-up automaton of {automaton.n_states} states", task="speed", classes=names, image_shape=(SIDE, SIDE), optics=shown,
         automaton=automaton, provenance={},
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=Range(0.01, 86_400).option,
         default=5.0,
-        help="loop: length of each of its four runs (default 5)",
+        help="loop: length of each of its six runs (default 5)",
     )
     parser.add_argument("--load", action="store_true", help="loop: keep both cores busy with other processes")
     parser.add_argument(

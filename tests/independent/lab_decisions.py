@@ -224,7 +224,7 @@ class Decisions:
         truth = -1 if self.object == NO_OBJECT else self.marks.get(self.object, -1)
         clicks, crc = int(window.counts.sum()), zlib.crc32(window.counts.astype("<i8").tobytes())
         place = (len(self.rows), tick, last, self.object, shot)
-        self.rows.append((*place, clicks, label, truth, flags, probability, crc))
+        self.rows.append((*place, clicks, label, truth, flags, probability, crc, 0))
         self.next_window += 1
 
     # -- the end -------------------------------------------------------------------------------------------------------

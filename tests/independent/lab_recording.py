@@ -20,7 +20,7 @@ HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSW
 LIMITS = {kind: 2 * MIB for kind in range(1, 11)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
-ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:]])
+ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:], ("exposures", "<u4")])
 RUN = np.dtype(
     [
         *PLACE,
@@ -73,7 +73,7 @@ def iter_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, payload) of every block, with the chain of checksums checked."""
     magic, version, chain = struct.unpack_from("<8sII", data)
     demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain, "no recording")
-    demand(version in (2, 3), f"version {version}")
+    demand(version in (2, 3, 4), f"version {version}")
     known = set(LIMITS) - ({ANSWERS} if version == 2 else set())
     at, index, kind = 16, 0, 0
     while at < len(data):
@@ -130,20 +130,25 @@ class DecisionLog:
     def __init__(self) -> None:
         self.rows: list[tuple[Any, ...]] = []
         self._known: list[Any] = []
-        self._hashes = [hashlib.sha256() for _ in range(3)]  # verdicts, codes, whole runs
+        self._hashes = [hashlib.sha256() for _ in range(4)]  # verdicts, codes, whole runs, exposures
+        self._walks = False  # whether any exposures were above 0
         self._open: NDArray[np.void] | None = None  # the last run, which may go on
 
     def take(self, payload: bytes) -> None:
         """Add the decisions of one block."""
         n_runs, n_verdicts, n_rows = struct.unpack_from("<III", payload)
         codes_at = 12 + 52 * n_runs + 18 * n_verdicts
-        demand(n_rows <= 1 << 18 and len(payload) == codes_at + 2 * n_rows, "sizes of a block of decisions")
+        end = codes_at + 2 * n_rows
+        demand(n_rows <= 1 << 18 and len(payload) in (end, end + 4 * n_verdicts), "sizes of a block of decisions")
+        exposures = (
+            list(struct.unpack_from(f"<{n_verdicts}I", payload, end)) if len(payload) > end else [0] * n_verdicts
+        )
         runs = np.frombuffer(payload, RUN, n_runs, 12)
         verdicts = np.frombuffer(payload, np.dtype(VERDICT), n_verdicts, 12 + 52 * n_runs)
         codes = np.frombuffer(payload, "<u2", n_rows, codes_at)
         demand(int(runs["count"].sum(dtype=np.int64)) == n_rows and bool(runs["count"].all()), "runs of a block")
         demand(not runs["continues"][1:].any() and runs["continues"].max(initial=0) <= 1, "continued runs")
-        following = iter(verdicts)
+        following = zip(verdicts.tolist(), exposures)
         places = (place for run in runs for place in _places(run))
         for code, (place, truth) in zip(codes.tolist(), places):
             demand(code == NO_NUMBER or code <= len(self._known), "a code without its verdict")
@@ -155,10 +160,12 @@ class DecisionLog:
                     self._known.append(verdict)
             else:
                 verdict = self._known[code]
-            clicks, label, flags, probability, counts_crc = verdict
-            self.rows.append((*place, clicks, label, truth, flags, probability, counts_crc))
+            (clicks, label, flags, probability, counts_crc), walked = verdict
+            self.rows.append((*place, clicks, label, truth, flags, probability, counts_crc, walked))
         demand(next(following, None) is None, "too many verdicts")
         self._hash(runs, verdicts.tobytes(), codes.tobytes())
+        self._hashes[3].update(struct.pack(f"<{n_verdicts}I", *exposures))
+        self._walks = self._walks or any(exposures)
 
     def _hash(self, runs: NDArray[np.void], verdicts: bytes, codes: bytes) -> None:
         self._hashes[0].update(verdicts)
@@ -180,7 +187,8 @@ class DecisionLog:
         runs = self._hashes[2].copy()
         if self._open is not None:
             runs.update(self._open.tobytes())
-        digests = (self._hashes[0].digest(), self._hashes[1].digest(), runs.digest())
+        digests = [self._hashes[0].digest(), self._hashes[1].digest(), runs.digest()]
+        digests += [self._hashes[3].digest()] if self._walks else []
         return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
