@@ -10,9 +10,7 @@ order or late; every gate is executed or its refusal is reported.
 from __future__ import annotations
 
 import zlib
-from collections import deque
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,71 +23,19 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.live import LiveRun
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_gate
+from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import ClickBlock, FrameBlock, Mark
 from pans.runtime.wire.tracker import Gap
 
-from .truths import walk_truth, window_members
+from .books import DELIVERED, EMITTED, LOST, NO_BOOKS, RING, CheckCounts, DeviceBooks, Entry, Stream
+from .truths import decoded, walk_truth, window_members
 
 if TYPE_CHECKING:
     from pans.firmware_sim.device.parallel import FrameRun
 
-RING = 1 << 17  # exposures of a stream that are remembered
 MAX_VIOLATIONS = 20
 MAX_SESSIONS = 8  # streams that are remembered
 MAX_GATES = 4096
-EMITTED, DELIVERED, LOST = 1, 2, 3
-
-
-class Entry(NamedTuple):
-    """One block as it left the detector; `dropped` when the device's buffer was full."""
-
-    first: int
-    exposures: int
-    clicks: bytes
-    object_index: int
-    dropped: bool
-
-
-@dataclass(slots=True)
-class Stream:
-    """Books of one session's stream."""
-
-    entries: deque[Entry] = field(default_factory=deque)
-    state: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(RING, np.uint8))
-    clicks: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(RING, np.uint64))  # bit c: channel c
-    stamps: NDArray[np.uint16] = field(default_factory=lambda: np.zeros(RING, np.uint16))  # of an automaton's exposures
-    emitted_to: int = 0
-    accounted_to: int = 0
-    next_window: int = 0
-    open_end: bool = False  # the host has said that it does not know how this stream ended
-
-
-class DeviceBooks(NamedTuple):
-    """What the device has made in one session: exposures, how many of those it dropped, and whether the host knew the end."""
-
-    exposures: int
-    dropped: int
-    end_known: bool
-
-
-NO_BOOKS = DeviceBooks(0, 0, True)
-
-
-@dataclass(slots=True)
-class CheckCounts:
-    """How much was checked: a check that saw nothing proves nothing."""
-
-    frames_emitted: int = 0
-    blocks_delivered: int = 0
-    blocks_lost: int = 0
-    blocks_lost_open_end: int = 0
-    decisions: int = 0
-    decisions_flagged: int = 0
-    commands: int = 0
-    gates_submitted: int = 0
-    gates_executed: int = 0
-    gates_refused: int = 0
-    streams: int = 0
 
 
 class Checker:
@@ -114,6 +60,7 @@ class Checker:
         self._byte_weights = np.uint64(1) << np.arange(0, 64, 8, dtype=np.uint64)
         self._streams: dict[int, Stream] = {}
         self._host_session = 0
+        self._stepped = False  # by the message that the host takes now
         self._last_command: dict[tuple[int, int], int] = {}
         self._gates: dict[tuple[int, int], Gate] = {}  # submitted: (session, command id)
         self._asked: dict[Gate, None] = {}
@@ -197,13 +144,29 @@ class Checker:
             self.counts.streams += 1
             return output
 
-        taps = {"step": lambda frame: self._on_output(step(frame)), "end": lambda: self._on_output(end())}
+        step_messages = core.step_messages
+
+        def tapped_step(frame: wire.Frame) -> Output:
+            self._stepped = True
+            return self._on_output(step(frame))
+
+        def tapped_messages(messages: Messages, place: int) -> tuple[int, Output]:
+            """What compiled steps take in one piece follows without a gap; all else comes by `step`."""
+            self._stepped = False
+            taken, output = step_messages(messages, place)
+            if not self._stepped:
+                for one in range(place, place + taken):
+                    self._on_accept(decoded(messages.frame(one)), None)
+                self._on_output(output)
+            return taken, output
+
         for owner, name, tap in (
             (core.tracker, "accept", tapped_accept),
             (core.tracker, "finish", tapped_finish),
             (core, "begin", tapped_begin),
-            (core, "step", taps["step"]),
-            (core, "end", taps["end"]),
+            (core, "step", tapped_step),
+            (core, "step_messages", tapped_messages),
+            (core, "end", lambda: self._on_output(end())),
         ):
             setattr(owner, name, tap)
 

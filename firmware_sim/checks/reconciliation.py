@@ -28,7 +28,7 @@ from pans.runtime.wire import DeviceState, FrameDecoder, MessageType, Opcode, St
 from pans.runtime.wire.messages import decode_command, pack_body, unpack_body
 from pans.runtime.wire.session import ANSWER_TYPES
 
-from .checkers import DeviceBooks
+from .books import DeviceBooks
 
 STREAM = frozenset((MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
 RECORDED = STREAM | {MessageType.STATUS}

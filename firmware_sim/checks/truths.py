@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
-from pans.runtime.wire.messages import DARK_PATTERN
+from pans.runtime.wire.messages import (
+    DARK_PATTERN,
+    ClickBlock,
+    Frame,
+    FrameBlock,
+    Mark,
+    MessageType,
+    decode_clicks,
+    decode_frames,
+    decode_mark,
+)
 
 
 class WalkTruth(NamedTuple):
@@ -21,6 +31,13 @@ class WalkTruth(NamedTuple):
     taken: int
     clicks: NDArray[np.int64]
     ended: bool
+
+
+def decoded(frame: Frame) -> ClickBlock | FrameBlock | Mark:
+    """Return the stream message of a frame."""
+    if frame.type == MessageType.CLICKS:
+        return decode_clicks(frame.payload)
+    return decode_frames(frame.payload) if frame.type == MessageType.FRAMES else decode_mark(frame.payload)
 
 
 def walk_truth(automaton: Automaton, stamps: list[int], clicks: list[int]) -> WalkTruth:
