@@ -99,9 +99,11 @@ def sent_to_device(recording: Recording) -> Sent:
 
 def automaton_of(config: Mapping[str, Any], bundle: Bundle | None) -> Automaton | None:
     """Return the automaton that a run with this `config` followed, None of fixed patterns; KeyError or ValueError if it does not tell."""
-    if not config.get("drive"):
-        return None
     automaton = None if bundle is None else bundle.automaton
+    if not config.get("drive"):
+        if automaton is not None:
+            raise ValueError("config.drive is missing: the recording does not say who drove its automaton")
+        return None
     if automaton is None:
         raise ValueError("the run followed an automaton, which is not in the recording")
     confidence = float(config["confidence"])

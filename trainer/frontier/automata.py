@@ -52,7 +52,7 @@ def automaton_recipe(budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
     from pans.trainer.adaptive.options import AutomatonOptions, with_defaults
 
     options = AutomatonOptions(seed=seed, **budget)
-    exposures, states = with_defaults(options)
+    exposures, states = with_defaults(options, load_profile(PROFILE))
     return replace(options, exposures=exposures, states=states)
 
 

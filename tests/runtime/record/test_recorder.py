@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from automata import automaton_bundle
 from bundles import made_bundle
 
 from pans.runtime.bundle.model import bundle_bytes
@@ -22,6 +23,7 @@ from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.format import TIMING_DTYPE, Kind
 from pans.runtime.record.log import decision_log_sha256
+from pans.runtime.record.sent_plan import automaton_of
 from pans.runtime.timing.clock import CLOCK_DTYPE
 
 HEADER = {"created_utc": "2025-01-01T00:00:00+00:00", "simulated": True, "seed": 7}
@@ -403,3 +405,13 @@ def test_decisions_in_bulk_make_the_same_log(tmp_path: Path) -> None:
         assert recorder.close({}) == digest == decision_log_sha256(wanted)
     for path in (one, many):
         np.testing.assert_array_equal(read_recording(path).decisions(), wanted)
+
+
+def test_a_recording_must_say_who_drove_its_automaton() -> None:
+    walks, fixed = automaton_bundle(), made_bundle(table=np.zeros((4, 2)))
+    assert automaton_of({}, fixed) is None
+    assert automaton_of({"drive": "device", "confidence": 0.0}, walks) is walks.automaton
+    with pytest.raises(ValueError, match="does not say who drove"):
+        automaton_of({"confidence": 0.0}, walks)
+    with pytest.raises(ValueError, match="not in the recording"):
+        automaton_of({"drive": "host", "confidence": 0.0}, fixed)
