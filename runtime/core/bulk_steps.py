@@ -23,8 +23,9 @@ from . import stream_kernels as kernels
 from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag, Output
 from .follower import Follower
 from .plan import Plan
-from .stream_kernels import DecisionTables, MarkArrays, WindowArrays
+from .stream_kernels import DecisionTables, MarkArrays
 from .window import DecisionWindows
+from .window_kernels import WindowArrays
 
 ROWS_PER_BATCH = 8192
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16

@@ -18,65 +18,25 @@ from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
-from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, Walks, add_exposures, add_walks
+from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, add_exposures, add_walks, complete, spill, sum_up
 
 # state, int64 (N_STATE,): where the stream stands (stream.N_PLACE columns), where the walk stands, and what it continues of Core and
 # DecisionWindows
-MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT, N_DECISIONS, N_ABSTAINED, LAST_TICK = range(
-    stream.N_PLACE, stream.N_PLACE + 10
-)
-(
-    EXPOSURE_TICKS,
-    VISIT_EXPOSURES,
-    SHOTS,
-    START_TICK,
-    PERIOD_TICKS,
-    CYCLE_TICKS,
-    N_CLASSES,
-    JITTER,
-    STEPS,
-    KIND,
-    N_STATE,
-) = range(
-    LAST_TICK + 1, LAST_TICK + 12
-)  # STEPS: blocks that may be taken before the kernel returns, and then no marks, 0: any number; KIND: of the plan's blocks
+MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT = range(stream.N_PLACE, stream.N_PLACE + 7)
+N_DECISIONS, N_ABSTAINED, LAST_TICK, JITTER = range(OBJECT + 1, OBJECT + 5)
+EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES = range(JITTER + 1, JITTER + 8)
+# blocks that may be taken before the kernel returns, and then no marks (0: any number); the kind of the plan's blocks
+STEPS, KIND, N_STATE = range(N_CLASSES + 1, N_CLASSES + 4)
 ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_messages` returns
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64
-_LANE = _U(0xFF)
 _ABSTAINED = int(DecisionFlag.ABSTAINED)
-_GAP = int(DecisionFlag.GAP) | _ABSTAINED
-_WRONG = int(DecisionFlag.WRONG_PATTERN) | _ABSTAINED
-_NOT_FINITE = int(DecisionFlag.NOT_FINITE) | _ABSTAINED
-_AMBIGUOUS = int(DecisionFlag.AMBIGUOUS) | _ABSTAINED
-_DARK = DARK_PATTERN
+_GAP, _WRONG = int(DecisionFlag.GAP) | _ABSTAINED, int(DecisionFlag.WRONG_PATTERN) | _ABSTAINED
+_NOT_FINITE, _AMBIGUOUS = int(DecisionFlag.NOT_FINITE) | _ABSTAINED, int(DecisionFlag.AMBIGUOUS) | _ABSTAINED
 _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
 ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
-
-
-class WindowArrays(NamedTuple):
-    """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
-
-    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, from plausible.py's rules.
-    `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
-    `stamps` uint16 and `bits` uint8 (65535,) are the patterns shown and the clicks of the latest CLICKS block.
-    """
-
-    feature_at: npt.NDArray[np.int32]
-    window_at: npt.NDArray[np.int32]
-    last: npt.NDArray[np.int64]
-    counts: npt.NDArray[np.int64]
-    seen: npt.NDArray[np.int64]
-    tallies: npt.NDArray[np.int64]
-    walks: Walks
-    longest: npt.NDArray[np.int64]
-    lanes: npt.NDArray[np.uint64]
-    whole: npt.NDArray[np.int64]
-    offsets: npt.NDArray[np.int64]
-    stamps: npt.NDArray[np.uint16]
-    bits: npt.NDArray[np.uint8]
 
 
 class DecisionTables(NamedTuple):
@@ -215,7 +175,7 @@ def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-un
     n_states = windows.walks.successors.shape[0]
     if n_states:
         for i in range(count):
-            if stamps[i] >= n_states and stamps[i] != _DARK:
+            if stamps[i] >= n_states and stamps[i] != DARK_PATTERN:
                 return False
     if not _accept(buffer, payload, count, state, windows):
         return False
@@ -359,12 +319,12 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
         at += block.word_bytes
         if block.relative + i != last[here]:
             if held == 255:
-                _spill(lanes, counts, seen, here, held)
+                spill(lanes, counts, seen, here, held)
                 held = 0
             continue
-        _complete(lanes, counts, seen, here, held, whole)
+        complete(lanes, counts, seen, here, held, whole)
         held = 0
-        clicks, index, crc = _sum_up(whole, radix, crc_table, crc_zero)
+        clicks, index, crc = sum_up(whole, radix, crc_table, crc_zero)
         label, probability, flags = np.int64(_NO_LABEL), np.float32(0.0), 0
         if seen[here, 0] != shots * n_features:
             flags = _GAP
@@ -379,7 +339,7 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
             done = i + 1
             break
     if held:
-        _spill(lanes, counts, seen, window, held)
+        spill(lanes, counts, seen, window, held)
     state[N_ROWS], state[FRAME] = n_rows, done
 
 
@@ -395,7 +355,7 @@ def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no
             return True
         if state[N_ROWS] == rows.size:
             return False
-        clicks, row, crc = _sum_up(counts[index], tables.radix, tables.crc, tables.crc_zero[0])
+        clicks, row, crc = sum_up(counts[index], tables.radix, tables.crc, tables.crc_zero[0])
         label, probability = np.int64(_NO_LABEL), np.float32(0.0)
         flags = (_WRONG if wrong else 0) | (_GAP if right + wrong < need[index] else 0)
         if flags == 0 and tables.labels.size:
@@ -439,52 +399,3 @@ def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-de
     row["exposures"] = 0
     state[N_DECISIONS] += 1
     state[N_ABSTAINED] += flags != 0
-
-
-@njit(cache=True, nogil=True)
-def _complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
-    """The counts of a window whose last exposure has come, into `whole`."""
-    if seen[window, 0] != 0:  # it began in an earlier block
-        _spill(lanes, counts, seen, window, held)
-        for feature in range(whole.size):
-            whole[feature] = counts[window, feature]
-    else:
-        _unpack(lanes, whole)
-        seen[window, 0] = held * whole.size
-
-
-@njit(cache=True, nogil=True)
-def _spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
-    """Add the byte lanes to the counts of their window."""
-    n_features = counts.shape[1]
-    for p in range(lanes.size):
-        lane = lanes[p]
-        for feature in range(8 * p, min(8 * p + 8, n_features)):
-            counts[window, feature] += np.int64(lane & _LANE)
-            lane >>= _U(8)
-    seen[window, 0] += held * n_features
-
-
-@njit(cache=True, nogil=True)
-def _unpack(lanes, whole):  # type: ignore[no-untyped-def]
-    """The byte lanes as counts: all of a window that one block holds."""
-    for p in range(lanes.size):
-        lane = lanes[p]
-        for feature in range(8 * p, min(8 * p + 8, whole.size)):
-            whole[feature] = np.int64(lane & _LANE)
-            lane >>= _U(8)
-
-
-@njit(cache=True, nogil=True)
-def _sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
-    """Clicks, row of the table and checksum of a window's counts."""
-    clicks, index = np.int64(0), np.int64(0)
-    for feature in range(whole.size):
-        count = whole[feature]
-        clicks += count
-        index += count * radix[feature]
-        crc ^= crc_table[0, feature, count & 0xFF]
-    for byte in range(1, crc_table.shape[0]):
-        for feature in range(whole.size):
-            crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
-    return clicks, index, crc

@@ -148,7 +148,7 @@ class DecisionWindows:
         return bool(self._seen[self._next_window :].any())
 
     def arrays(self) -> tuple[I32, I32, I64, I64, I64, I64, Walks, I64]:
-        """Return the arrays that hold the visit under way, the first eight of stream_kernels.WindowArrays."""
+        """Return the arrays that hold the visit under way, the first eight of window_kernels.WindowArrays."""
         visit = self._counts, self._seen, self.tallies
         return self._feature_at, self._window_at, self._last, *visit, self.walks, self._longest
 

@@ -1,4 +1,4 @@
-"""The compiled kernels of the windows: exposures in; clicks, and how many exposures were right, out.
+"""The compiled kernels of the windows: exposures in; clicks, and how many exposures were right, out. Sums over a whole window's clicks.
 
 Owns the loops, and with them what every exposure of a visit means; never allocates. The arrays are window.DecisionWindows'.
 
@@ -17,6 +17,8 @@ from numba import njit
 from pans.runtime.wire.schema import DARK_PATTERN
 
 DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
+_U = np.uint64
+_LANE = _U(0xFF)
 BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong state: nobody knows
 
 
@@ -33,6 +35,29 @@ class Walks(NamedTuple):
     need: npt.NDArray[np.int64]
     last: npt.NDArray[np.int64]
     shown: npt.NDArray[np.int64]
+
+
+class WindowArrays(NamedTuple):
+    """The open windows of one visit (arrays of window.DecisionWindows) and the kernel's scratch.
+
+    `offsets` int64 (slots of a cycle,) are the ticks at which exposures begin, from plausible.py's rules.
+    `lanes` uint64 (ceil(d_f / 8),) counts eight channels each, a byte per channel; `whole` int64 (d_f,) is one window's counts.
+    `stamps` uint16 and `bits` uint8 (65535,) are the patterns shown and the clicks of the latest CLICKS block.
+    """
+
+    feature_at: npt.NDArray[np.int32]
+    window_at: npt.NDArray[np.int32]
+    last: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.int64]
+    seen: npt.NDArray[np.int64]
+    tallies: npt.NDArray[np.int64]
+    walks: Walks
+    longest: npt.NDArray[np.int64]
+    lanes: npt.NDArray[np.uint64]
+    whole: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
+    stamps: npt.NDArray[np.uint16]
+    bits: npt.NDArray[np.uint8]
 
 
 @njit(cache=True, nogil=True)
@@ -116,3 +141,52 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
             tallies[DARK_CLICKS] += bits[i]
         elif node != BROKEN:
             tallies[WRONG_PATTERNS] += 1
+
+
+@njit(cache=True, nogil=True)
+def complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
+    """The counts of a window whose last exposure has come, into `whole`."""
+    if seen[window, 0] != 0:  # it began in an earlier block
+        spill(lanes, counts, seen, window, held)
+        for feature in range(whole.size):
+            whole[feature] = counts[window, feature]
+    else:
+        unpack(lanes, whole)
+        seen[window, 0] = held * whole.size
+
+
+@njit(cache=True, nogil=True)
+def spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
+    """Add the byte lanes to the counts of their window."""
+    n_features = counts.shape[1]
+    for p in range(lanes.size):
+        lane = lanes[p]
+        for feature in range(8 * p, min(8 * p + 8, n_features)):
+            counts[window, feature] += np.int64(lane & _LANE)
+            lane >>= _U(8)
+    seen[window, 0] += held * n_features
+
+
+@njit(cache=True, nogil=True)
+def unpack(lanes, whole):  # type: ignore[no-untyped-def]
+    """The byte lanes as counts: all of a window that one block holds."""
+    for p in range(lanes.size):
+        lane = lanes[p]
+        for feature in range(8 * p, min(8 * p + 8, whole.size)):
+            whole[feature] = np.int64(lane & _LANE)
+            lane >>= _U(8)
+
+
+@njit(cache=True, nogil=True)
+def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
+    """Clicks, row of the table and checksum of a window's counts."""
+    clicks, index = np.int64(0), np.int64(0)
+    for feature in range(whole.size):
+        count = whole[feature]
+        clicks += count
+        index += count * radix[feature]
+        crc ^= crc_table[0, feature, count & 0xFF]
+    for byte in range(1, crc_table.shape[0]):
+        for feature in range(whole.size):
+            crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
+    return clicks, index, crc
