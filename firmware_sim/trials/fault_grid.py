@@ -39,7 +39,7 @@ from pans.runtime.wire.commands import Gate
 from . import Report, Trial, figures_text
 
 SHOTS = 1
-MODES = ("sequential", "parallel", "device-driven")
+MODES = ("sequential", "parallel", "device-driven", "host-driven")
 GATE_EVERY = 32  # decisions
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
