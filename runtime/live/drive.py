@@ -75,6 +75,10 @@ class HostDriver:
         following = self._place.following(core.windows, core.tracker.next_exposure)
         if following == self._sent or following[0] >= core.end_exposure:
             return False
+        if (
+            not connection.session.sends_at_once
+        ):  # what waits for acknowledgements comes late: the next walk is named in time
+            return False
         exposure, state = self._sent = following
         body = exposure.to_bytes(_EXPOSURE_BYTES, "little") + self._tails[state]
         connection.session.submit(Opcode.SHOW, body, may_be_refused=True)

@@ -131,6 +131,11 @@ class HostSession:
         return len(self._waiting) < MAX_WAITING
 
     @property
+    def sends_at_once(self) -> bool:
+        """Whether a command that is submitted now leaves at the next `poll`, and waits for no acknowledgement."""
+        return len(self._unacknowledged) + len(self._waiting) < COMMAND_WINDOW
+
+    @property
     def in_flight(self) -> int:
         """Commands that the device has not dealt with, waiting ones too."""
         return len(self._waiting) + len(self._unacknowledged)

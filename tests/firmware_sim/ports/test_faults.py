@@ -19,6 +19,9 @@ from pans.firmware_sim.ports.faults import NAMES, NO_FAULTS, USUAL, Faults, Recu
 from pans.firmware_sim.ports.faulty import FaultCounters, FaultyDevice, Lane
 from pans.firmware_sim.ports.serve import open_sim, parse_sim_url
 from pans.firmware_sim.trials.fault_grid import MODES, case_faults, run_case
+from pans.runtime.core import stream_kernels
+from pans.runtime.core.follower import Follower
+from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.decide.table import TableDecider
 from pans.runtime.errors import ConfigError, LinkError, UsageError
@@ -317,6 +320,18 @@ def test_a_window_that_is_skipped_is_found(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_miscounted_clicks_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = stream_kernels.walk_messages
+
+    def wrong(*arguments: Any) -> Any:
+        ended = original(*arguments)
+        arguments[6]["counts_crc"] ^= 1  # of the rows
+        return ended
+
+    monkeypatch.setattr(stream_kernels, "walk_messages", wrong)
+    assert found("none", "other clicks than were emitted")
+
+
+def test_changed_clicks_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     original = wire.decode_clicks
 
     def wrong(payload: bytes) -> wire.ClickBlock:
@@ -324,6 +339,7 @@ def test_miscounted_clicks_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
         return block if block.exposure_index % 50 else block._replace(bits=block.bits ^ np.uint8(1))
 
     monkeypatch.setattr(wire, "decode_clicks", wrong)
+    monkeypatch.setattr(Core, "step_messages", Follower.step_messages)  # message by message
     assert found("none", "repeated, changed")
 
 
