@@ -52,7 +52,8 @@ GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one 
 REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/training.md)
-UNDER_BUDGET = 0.99  # of the budget is what the held-back objects may take: others take a little more or less
+BUDGET_BLOCKS = 6  # of objects, by which the budget is met
+UNDER_BUDGET = 0.99  # of the budget is what they may take: others take a little more or less
 DIMMINGS = 4  # steps of the search for the brightness that meets the budget
 STAGES = ("grow", "grey", "shown")
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
@@ -311,7 +312,7 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        self._meet_budget(held_back)
+        self._meet_budget()
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
         if grid is not None:
             to_grid(self.machine, grid)
@@ -323,12 +324,17 @@ class _Run:
             arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
         )
 
-    def _meet_budget(self, held_back: list[Block]) -> None:
-        """Dim or brighten all patterns alike until the held-back objects take 99 % of the budget; a few percent at most."""
+    def _meet_budget(self) -> None:
+        """Dim or brighten all patterns alike until training objects take 99 % of the budget; a few percent at most.
+
+        They are drawn from those that were fitted: the last ones of a file need not be like the others (those of MNIST are darker), and
+        light is not learned by heart.
+        """
         if self.price.budget is None:
             return
+        drawn = self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)[:BUDGET_BLOCKS]
         for _ in range(DIMMINGS):
-            found = figures(self.machine, self.sight(), held_back)
+            found = figures(self.machine, self.sight(), drawn)
             spent = found.clicks if self.price.of_clicks else found.photons
             wanted = UNDER_BUDGET * self.price.budget / spent
             if 0.995 <= wanted <= 1.0:
