@@ -61,9 +61,10 @@ def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
     if not path.is_file():
         return None
     bundle, _ = load_bundle(path)
-    found = bundle.provenance.get("options")
-    wanted = asdict(options).items()  # `pans train` adds threads and device
-    same = isinstance(found, dict) and wanted <= found.items() and bundle.provenance.get("profile") == PROFILE
+    found, wanted = bundle.provenance.get("options"), asdict(options)
+    # options that are newer than the bundle are at their defaults there; `pans train` adds threads and device
+    same = isinstance(found, dict) and wanted.items() <= (asdict(type(options)()) | found).items()
+    same = same and bundle.provenance.get("profile") == PROFILE
     return bundle if same and bundle.automaton is not None else None
 
 
