@@ -26,7 +26,7 @@ from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 
 from .figures import Figures, figures
-from .finished import Finished, bit_grid, dwell_steps, finished, to_grid
+from .finished import Finished, Grid, bit_grid, dwell_steps, finished, to_grid
 from .grow import GrowOptions, Growth, sum_of
 from .light import Bits, Grey, as_bits
 from .machine import COUNT_FLOOR, Machine, Sight, forward
@@ -54,7 +54,7 @@ TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than 
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/training.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
 UNDER_BUDGET = 0.99  # of the budget is what they may take: others take a little more or less
-DIMMINGS = 4  # steps of the search for the brightness that meets the budget
+DIMMINGS = 6  # steps of the search for the brightness that meets the budget
 STAGES = ("grow", "grey", "shown")
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
 
@@ -312,8 +312,8 @@ class _Run:
     def finish(self) -> TrainedAutomaton:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
-        self._meet_budget()
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
+        self._meet_budget(grid)
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
@@ -324,7 +324,7 @@ class _Run:
             arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
         )
 
-    def _meet_budget(self) -> None:
+    def _meet_budget(self, grid: Grid | None) -> None:
         """Dim or brighten all patterns alike until training objects take 99 % of the budget; a few percent at most.
 
         They are drawn from those that were fitted: the last ones of a file need not be like the others (those of MNIST are darker), and
@@ -332,14 +332,23 @@ class _Run:
         """
         if self.price.budget is None:
             return
+        bits = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
+        exact = [
+            light.log_light.clone() for light in bits
+        ]  # before it is rounded to whole steps, which raises the darkest
         drawn = self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)[:BUDGET_BLOCKS]
         for _ in range(DIMMINGS):
+            if grid is not None:
+                to_grid(self.machine, grid)
             found = figures(self.machine, self.sight(), drawn)
             spent = found.clicks if self.price.of_clicks else found.photons
             wanted = UNDER_BUDGET * self.price.budget / spent
             if 0.995 <= wanted <= 1.0:
                 return
+            for light, before in zip(bits, exact):
+                light.log_light.copy_(before)
             scale_light(self.machine, wanted**1.1)
+            exact = [light.log_light.clone() for light in bits]
 
     def _posteriors(self, sight: Sight, held_back: list[Block]) -> Posteriors:
         """Calibrated posteriors of all nodes; the machine's leaves are counted anew."""

@@ -68,6 +68,13 @@ def test_a_budget_of_clicks_is_met(task):
     assert found.clicks == pytest.approx(0.99 * 1.5, rel=0.06)
 
 
+def test_the_budget_holds_where_brightness_has_few_steps(task):
+    profile = load_profile("dmd-spad")
+    profile = replace(profile, projector=replace(profile.projector, dwell_steps=6))
+    found = train_automaton(task, profile, SMALL).held_back
+    assert found.photons == pytest.approx(0.99 * 4.0, rel=0.06)
+
+
 def test_the_same_seed_gives_the_same_automaton_and_another_seed_another(task, trained):
     again = train_automaton(task, IDEAL, SMALL)
     for name in ("pattern_levels", "dwell", "successors", "posteriors"):
@@ -182,7 +189,7 @@ def test_options_that_cannot_be(task):
         with pytest.raises(UsageError, match=error):
             check_automaton_options(replace(SMALL, **changes), task, IDEAL)
     with pytest.raises(PlanError, match="states cannot share one"):
-        check_automaton_options(replace(SMALL, patterns=3), task, IDEAL)
+        check_automaton_options(replace(SMALL, patterns=3), task, load_profile("dmd-8bit-spad"))
     with pytest.raises(PlanError, match="65533"):
         check_automaton_options(replace(SMALL, exposures=200, states=500), task, IDEAL)
     with pytest.raises(UsageError, match="the light is the scene's own"):
