@@ -120,7 +120,8 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
     core = Core(plan, make_decider(bundle, shots=SHOTS, backend=backend), SHOTS, config.n_cycles)
     recovery = Recovery.of(link, "", 30.0)
     observers = Observers(host.watch, host.start)
-    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend}}
+    driven = {"drive": plan.drive, "confidence": 0.0}
+    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend, **driven}}
     with TemporaryDirectory() as folder:
         with Recorder(Path(folder) / "grid.pansrec", header) as recorder:
             result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)

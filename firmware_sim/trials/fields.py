@@ -252,7 +252,8 @@ class Stage:
     def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         config = RunConfig(SHOTS, OBJECTS * self.plan.cycles_per_object, deadline_us=1e5)
         core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
-        header = {"config": {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}}
+        config_of_run = {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}
+        header = {"config": {**config_of_run, "drive": self.plan.drive, "confidence": 0.0}}
         with Recorder(path, header, overwrite=True) as recorder:
             try:
                 result = run_live(link, self.profile, self.bundle, self.plan, core, config, recorder)
