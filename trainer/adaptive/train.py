@@ -292,10 +292,16 @@ class _Run:
         below = masses[order].cumsum(0) / masses.sum()
         low, high = top_limits(self.profile)[0], self._highest_top()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
+        top = min(high, max(low, top))
+        steps = bit_grid(top, self.profile).steps
         for level in self.machine.levels:
-            level.light.top = min(high, max(low, top))
+            light = level.light
+            assert isinstance(light, Bits)
+            light.top = top
+            if steps > 1:  # no state can be darker than one step; training then lights fewer pixels
+                light.bottom = top / steps
             with torch.no_grad():
-                level.light.settle()
+                light.settle()
 
     def _reroute(self) -> None:
         states = sum(level.n_states for level in self.machine.levels)
