@@ -14,10 +14,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
+from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, dead_fraction
 from pans.runtime.instrument.profile import Profile
 
-DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
 GOLDEN = 0x9E3779B97F4A7C15  # the increment of splitmix64: 2^64 over the golden ratio, odd
 CHANNEL_STEP = (
     0xD1342543DE82EF95  # odd, of good spectrum: the multiplier of Java's L64X128MixRandom (Steele and Vigna 2021)
@@ -40,10 +39,9 @@ class DetectorModel:
 def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
     """Collect the profile's effects for this exposure: dead time where it matters, crosstalk where there are neighbours."""
     detector = profile.detector
-    dead_fraction = detector.dead_time_ns * 1e-3 / exposure_us
     return DetectorModel(
         law=click_law(profile, exposure_us),
-        dead_fraction=dead_fraction if dead_fraction > DEAD_TIME_MATTERS else 0.0,
+        dead_fraction=dead_fraction(profile, exposure_us),
         afterpulse_probability=detector.afterpulse_probability,
         crosstalk_probability=detector.crosstalk_probability if profile.mode == "parallel" else 0.0,
     )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
-from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.click_law import ClickLaw, dead_fraction
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import jeffreys_interval
@@ -37,7 +37,6 @@ SEQUENTIAL_PATTERNS = 60
 PARALLEL_FRAMES = 900
 DARK_SHARE = 0.1
 LEAST_SEQUENTIAL_US, LEAST_PARALLEL_US = 40.0, 50.0  # shorter exposures would only load the link
-DEAD_TIME_MATTERS = 1e-3  # of the exposure
 PATTERNS_DIFFER = 0.01  # p-value of the test that they do not, below which the level's interval holds their spread
 _SIDES = (32, 64, 128, 256, 512)
 
@@ -55,9 +54,8 @@ class Design:
 def count_model(profile: Profile, exposure_us: float) -> CountModel:
     """What the profile says of the detector beyond light and dark counts, for this exposure."""
     detector = profile.detector
-    dead = detector.dead_time_ns * 1e-3 / exposure_us
     law = ClickLaw(0.0, detector.read_noise_e, detector.threshold_e)
-    return CountModel(law, dead if dead > DEAD_TIME_MATTERS else 0.0)
+    return CountModel(law, dead_fraction(profile, exposure_us))
 
 
 def calibration_exposure_us(profile: Profile) -> float:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from .profile import Profile
 
 F64 = NDArray[np.float64]
+DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
 _TINY = 1e-300  # Phi below this is negligible at any mean that a float can hold, and would soon be subnormal
 
 
@@ -43,6 +44,17 @@ def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
     """The law of one exposure of `exposure_us` microseconds on this profile's detector."""
     detector = profile.detector
     return ClickLaw(detector.dark_rate_hz * exposure_us * 1e-6, detector.read_noise_e, detector.threshold_e)
+
+
+def dead_fraction(profile: Profile, exposure_us: float) -> float:
+    """The part of an exposure for which a click blinds the detector; 0 where that changes no clicks worth speaking of.
+
+    A detector with a threshold asks for the first click alone, which nothing before it in the exposure can suppress. What counts is a
+    click of the exposure before: where the readout between them outlasts the dead time, and below a permille of the exposure, it is 0.
+    """
+    dead_us = profile.detector.dead_time_ns * 1e-3
+    fraction = dead_us / exposure_us
+    return fraction if fraction > DEAD_TIME_MATTERS and dead_us > profile.exposure.readout_us else 0.0
 
 
 def survival_coefficients(law: ClickLaw) -> F64:

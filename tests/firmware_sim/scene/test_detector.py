@@ -149,6 +149,12 @@ def test_only_declared_effects_are_modelled() -> None:
     fast = detector_model(load_profile("wdm-snspd"), 1.0)
     assert fast.dead_fraction == pytest.approx(6.7e-3)
     assert fast.crosstalk_probability == 0.001
+    led = load_profile("microled-spad")
+    assert (
+        detector_model(led, 2.3).dead_fraction == 0
+    )  # 35 ns of 2.3 us, but half a microsecond of readout comes between
+    unread = replace(led, exposure=replace(led.exposure, readout_us=0.01))
+    assert detector_model(unread, 2.3).dead_fraction == pytest.approx(0.035 / 2.3)
 
 
 def test_crosstalk_needs_neighbours() -> None:
