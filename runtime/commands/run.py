@@ -32,8 +32,8 @@ from .options import (
     flow_of,
 )
 
-DEMO_BUNDLE = "fashion10.pans"
-DEMO_PROFILE = "oled-qcmos"
+DEMO_BUNDLE = "fashion-adaptive.pans"
+DEMO_PROFILE = "dmd-spad"
 DEMO_SCENE = "fashion200"
 DEMO_OBJECTS = 200
 DEMO_TRIALS = 5
