@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pans.runtime import SHIPPED
 from pans.runtime.cli import main
 
 
@@ -30,3 +31,10 @@ def page_of(path: Path, tmp_path: Path) -> str:
 
 def words_of(page: str) -> str:
     return html.unescape(re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]+"', "", page)))
+
+
+def fixed_run(objects: int, trials: int = 1) -> tuple[str, ...]:
+    """Return the words of a run of the shipped fixed patterns in virtual time, on the first `objects` shipped images."""
+    device = "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast"
+    many = ("--trials", str(trials), "--decisions", str(objects * trials))
+    return ("run", str(SHIPPED / "fashion10.pans"), "--device", device, *many)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import json_of
+from commands import fixed_run, json_of
 
 from pans.runtime.cli import main
 from pans.runtime.record import read_recording
@@ -32,7 +32,7 @@ def run_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     """A recording of one detector after another, and of all at once with dark slots."""
     folder = tmp_path_factory.mktemp("run")
     if request.param == "oled-qcmos":
-        words = ["demo", "--pace", "fast", "--trials", "1", "--out", str(folder)]
+        words = [*fixed_run(200), "--out", str(folder)]
     else:
         bundle = folder / "small.pans"
         make_parallel(bundle)

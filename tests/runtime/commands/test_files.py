@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, early_leaf
 from bundles import made_bundle
+from commands import fixed_run
 
 from pans.runtime.bundle import Automaton, with_expected
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, write_bundle
@@ -64,7 +65,8 @@ def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, An
 
 def test_whole_files_are_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_bundle(toy_bundle(), tmp_path / "a.pans")
-    record(tmp_path / "a.pansrec", [decision(0), decision(1)])
+    assert main([*fixed_run(3), "--record", str(tmp_path / "a.pansrec")]) == 0
+    capsys.readouterr()
     profile = tmp_path / "mine.toml"
     profile.write_text(load_profile("ideal").text)
     paths = [tmp_path / "a.pans", tmp_path / "a.pansrec", profile, "oled-qcmos"]
@@ -141,7 +143,9 @@ def test_decisions_that_cannot_be_true(
 
 def test_an_abstention_without_a_label_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = record(tmp_path / "a.pansrec", [decision(0, flags=9, label=0xFFFF, probability=0.0)])
-    assert run(capsys, "verify", path)[0] == 0
+    code, found = run(capsys, "verify", path, "--json")
+    assert code == 1
+    assert ["cannot be rebuilt" in violation["message"] for violation in found["violations"]] == [True]  # nothing else
 
 
 def test_timings_must_belong_and_be_in_order(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from commands import page_of, words_of
+from commands import fixed_run, page_of, words_of
 
 from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.cli import main
@@ -25,7 +25,7 @@ pytest.importorskip("matplotlib", reason="needs the plot extra")
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "--pace", "fast", "--trials", "1", "--out", str(folder)]) == 0
+    assert main([*fixed_run(200), "--out", str(folder)]) == 0
     return folder / "run.pansrec"
 
 

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import json_of
+from commands import fixed_run, json_of
 
 MEASURED = ("armed_after_s", "realtime", "recording", "report")  # of this machine and this run
-DEMO = ("demo", "--pace", "fast", "--trials", "2")
 
 
 def of_a_flow(folder: Path) -> tuple[str, ...]:
@@ -19,11 +18,12 @@ def of_a_flow(folder: Path) -> tuple[str, ...]:
     return ("run", bundle, "--device", device, "--flow", settings, "--seconds", "0.1", "--gate-class", "b,c")
 
 
-@pytest.mark.parametrize("kind", ["still", "flow"])
+@pytest.mark.parametrize("kind", ["still", "walks", "flow"])
 def test_the_summary_has_the_contracts_keys_order_and_values(
     kind: str, flow_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = DEMO if kind == "still" else of_a_flow(flow_folder)
+    walks = ("demo", "--pace", "fast", "--trials", "1")
+    words = {"still": fixed_run(200, 2), "walks": walks, "flow": of_a_flow(flow_folder)}[kind]
     found = json_of(capsys, "", *words, "--out", tmp_path)
     wanted: dict[str, Any] = json.loads((Path(__file__).parent / f"summary_{kind}.json").read_text())
     assert list(found) == list(wanted)
