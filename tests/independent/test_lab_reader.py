@@ -69,7 +69,7 @@ def small_bundle(backend: str) -> Bundle:
 def small_profile(mode: str) -> str:
     """The shipped profile `ideal` with other figures, in either mode."""
     text = (ROOT / "hw_profiles" / "ideal.toml").read_text().replace('"sequential"', f'"{mode}"')
-    text = text.replace("levels = 65_536", f"levels = {LEVELS}").replace("= 10_000.0\n\n[det", f"= {PEAK_HZ}\n\n[det")
+    text = text.replace("levels = 65_536", f"levels = {LEVELS}").replace("hz = 10_000.0", f"hz = {PEAK_HZ}")
     text = text.replace("dark_rate_hz = 0.0", "dark_rate_hz = 50.0")
     return text if mode == "sequential" else text.replace("channels = 1\n", f"channels = {D_F}\n")
 

@@ -31,7 +31,8 @@ PEAK_HZ = TOP / (EXPOSURE_US * 1e-6)
 def profile_text(mode: str, deadline_us: float = 1e6) -> str:
     """A profile of the lab's instrument: the shipped `ideal` with other figures."""
     text = (ROOT / "hw_profiles" / "ideal.toml").read_text().replace('"sequential"', f'"{mode}"')
-    text = text.replace("levels = 65_536", f"levels = {LEVELS}").replace("= 10_000.0\n\n[det", f"= {PEAK_HZ}\n\n[det")
+    text = text.replace("levels = 65_536", f"levels = {LEVELS}")
+    text = text.replace("peak_photoelectrons_hz = 10_000.0", f"peak_photoelectrons_hz = {PEAK_HZ}")
     text = text.replace("decision_deadline_us = 10_000.0", f"decision_deadline_us = {deadline_us}")
     text = text.replace("lease_ms = 1000", "lease_ms = 2000" if deadline_us >= 1e6 else "lease_ms = 1000")
     return text if mode == "sequential" else text.replace("channels = 1\n", f"channels = {D_F}\n")

@@ -195,7 +195,7 @@ def test_a_part_without_its_place_is_refused(parts: Path) -> None:
     recording = read_recording(parts_in(parts)[1])
 
     class Silent:
-        header, path = recording.header, recording.path
+        header, path, complete = recording.header, recording.path, True
 
         def events(self) -> Any:
             return iter(())
