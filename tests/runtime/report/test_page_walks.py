@@ -62,6 +62,7 @@ def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) ->
 
 
 def test_the_page_has_the_walks(recording: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
     words = words_of(page_of(recording.path, tmp_path))
     decisions = recording.decisions()
     assert f"{decisions['exposures'].mean():.2f} exposures of 6 at most" in words
