@@ -219,6 +219,7 @@ def test_neighbours_tell_classes_that_lie_apart_and_no_others():
 
 
 def test_single_shots_are_told_with_their_expectation(asked, monkeypatch, tmp_path):
+    pytest.importorskip("sklearn", reason="needs the plot extra")
     question, said = asked
     monkeypatch.setattr(readouts, "SHOT_FEATURES", (4, 32))
     monkeypatch.setattr(readouts, "PIPELINE_FEATURES", 4)
