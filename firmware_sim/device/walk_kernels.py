@@ -9,30 +9,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pans.firmware_sim.scene.detector_kernels import click_thresholds
-from pans.firmware_sim.scene.detector_model import (
-    CHANNEL_STEP,
-    CLICK_STREAM,
-    GOLDEN,
-    MIX_1,
-    MIX_2,
-    DetectorModel,
-    first_click_probability,
-    stream_key,
-)
+from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, click_thresholds, mix
+from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, first_click_probability, stream_key
 from pans.runtime.wire.messages import DARK_PATTERN
 
 _U = np.uint64
-_GOLDEN, _STEP = _U(GOLDEN), _U(CHANNEL_STEP)
-_M1, _M2 = _U(MIX_1), _U(MIX_2)
-_S11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
-
-
-@njit(cache=True, nogil=True)
-def _mix(word):  # type: ignore[no-untyped-def]
-    word = (word ^ (word >> _S30)) * _M1
-    word = (word ^ (word >> _S27)) * _M2
-    return word ^ (word >> _S31)
 
 
 @njit(cache=True, nogil=True)
@@ -48,7 +29,7 @@ def follow(limits, successors, adaptive, key, first, begin, stamps, clicks):  # 
     for i in range(stamps.shape[0]):
         lit = adaptive[i] and node < n_states
         limit = limits[click, node if lit else n_states]
-        number = _mix(_mix(_U(first + i) * _GOLDEN + key) + _STEP) >> _S11
+        number = mix(mix(_U(first + i) * GOLDEN_WORD + key) + STEP_WORD) >> SHIFT_11
         click = 1 if number < limit else 0
         clicks[i] = click
         stamps[i] = node if lit else DARK_PATTERN

@@ -26,13 +26,13 @@ from .detector_model import (
 )
 
 _U = np.uint64
-_GOLDEN, _STEP = _U(GOLDEN), _U(CHANNEL_STEP)
+GOLDEN_WORD, STEP_WORD = _U(GOLDEN), _U(CHANNEL_STEP)
 _M1, _M2 = _U(MIX_1), _U(MIX_2)
-_S11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
+SHIFT_11, _S27, _S30, _S31 = _U(11), _U(27), _U(30), _U(31)
 
 
 @njit(cache=True, nogil=True)
-def _mix(word):  # type: ignore[no-untyped-def]
+def mix(word):  # type: ignore[no-untyped-def]
     word = (word ^ (word >> _S30)) * _M1
     word = (word ^ (word >> _S27)) * _M2
     return word ^ (word >> _S31)
@@ -44,13 +44,13 @@ def plain_words(thresholds, row_of, key, first, words):  # type: ignore[no-untyp
     n_channels = thresholds.shape[1]
     for t in range(row_of.size):
         row = row_of[t]
-        state = _mix(_U(t + first) * _GOLDEN + key)
+        state = mix(_U(t + first) * GOLDEN_WORD + key)
         step = _U(0)
         for p in range(words.shape[1]):
             byte = _U(0)
             for c in range(8 * p, min(8 * p + 8, n_channels)):
-                step += _STEP
-                byte |= _U((_mix(state + step) >> _S11) < thresholds[row, c]) << _U(c & 7)
+                step += STEP_WORD
+                byte |= _U((mix(state + step) >> SHIFT_11) < thresholds[row, c]) << _U(c & 7)
             words[t, p] = byte
 
 
@@ -63,21 +63,21 @@ def memory_words(thresholds, primed, row_of, keys, first, crosstalk, previous, w
     n_channels = thresholds.shape[1]
     for t in range(row_of.size):
         row, exposure = row_of[t], _U(t + first)
-        state = _mix(exposure * _GOLDEN + keys[0])
+        state = mix(exposure * GOLDEN_WORD + keys[0])
         step = _U(0)
         for c in range(n_channels):
-            step += _STEP
+            step += STEP_WORD
             threshold = primed[row, c] if previous[0, c] else thresholds[row, c]
-            previous[1, c] = (_mix(state + step) >> _S11) < threshold
+            previous[1, c] = (mix(state + step) >> SHIFT_11) < threshold
         for c in range(n_channels):
             previous[0, c] = previous[1, c]
         if crosstalk:
-            below, above = _mix(exposure * _GOLDEN + keys[1]), _mix(exposure * _GOLDEN + keys[2])
+            below, above = mix(exposure * GOLDEN_WORD + keys[1]), mix(exposure * GOLDEN_WORD + keys[2])
             for c in range(n_channels):
                 if previous[1, c]:
-                    if c + 1 < n_channels and (_mix(below + _U(c + 2) * _STEP) >> _S11) < crosstalk:
+                    if c + 1 < n_channels and (mix(below + _U(c + 2) * STEP_WORD) >> SHIFT_11) < crosstalk:
                         previous[0, c + 1] = 1
-                    if c > 0 and (_mix(above + _U(c) * _STEP) >> _S11) < crosstalk:
+                    if c > 0 and (mix(above + _U(c) * STEP_WORD) >> SHIFT_11) < crosstalk:
                         previous[0, c - 1] = 1
         for p in range(words.shape[1]):
             byte = 0
@@ -95,19 +95,21 @@ def register_words(thresholds, primed, row_of, keys, first, crosstalk, previous,
         last |= _U(previous[0, c]) << _U(c)
     for t in range(row_of.size):
         row, exposure = row_of[t], _U(t + first)
-        state = _mix(exposure * _GOLDEN + keys[0])
+        state = mix(exposure * GOLDEN_WORD + keys[0])
         own, step = _U(0), _U(0)
         for c in range(n_channels):
-            step += _STEP
-            own |= _U((_mix(state + step) >> _S11) < (primed if last >> _U(c) & _U(1) else thresholds)[row, c]) << _U(c)
+            step += STEP_WORD
+            own |= _U(
+                (mix(state + step) >> SHIFT_11) < (primed if last >> _U(c) & _U(1) else thresholds)[row, c]
+            ) << _U(c)
         last = own
         if crosstalk and own:
-            below, above = _mix(exposure * _GOLDEN + keys[1]), _mix(exposure * _GOLDEN + keys[2])
+            below, above = mix(exposure * GOLDEN_WORD + keys[1]), mix(exposure * GOLDEN_WORD + keys[2])
             for c in range(n_channels):
                 if own >> _U(c) & _U(1):
-                    if c + 1 < n_channels and (_mix(below + _U(c + 2) * _STEP) >> _S11) < crosstalk:
+                    if c + 1 < n_channels and (mix(below + _U(c + 2) * STEP_WORD) >> SHIFT_11) < crosstalk:
                         last |= _U(1) << _U(c + 1)
-                    if c > 0 and (_mix(above + _U(c) * _STEP) >> _S11) < crosstalk:
+                    if c > 0 and (mix(above + _U(c) * STEP_WORD) >> SHIFT_11) < crosstalk:
                         last |= _U(1) << _U(c - 1)
         for p in range(words.shape[1]):
             words[t, p] = last >> _U(8 * p) & _U(0xFF)

@@ -22,6 +22,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile
@@ -192,17 +193,22 @@ def _hold(shots: int, ticks: Ticks) -> int:
 def _shot_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
     patterns = interleave(np.arange(n), dark)
     period = max(ticks.spacing, up(ticks.refresh))
-    cycle = Cycle(
+    block = block_exposures(len(patterns), period, ticks, MAX_BLOCK_EXPOSURES)
+    return lay_out(profile, n, _single_shots(patterns, period, shots, block), ticks)
+
+
+def _single_shots(patterns: NDArray[np.int64], period: int, cycles_per_object: int, block: int) -> Cycle:
+    """Return a cycle of one shot: an exposure of each pattern, `period` ticks apart."""
+    return Cycle(
         patterns,
         np.zeros(len(patterns), np.int64),
         offsets=np.arange(len(patterns)) * period,
         cycle_ticks=len(patterns) * period,
         period=period,
         shots_per_cycle=1,
-        cycles_per_object=shots,
-        block=block_exposures(len(patterns), period, ticks, MAX_BLOCK_EXPOSURES),
+        cycles_per_object=cycles_per_object,
+        block=block,
     )
-    return lay_out(profile, n, cycle, ticks)
 
 
 def _pattern_major(profile: Profile, n: int, shots: int, dark: int, ticks: Ticks) -> Plan:
@@ -235,17 +241,9 @@ def _walks(
         raise PlanError(f"an exposure and the {drive}'s turn take {period} ticks, the protocol counts up to {U32_MAX}")
     slots = interleave(np.full(automaton.n_slots, ADAPTIVE_PATTERN), dark)
     check_slots(len(slots), "fewer dark slots")
-    cycle = Cycle(
-        slots,
-        np.zeros(len(slots), np.int64),
-        offsets=np.arange(len(slots)) * period,
-        cycle_ticks=len(slots) * period,
-        period=period,
-        shots_per_cycle=1,
-        cycles_per_object=walks,
-        block=1 if drive == "host" else block_exposures(len(slots), period, ticks, MAX_BLOCK_EXPOSURES),
-    )
-    return replace(lay_out(profile, len(bundle.pattern_levels), cycle, ticks), automaton=automaton, drive=drive)
+    block = 1 if drive == "host" else block_exposures(len(slots), period, ticks, MAX_BLOCK_EXPOSURES)
+    plan = lay_out(profile, len(bundle.pattern_levels), _single_shots(slots, period, walks, block), ticks)
+    return replace(plan, automaton=automaton, drive=drive)
 
 
 def _checked_drive(profile: Profile, automaton: Automaton, drive: str) -> str:

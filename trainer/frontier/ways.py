@@ -16,6 +16,7 @@ from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.options import plain_options
 from pans.trainer.paper.page import Asked, Row, kept
+from pans.trainer.paper.paradigms import MEASURED
 from pans.trainer.paper.tables import ACTIVE, FIRST
 from pans.trainer.tasks.registry import Task
 
@@ -164,18 +165,6 @@ def _made(asked: Asked, point: Point, seed: int, task: Task) -> Row:
     return next(iter(baseline_rows(task, _options(point, seed), [point.level], silent)))
 
 
-KEYS = (
-    "accuracy_mean",
-    "accuracy_std",
-    "accuracy_se_objects",
-    "clicks_mean",
-    "photons_mean",
-    "illumination",
-    "objects",
-    "trials",
-)
-
-
 def _plain(found: Row, point: Point, seed: int) -> Row:
     """Return what the page keeps of a row."""
     whole = found.get("all", found)
@@ -190,8 +179,8 @@ def _plain(found: Row, point: Point, seed: int) -> Row:
         "command": point.command(seed),
         "exposures": found["exposures"] if "exposures" in found else _exposures(point),
         "cpu_seconds": found.get("training_seconds", found.get("cpu_seconds", found.get("seconds"))),
-        "all": {key: whole[key] for key in KEYS if key in whole},
-        FIRST: {key: found[FIRST][key] for key in KEYS if key in found[FIRST]},
+        "all": {key: whole[key] for key in MEASURED if key in whole},
+        FIRST: {key: found[FIRST][key] for key in MEASURED if key in found[FIRST]},
         **facts,
     }
 
