@@ -1,17 +1,17 @@
 """The one exception tree. Each class knows the exit code that the command line returns for it.
 
     PansError                 2   anything this project raises on purpose
-    ├── UsageError            2   a command or an argument that cannot be meant
+    ├── UsageError            2   a command or an argument that makes no sense
     ├── ConfigError           2   a profile, calibration, scene or plan file that says something impossible
     ├── PlanError             2   what is asked for cannot be done by this hardware (the numbers are in the message)
     ├── DamagedFileError      2   a bundle or recording that is truncated, altered or inconsistent
     ├── LinkError             3   the device cannot be reached, or went away
     │   └── DeviceError       3   the device answered, and refused
     ├── RecordingError        2   the recording cannot be written any further: the run ends, what was written is readable
-    └── TimingError           4   the timing contract was broken and going on would be a lie
+    └── TimingError           4   the timing contract was broken, so that results could no longer be trusted
 
 A message says what, found, allowed and where; `remedy` is the next step. Damaged bytes, lost frames and late deadlines are
-measurements, not exceptions: they are counted, flagged and reported.
+measurements, not exceptions: they are counted, flagged and reported. Exceptions are raised only when results could no longer be trusted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ class PansError(Exception):
     """Base of all errors raised on purpose; `remedy` is one sentence that says what to do next ("" if nothing helps)."""
 
     exit_code = 2
+    usual_remedy = ""  # shown where an error brings none of its own
 
     def __init__(self, message: str, *, remedy: str = "") -> None:
         super().__init__(message)
@@ -35,29 +36,40 @@ class PansError(Exception):
 
 
 class UsageError(PansError):
-    """A command or an argument that cannot be meant."""
+    """A command or an argument that makes no sense."""
+
+    usual_remedy = "`pans help COMMAND` lists what is allowed"
 
 
 class ConfigError(PansError):
     """A profile, calibration or scene that says something impossible; the message starts with file:line:col."""
 
+    usual_remedy = "correct the file there; docs/reference lists every field"
+
 
 class PlanError(PansError):
     """What is asked for cannot be done by this hardware; the message holds the numbers."""
+
+    usual_remedy = "ask for less, or choose another profile"
 
 
 class DamagedFileError(PansError):
     """A bundle or recording that is truncated, altered, oversized or inconsistent."""
 
+    usual_remedy = "copy or make the file again"
+
 
 class RecordingError(PansError):
     """The recording cannot be written any further: the disk is full, or gone."""
+
+    usual_remedy = "make room on the disk, and run again"
 
 
 class LinkError(PansError):
     """The device cannot be reached, or went away."""
 
     exit_code = 3
+    usual_remedy = "`pans devices` lists what is connected, `pans doctor` checks this machine"
 
 
 class DeviceError(LinkError):
@@ -65,8 +77,9 @@ class DeviceError(LinkError):
 
 
 class TimingError(PansError):
-    """The timing contract was broken and going on would be a lie."""
+    """The timing contract was broken, so that results could no longer be trusted."""
 
+    usual_remedy = "`pans doctor` checks this machine's timing"
     exit_code = 4
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from pans.firmware_sim.options import add_options, settings_from
 from pans.firmware_sim.trials import TRIALS, load_trial
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
+from pans.runtime.cli.parser import CommandParser
 from pans.runtime.errors import PansError
 from pans.runtime.outputs import check_outputs, write_file
 
@@ -34,7 +35,7 @@ def run_trial(name: str, args: argparse.Namespace) -> int:
     return EXIT_FINE if report.passed else EXIT_ALERT
 
 
-class _TrialParser(argparse.ArgumentParser):
+class _TrialParser(CommandParser):
     """The parser of one trial; its module is imported when its options are asked for."""
 
     name = ""

@@ -12,24 +12,19 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__
-from pans.runtime.bundle.model import BackEnd, Shown, make_bundle, write_bundle
-from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, add_force, emit
-from pans.runtime.container import read_file
-from pans.runtime.core.plan import exposure_us
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
-from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.outputs import check_outputs
-from pans.runtime.record.parts import is_of_parts
-from pans.runtime.report.file_facts import file_facts
-from pans.runtime.report.verify import FileVerdict, verify_file, verify_parts
 from pans.runtime.safe_text import one_line
+
+if TYPE_CHECKING:  # the help of a command must not load what it works with
+    from numpy.typing import NDArray
+
+    from pans.runtime.bundle.quantise import QuantisedPatterns
+    from pans.runtime.instrument.profile import Profile
+    from pans.runtime.report.verify import FileVerdict
 
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
@@ -48,6 +43,9 @@ def _configure_verify(parser: argparse.ArgumentParser) -> None:
 
 
 def _verify(args: argparse.Namespace) -> int:
+    from pans.runtime.record.parts import is_of_parts
+    from pans.runtime.report.verify import verify_file, verify_parts
+
     groups = [verify_parts(path) if is_of_parts(path) else [verify_file(path)] for path in args.paths]
     verdicts = [verdict for group in groups for verdict in group]
     payload = {
@@ -82,6 +80,8 @@ def _configure_info(parser: argparse.ArgumentParser) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
+    from pans.runtime.report.file_facts import file_facts
+
     facts = file_facts(args.path)
     rows = list(_flat(facts))
     if not args.json and sys.stdout.isatty():
@@ -151,6 +151,13 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
 
 
 def _bundle(args: argparse.Namespace) -> int:
+    from pans.runtime.bundle.model import BackEnd, Shown, make_bundle, write_bundle
+    from pans.runtime.bundle.quantise import quantise_patterns
+    from pans.runtime.container import read_file
+    from pans.runtime.core.plan import exposure_us
+    from pans.runtime.instrument.profile import load_profile
+    from pans.runtime.outputs import check_outputs
+
     check_outputs([args.out], inputs=[args.patterns, args.head, args.table, args.profile], force=args.force)
     if args.head is None and args.table is None:
         raise UsageError("neither --head nor --table was given", remedy="give one of them, or both")
@@ -180,6 +187,8 @@ def _bundle(args: argparse.Namespace) -> int:
 
 def _inputs(args: argparse.Namespace, profile: Profile | None) -> tuple[NDArray[Any], dict[str, Any]]:
     """Return the patterns, and where everything came from; no time of day, so that the same inputs give the same bytes."""
+    from pans.runtime.container import read_file
+
     patterns = _load_array(args.patterns)
     if patterns.ndim != 2:
         raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
@@ -230,6 +239,10 @@ def _image_shape(text: str | None, pixels: int) -> tuple[int, int]:
 
 def _load_array(path: Path) -> NDArray[Any]:
     """Read one .npy array of floats; its header is held against the file's size before anything is allocated."""
+    import numpy as np
+
+    from pans.runtime.container import read_file
+
     data = read_file(path)
     stream = io.BytesIO(data)
     try:

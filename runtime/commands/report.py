@@ -10,7 +10,6 @@ from pathlib import Path
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.outputs import check_outputs, write_file
-from pans.runtime.report.verify import file_kind
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +21,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     check_outputs([args.out], inputs=[args.path], force=args.force)
     from pans.runtime.report import page_of
+    from pans.runtime.report.verify import file_kind
 
     page = page_of(args.path)
     kind = file_kind(args.path)

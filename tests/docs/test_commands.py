@@ -30,16 +30,12 @@ MOST_WORDS = 40  # of a sentence in a tutorial or a how-to
 
 def parser_of(name: str) -> argparse.ArgumentParser:
     """The parser of one command, as `pans` itself makes it."""
-    parser = argparse.ArgumentParser(prog=f"pans {name}", exit_on_error=False)
-    for option in ("--json", "--debug"):
-        parser.add_argument(option, action="store_true")
-    COMMANDS[name].load().configure(parser)
-    return parser
+    return cli.parser.parser_of(name, COMMANDS[name].load())
 
 
 def check(words: list[str], where: str, whole: bool) -> None:
     """Parse one command line; of one that is only mentioned in a line of text, the command and its options must exist."""
-    if words[0] in ("--help", "--version", "COMMAND"):
+    if words[0] in ("--help", "--version", "-V", "help", "COMMAND"):
         return
     assert words[0] in COMMANDS, f"{where}: pans {words[0]} is no command"
     try:
@@ -74,9 +70,10 @@ def test_every_command_and_every_option_is_on_the_page_of_commands() -> None:
         if name in sections and find_spec("torch"):
             for action in parser_of(name)._actions:
                 longest = max(action.option_strings, key=len, default="")
-                assert longest in ("", "--help", "--json", "--debug") or f"`{longest}" in sections[name], (
-                    f"{name}: {longest}"
-                )
+                assert (
+                    longest in ("", "--help", "--json", "--quiet", "--verbose", "--debug")
+                    or f"`{longest}" in sections[name]
+                ), f"{name}: {longest}"
     assert set(COMMANDS) <= set(sections)
 
 

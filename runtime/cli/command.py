@@ -1,0 +1,28 @@
+"""What a command is, and the exit codes of the contract."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+
+EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
+EXIT_INTERNAL = 70  # a fault of pans itself: EX_SOFTWARE of sysexits.h
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One subcommand: `configure` adds its arguments, `run` does the work and returns the exit code.
+
+    `examples` are command lines for the end of `--help`.
+    """
+
+    help: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    examples: tuple[str, ...] = ()
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Add `--force`, of every command that writes files."""
+    parser.add_argument("--force", action="store_true", help="replace files that exist")

@@ -1,0 +1,133 @@
+"""`main`: from the words of the command line to one command's exit code; no error leaves it as a traceback unless asked for."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from importlib.metadata import EntryPoint
+
+from pans.runtime import __version__
+from pans.runtime.errors import PansError, UsageError
+
+from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE
+from .finding import find_commands, load_command, missing_extra
+from .first_sign import first_sign
+from .overview import overview
+from .parser import parser_of
+from .talk import begin, fail, has_answered, note
+
+_REMEDIES = {
+    errno.ENOSPC: "make room on that disk, or choose another one",
+    errno.EACCES: "check the permissions of that path, or choose another one",
+    errno.EPERM: "check the permissions of that path, or choose another one",
+    errno.EROFS: "choose a place that can be written to",
+    errno.ENOENT: "check the path",
+    errno.EMFILE: "raise the limit of open files: ulimit -n 4096",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `pans` with `argv` (default: the process's arguments) and return the exit code of the contract."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    begin(words)
+    try:
+        code = _run(words)
+    except KeyboardInterrupt:
+        return fail(PansError("interrupted"), EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        _silence()  # the reader of our output went away: nothing more can be said to it
+        return EXIT_FINE
+    except Exception as error:
+        if "--debug" in words:
+            raise
+        known = _known(error)
+        if not has_answered() and isinstance(error, OSError) and known is not None and _is_stdout(error):
+            _silence()
+        return fail(known, known.exit_code) if known is not None else fail(_internal(error), EXIT_INTERNAL)
+    if code == EXIT_INTERRUPTED and "--json" in words and not has_answered():
+        fail(PansError("interrupted"), code)
+    return code
+
+
+def _run(words: list[str]) -> int:
+    commands = find_commands()
+    wanted = next((word for word in words if not word.startswith("-")), None)
+    if wanted == "help":
+        return _help(words, commands)
+    if wanted is None or wanted not in commands:
+        return _top_level(words, wanted, commands)
+    rest = list(words)
+    rest.remove(wanted)
+    with first_sign(f"pans {wanted}: loading ..."):
+        command = load_command(commands[wanted])
+        args = parser_of(wanted, command).parse_args(rest)
+        note(f"pans {__version__}: {wanted} is {commands[wanted].value}")
+        return command.run(args)
+
+
+def _help(words: list[str], commands: Mapping[str, EntryPoint]) -> int:
+    """`pans help [COMMAND [NAME]]`: what `pans COMMAND [NAME] --help` prints."""
+    rest = [word for word in words if not word.startswith("-")][1:]
+    return _run([*rest, "--help"]) if rest else _top_level([], None, commands)
+
+
+def _top_level(words: Sequence[str], wanted: str | None, commands: Mapping[str, EntryPoint]) -> int:
+    if wanted is not None:
+        near = get_close_matches(wanted, commands, n=2)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        return fail(UsageError(f"unknown command {wanted!r}", remedy=f"{hint}`pans` lists the commands"), EXIT_USAGE)
+    if {"--version", "-V"} & {*words}:
+        print(f"pans {__version__}")
+        return EXIT_FINE
+    unknown = next((word for word in words if word not in _WITHOUT_COMMAND), None)
+    if unknown is not None:
+        remedy = "name a command first: `pans` lists them"
+        return fail(UsageError(f"unknown option {unknown!r}", remedy=remedy), EXIT_USAGE)
+    print(overview(commands))
+    return EXIT_FINE
+
+
+_WITHOUT_COMMAND = {"-h", "--help", "--json", "--debug", "-q", "--quiet", "-v", "--verbose"}
+
+
+def _known(error: Exception) -> PansError | None:
+    """Return the error that a user can do something about, None for a fault of pans."""
+    if isinstance(error, PansError):
+        return error
+    if isinstance(error, OSError) and error.errno is not None:
+        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
+        remedy = _REMEDIES.get(error.errno, "check the path and the disk")
+        return UsageError(f"{where}{error.strerror or error}", remedy=remedy)
+    if isinstance(error, MemoryError):
+        return UsageError(f"there is not enough memory: {error}".removesuffix(": "), remedy="ask for less at once")
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pans"):
+        from .finding import EXTRAS
+
+        package = error.name.partition(".")[0]
+        return missing_extra("this", package, EXTRAS[package]) if package in EXTRAS else None
+    return None
+
+
+def _internal(error: Exception) -> PansError:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{os.path.basename(last.filename)}:{last.lineno}"
+    return PansError(
+        f"internal error: {type(error).__name__}: {error} ({place})",
+        remedy="this is a fault of pans: report it with what the same command prints with --debug",
+    )
+
+
+def _is_stdout(error: OSError) -> bool:
+    """Whether stdout could not be written: errors of files name the file."""
+    return error.filename is None and error.errno == errno.ENOSPC
+
+
+def _silence() -> None:
+    """Point stdout to nowhere, so that what it still holds makes no error when the process ends."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)

@@ -1,0 +1,114 @@
+"""What a command prints: its answer on stdout, everything for people on stderr, errors as two lines or as one JSON object.
+
+Owns how much is printed (`--quiet`, `--verbose`) and whether the answer has been given, for one call of `main` at a time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pans.runtime.errors import PansError
+from pans.runtime.safe_text import lines, one_line
+
+_WHERE = re.compile(r"(?:argument (?P<option>[^:]{1,60})|(?P<place>[^\s:]{1,4096}(?::\d+)*)): ")
+
+
+@dataclass(slots=True)
+class _Voice:
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+    said: bool = False  # anything at all
+    answered: bool = False  # on stdout
+
+
+_voice = _Voice()
+
+
+def begin(words: list[str]) -> None:
+    """Set what is printed from here on, by the command line's words."""
+    _voice.quiet = bool({"-q", "--quiet"} & {*words})
+    _voice.verbose = bool({"-v", "--verbose"} & {*words})
+    _voice.as_json = "--json" in words
+    _voice.said = _voice.answered = False
+
+
+def has_said() -> bool:
+    """Return whether anything has been printed since `begin`."""
+    return _voice.said
+
+
+def has_answered() -> bool:
+    """Return whether the answer has been printed since `begin`."""
+    return _voice.answered
+
+
+def say(text: str) -> None:
+    """Print for people, on stderr: stdout belongs to the JSON object or the answer itself. Nothing with `--quiet`."""
+    if not _voice.quiet:
+        _print_error(text)
+
+
+def note(text: str) -> None:
+    """Print for people who asked for more with `--verbose`."""
+    if _voice.verbose:
+        say(text)
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr, with `--quiet` too."""
+    _print_error(f"pans: warning: {text}")
+
+
+def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -> None:
+    """Print one JSON object when `--json` was given, else `text`; both on stdout."""
+    if args.json:
+        _answer(json.dumps(payload, allow_nan=False, default=_plain))
+    elif text:
+        _answer(lines(text))
+
+
+def fail(error: PansError, exit_code: int) -> int:
+    """Print an error on stderr, with `--json` also as one object on stdout unless the answer is there; return `exit_code`."""
+    advice = error.remedy or error.usual_remedy
+    remedy = f"\n  remedy: {one_line(advice)}" if advice else ""
+    # no line of a message can pass for one of ours
+    _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy)
+    if _voice.as_json and not _voice.answered:
+        facts = {"message": error.message, "where": where_of(error), "remedy": advice, "exit": exit_code}
+        _answer(json.dumps({"error": facts}))
+    return exit_code
+
+
+def where_of(error: PansError) -> str:
+    """Return the file (with line and column) or the option that a message begins with, "" where it names none.
+
+    >>> where_of(PansError("lab.toml:14:1: dead_time_ns must be above 0"))
+    'lab.toml:14:1'
+    >>> where_of(PansError("argument --seconds: 'nan' is not a number from 0 to 1e+09"))
+    '--seconds'
+    """
+    found = _WHERE.match(error.message)
+    return "" if found is None else found["option"] or found["place"]
+
+
+def _answer(text: str) -> None:
+    _voice.said = _voice.answered = True
+    print(text, flush=True)
+
+
+def _print_error(text: str) -> None:
+    _voice.said = True
+    print(lines(text), file=sys.stderr, flush=True)
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return value.tolist()
+    return str(value)

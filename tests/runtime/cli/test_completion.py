@@ -1,0 +1,73 @@
+"""Completion scripts: bash itself completes with ours; zsh and fish get every command and option."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pans.runtime.cli import main
+from pans.runtime.cli.finding import find_commands
+
+TRY = """
+source "$1"; shift
+COMP_WORDS=("$@"); COMP_CWORD=$(($#-1)); COMPREPLY=(); _pans
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("scripts")
+    found = {}
+    for shell in ("bash", "zsh", "fish"):
+        with pytest.MonkeyPatch.context() as patch:
+            printed: list[str] = []
+            patch.setattr(
+                "builtins.print",
+                lambda text, file=None, flush=False, to=printed: to.append(text) if file is None else None,
+            )
+            assert main(["completion", shell]) == 0
+        found[shell] = folder / shell
+        found[shell].write_text("\n".join(printed) + "\n")
+    return found
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["pans", "ver"], {"verify"}),
+        (["pans", "help", "comp"], {"completion"}),
+        (["pans", "run", "--on"], {"--on-dark"}),
+        (["pans", "run", "--on-dark", ""], {"warn", "tables", "mask", "abstain"}),
+        (["pans", "-q", "bench", "li"], {"link"}),
+        (["pans", "verify", "no-such-file"], {""}),
+    ],
+    ids=" ".join,
+)
+def test_bash_completes(scripts: dict[str, Path], words: list[str], wanted: set[str], tmp_path: Path) -> None:
+    done = subprocess.run(
+        ["bash", "-c", TRY, "-", str(scripts["bash"]), *words], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert {*done.stdout.rstrip("\n").split("\n")} == wanted
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_files_after_an_option_that_takes_one(scripts: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "first.pansrec").touch()
+    words = ["bash", "-c", TRY, "-", str(scripts["bash"]), "pans", "run", "--record", "fir"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert done.stdout == "first.pansrec\n"
+
+
+def test_every_shell_knows_every_command(scripts: dict[str, Path]) -> None:
+    for path in scripts.values():
+        known = {*re.findall(r"[\w-]+", path.read_text())}
+        assert {*find_commands()} <= known
+    assert "-l on-dark -x -a 'warn tables mask abstain'" in scripts["fish"].read_text()
+    assert "bashcompinit" in scripts["zsh"].read_text()
