@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
@@ -14,13 +14,14 @@ EXIT_INTERNAL = 70  # a fault of pans itself: EX_SOFTWARE of sysexits.h
 class Command:
     """One subcommand: `configure` adds its arguments, `run` does the work and returns the exit code.
 
-    `examples` are command lines for the end of `--help`.
+    `examples` are command lines for the end of `--help`. `prepare`, if given, sees the parser and the words before they are parsed.
     """
 
     help: str
     configure: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
     examples: tuple[str, ...] = ()
+    prepare: Callable[[argparse.ArgumentParser, Sequence[str]], None] | None = None
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

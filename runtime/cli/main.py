@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import errno
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -12,8 +14,9 @@ from importlib.metadata import EntryPoint
 
 from pans.runtime import __version__
 from pans.runtime.errors import PansError, UsageError
+from pans.runtime.logs import LOGGER, logging_of
 
-from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE
+from .command import EXIT_FINE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_USAGE, Command
 from .finding import find_commands, load_command, missing_extra
 from .first_sign import first_sign
 from .overview import overview
@@ -64,9 +67,25 @@ def _run(words: list[str]) -> int:
     rest.remove(wanted)
     with first_sign(f"pans {wanted}: loading ..."):
         command = load_command(commands[wanted])
-        args = parser_of(wanted, command).parse_args(rest)
-        note(f"pans {__version__}: {wanted} is {commands[wanted].value}")
-        return command.run(args)
+        parser = parser_of(wanted, command)
+        if command.prepare is not None:
+            command.prepare(parser, rest)
+        args = parser.parse_args(rest)
+        with logging_of(args):
+            note(f"pans {__version__}: {wanted} is {commands[wanted].value}")
+            return _logged(command, args, words)
+
+
+def _logged(command: Command, args: argparse.Namespace, words: Sequence[str]) -> int:
+    """Run the command; its log has the words at the begin, and at the end the exit code or the error."""
+    LOGGER.info("begins: %s", shlex.join(["pans", *words]))
+    try:
+        code = command.run(args)
+    except BaseException as error:
+        LOGGER.error("ends by an error: %s: %s", type(error).__name__, error)
+        raise
+    LOGGER.info("ends with exit code %d", code)
+    return code
 
 
 def _help(words: list[str], commands: Mapping[str, EntryPoint]) -> int:

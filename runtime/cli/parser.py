@@ -11,6 +11,7 @@ from difflib import get_close_matches
 from typing import Any, NoReturn
 
 from pans.runtime.errors import UsageError
+from pans.runtime.logs import add_log_options
 from pans.runtime.ranges import FINITE, WHOLE
 
 from .command import EXIT_USAGE, Command
@@ -77,6 +78,7 @@ def parser_of(name: str, command: Command) -> CommandParser:
     shared.add_argument("-q", "--quiet", action="store_true", help="print only the answer, warnings and errors")
     shared.add_argument("-v", "--verbose", action="store_true", help="print what is chosen and loaded on the way")
     shared.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_log_options(shared)
     command.configure(parser)
     parser._action_groups.remove(shared)
     parser._action_groups.append(shared)  # the command's own options first

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import re
 import sys
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pans.runtime.errors import PansError
+from pans.runtime.logs import LOGGER, stderr_line
 from pans.runtime.safe_text import lines, one_line
 
 _WHERE = re.compile(r"(?:argument (?P<option>[^:]{1,60})|(?P<place>[^\s:]{1,4096}(?::\d+)*)): ")
@@ -51,6 +53,7 @@ def has_answered() -> bool:
 
 def say(text: str) -> None:
     """Print for people, on stderr: stdout belongs to the JSON object or the answer itself. Nothing with `--quiet`."""
+    LOGGER.info("%s", text)
     if not _voice.quiet:
         _print_error(text)
 
@@ -63,7 +66,8 @@ def note(text: str) -> None:
 
 def warn(text: str) -> None:
     """Print a warning on stderr, with `--quiet` too."""
-    _print_error(f"pans: warning: {text}")
+    LOGGER.warning("%s", text)
+    _print_error(f"pans: warning: {text}", logging.WARNING)
 
 
 def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -> None:
@@ -79,7 +83,7 @@ def fail(error: PansError, exit_code: int) -> int:
     advice = error.remedy or error.usual_remedy
     remedy = f"\n  remedy: {one_line(advice)}" if advice else ""
     # no line of a message can pass for one of ours
-    _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy)
+    _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy, logging.ERROR)
     if _voice.as_json and not _voice.answered:
         facts = {"message": error.message, "where": where_of(error), "remedy": advice, "exit": exit_code}
         _answer(json.dumps({"error": facts}))
@@ -103,9 +107,9 @@ def _answer(text: str) -> None:
     print(text, flush=True)
 
 
-def _print_error(text: str) -> None:
+def _print_error(text: str, level: int = logging.INFO) -> None:
     _voice.said = True
-    print(lines(text), file=sys.stderr, flush=True)
+    print(stderr_line(lines(text), level), file=sys.stderr, flush=True)
 
 
 def _plain(value: Any) -> Any:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say
+from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
@@ -183,7 +183,7 @@ def _run_job(job: Job, started_ns: int, ending: _Ending) -> Outcome:
         _close_quietly(opening)
         raise
     for warning in ready.dark.warnings:
-        say(f"pans: {warning}")
+        warn(warning)
     link = opening.result()
     try:
         with claimed(job) as job:

@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from pans.runtime.cli import say
+from pans.runtime.cli import warn
 from pans.runtime.errors import UsageError
 from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
 from pans.runtime.instrument.calibration import MAX_AGE_H
@@ -176,5 +176,5 @@ def _metrics_of(args: argparse.Namespace) -> str:
 
     check_address(address, public=args.metrics_public)
     if is_public(address):
-        say(f"pans: warning: other machines can read the figures at {address}; there is no password")
+        warn(f"other machines can read the figures at {address}; there is no password")
     return address

@@ -12,10 +12,11 @@ import sys
 from pathlib import Path
 
 from pans.runtime import SHIPPED
-from pans.runtime.cli import Command, add_force
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.operate.option_file import add_option_file, prepare_options, write_options
 from pans.runtime.run_folder import RUNS
 from pans.runtime.timing.cpu import check_core
 
@@ -102,6 +103,7 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     add_flow_options(parser)
     add_dark_options(parser)
     add_continuous_options(parser)
+    add_option_file(parser)
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:
@@ -118,7 +120,12 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     profile = args.profile or profile_of(args.device)
-    return carry_out(args, _job(args, args.bundle, args.device, profile, args.decisions, args.record))
+    job = _job(args, args.bundle, args.device, profile, args.decisions, args.record)
+    if args.write_config is None:
+        return carry_out(args, job)
+    path = write_options(args)
+    emit(args, {"config": str(path)}, f"{path}\nnext: pans run --config {shlex.quote(str(path))}")
+    return EXIT_FINE
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -147,7 +154,9 @@ def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, deci
         run_name=bundle.stem,
         force=args.force,
         inputs=tuple(
-            Path(name) for name in (profile, getattr(args, "flow", None), getattr(args, "act_profile", None)) if name
+            Path(name)
+            for name in (profile, *(getattr(args, other, None) for other in ("flow", "act_profile", "config")))
+            if name
         ),
         shots=args.shots,
         trials=args.trials,
@@ -181,7 +190,7 @@ def profile_of(device: str) -> str:
     raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
 
 
-RUN = Command("decide on a device's clicks with a trained bundle, live", _configure_run, _run)
+RUN = Command("decide on a device's clicks with a trained bundle, live", _configure_run, _run, prepare=prepare_options)
 DEMO = Command(
     "the main job with nothing but the package: a simulated instrument, real images, timed decisions",
     _configure_demo,

@@ -6,11 +6,13 @@ recorder only the list is kept.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from typing import Any
 
 from pans.runtime.core.decision import CoreEvent
 from pans.runtime.link.connection import Connection
+from pans.runtime.logs import log_event
 from pans.runtime.record import AnyRecorder
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.session import Refusal
@@ -41,6 +43,7 @@ class Journal:
         event = {"kind": kind, **facts}
         if kind in TROUBLE:
             self.trouble = event
+        log_event(kind, facts, logging.WARNING if kind in TROUBLE else logging.INFO)
         if len(self.events) < MAX_EVENTS and self._kept[kind] < MAX_OF_A_KIND:
             self._kept[kind] += 1
             self.events.append(event)

@@ -25,6 +25,7 @@ from tree import ROOT
 from pans.runtime import cli
 
 COMMANDS = {point.name: point for point in entry_points(group="pans.commands")}
+LOG_OPTIONS = ("--log-file", "--log-format", "--log-rotate-mb")  # of every command, at the top of the page
 MOST_WORDS = 40  # of a sentence in a tutorial or a how-to
 
 
@@ -45,7 +46,7 @@ def check(words: list[str], where: str, whole: bool) -> None:
     known = {option for action in parser._actions for option in action.option_strings}
     if words[0] != "trials":  # each trial has options of its own
         assert {word.partition("=")[0] for word in words if word.startswith("--")} <= known, f"{where}: {words}"
-    if whole and "..." not in words:
+    if whole and "..." not in words and "--config" not in words:  # a file may hold what is required
         try:
             parser.parse_args(words[1:])
         except (SystemExit, argparse.ArgumentError) as error:
@@ -71,7 +72,7 @@ def test_every_command_and_every_option_is_on_the_page_of_commands() -> None:
             for action in parser_of(name)._actions:
                 longest = max(action.option_strings, key=len, default="")
                 assert (
-                    longest in ("", "--help", "--json", "--quiet", "--verbose", "--debug")
+                    longest in ("", "--help", "--json", "--quiet", "--verbose", "--debug", *LOG_OPTIONS)
                     or f"`{longest}" in sections[name]
                 ), f"{name}: {longest}"
     assert set(COMMANDS) <= set(sections)

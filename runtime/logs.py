@@ -1,0 +1,238 @@
+"""Logs of a command through `logging`: a file of text or JSON lines that rotates, and stderr with priorities under systemd.
+
+Owns the options, the one place where handlers are set up, and the form of a line. A line never makes its writer wait: a thread writes
+the file, behind a queue of bounded length, and what a full disk or a full queue costs is counted. What the command line prints and the events of a run go
+to the logger `pans`; a program that imports pans may add handlers of its own to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import logging.handlers
+import os
+import queue
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from .errors import UsageError
+from .ranges import Range
+from .safe_text import one_line
+
+LOGGER = logging.getLogger("pans")
+LOGGER.addHandler(logging.NullHandler())
+FORMATS = ("text", "json")
+MIB = 1 << 20
+ROTATE_MB, KEPT = 10.0, 5  # the file and at most five before it: 60 MiB
+ROTATE = Range(0.01, 1e6)
+QUEUE_LINES = 10_000
+KIND_MOST, KIND_EVERY_S = 20, 60.0  # events of one kind in that time; a fault that repeats must not fill the disk
+LINE_MAX = 8000
+FIRST_LINE_MAX_BYTES = 1 << 16
+_LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+
+
+def add_log_options(group: argparse._ActionsContainer) -> None:
+    """Add `--log-file`, `--log-format` and `--log-rotate-mb`, of every command."""
+    group.add_argument("--log-file", type=Path, metavar="FILE", help="append what happens to this file, line by line")
+    group.add_argument("--log-format", choices=FORMATS, help="of the log file (default: text)")
+    group.add_argument(
+        "--log-rotate-mb",
+        type=ROTATE.option,
+        metavar="N",
+        help=f"begin a new log file after N MiB and keep {KEPT} old ones (default {ROTATE_MB:g})",
+    )
+
+
+@contextmanager
+def logging_of(args: argparse.Namespace) -> Iterator[None]:
+    """Log to the file that the options name until the block ends; UsageError for a file that is no log of ours."""
+    path: Path | None = args.log_file
+    if path is None:
+        for option in ("log_format", "log_rotate_mb"):
+            if getattr(args, option) is not None:
+                name = option.replace("_", "-")
+                raise UsageError(f"--{name} has no effect without a log file", remedy="name one with --log-file")
+        yield
+        return
+    handler = _FileHandler(path, _JsonLine() if args.log_format == "json" else _TextLine(), args.log_rotate_mb)
+    lines: queue.Queue[Any] = queue.Queue(QUEUE_LINES)
+    entrance = _Entrance(lines)
+    entrance.addFilter(_KindLimit())
+    listener = _Listener(lines, handler)
+    level = LOGGER.level
+    LOGGER.setLevel(logging.INFO)
+    LOGGER.addHandler(entrance)
+    listener.start()
+    try:
+        yield
+    finally:
+        LOGGER.removeHandler(entrance)
+        LOGGER.setLevel(level)
+        listener.stop()
+        handler.close()
+        if lost := entrance.lost + handler.lost:
+            print(f"pans: {lost} lines are missing from {path}", file=sys.stderr)
+
+
+def log_event(kind: str, facts: Mapping[str, Any], level: int = logging.INFO) -> None:
+    """Log one event of a run: its kind, and facts whose names carry the units."""
+    if LOGGER.isEnabledFor(level):
+        LOGGER.log(level, kind, extra={"facts": dict(facts)})
+
+
+def stderr_line(text: str, level: int = logging.INFO) -> str:
+    """Return `text` as stderr shows it: under systemd each line begins with its priority, `<3>` to `<7>` (sd-daemon(3))."""
+    if not _is_journal():
+        return text
+    priority = 3 if level >= logging.ERROR else 4 if level >= logging.WARNING else 6
+    return "\n".join(f"<{priority}>{line}" for line in text.split("\n"))
+
+
+def _is_journal() -> bool:
+    """Whether stderr leads to the journal: JOURNAL_STREAM names its device and inode (systemd.exec(5))."""
+    wanted = os.environ.get("JOURNAL_STREAM", "")
+    if not wanted:
+        return False
+    try:
+        found = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError, AttributeError):
+        return False
+    return wanted == f"{found.st_dev}:{found.st_ino}"
+
+
+# ---- lines ----
+
+
+def _time_of(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+
+
+class _TextLine(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        facts = getattr(record, "facts", {})
+        told = "".join(f" {key}={_plain(value)}" for key, value in facts.items())
+        return one_line(f"{_time_of(record)} {record.levelname} {record.getMessage()}{told}", LINE_MAX)
+
+
+class _JsonLine(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": _time_of(record),
+            "level": record.levelname,
+            "message": record.getMessage()[:LINE_MAX],
+        }
+        if facts := getattr(record, "facts", {}):
+            line["facts"] = facts
+        return json.dumps(line, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+# ---- handlers ----
+
+
+class _Entrance(logging.handlers.QueueHandler):
+    """Puts lines into the queue and counts those for which there is no room."""
+
+    lost = 0
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self.lost += 1
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        return record  # it stays in this process
+
+
+class _Listener(logging.handlers.QueueListener):
+    def enqueue_sentinel(self) -> None:
+        self.queue.put(self._sentinel)  # type: ignore[attr-defined]  # waits where the queue is full
+
+
+class _KindLimit(logging.Filter):
+    """Lets KIND_MOST events of a kind pass in KIND_EVERY_S, and tells with the next how many did not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: Counter[str] = Counter()
+        self._left_out: Counter[str] = Counter()
+        self._since_s = time.monotonic()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        facts = getattr(record, "facts", None)
+        if facts is None:
+            return True
+        now_s = time.monotonic()
+        if now_s - self._since_s > KIND_EVERY_S:
+            self._since_s = now_s
+            self._passed.clear()
+        kind = record.msg
+        if self._passed[kind] >= KIND_MOST:
+            self._left_out[kind] += 1
+            return False
+        self._passed[kind] += 1
+        if left_out := self._left_out.pop(kind, 0):
+            facts["not_logged_before"] = left_out
+        return True
+
+
+class _FileHandler(logging.handlers.RotatingFileHandler):
+    """A log of ours, appended to; what cannot be written is counted."""
+
+    def __init__(self, path: Path, lines: logging.Formatter, rotate_mb: float | None) -> None:
+        self.lost = 0
+        for old in (path, *(path.with_name(f"{path.name}.{number}") for number in range(1, KEPT + 1))):
+            _check_log(old)
+        most = round((ROTATE_MB if rotate_mb is None else rotate_mb) * MIB)
+        try:
+            super().__init__(path, maxBytes=most, backupCount=KEPT, encoding="utf-8", errors="backslashreplace")
+        except OSError as error:
+            raise UsageError(
+                f"{path}: cannot be written to: {error.strerror or error}", remedy="choose another name for --log-file"
+            ) from error
+        self.setFormatter(lines)
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        self.lost += 1
+
+
+def _check_log(path: Path) -> None:
+    """Refuse to append to, or to rotate away, what is no log of ours."""
+    if not os.path.lexists(path):
+        return
+    remedy = "choose another name for --log-file"
+    if not path.is_file():
+        raise UsageError(f"{path}: is not a regular file", remedy=remedy)
+    try:
+        with open(path, "rb") as file:
+            line = file.readline(FIRST_LINE_MAX_BYTES)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy=remedy) from error
+    if line and not is_log_line(line):
+        raise UsageError(f"{path}: exists, and is not a log of pans", remedy=remedy)
+
+
+def is_log_line(line: bytes) -> bool:
+    """Return whether `line` begins a log of ours, in either form."""
+    try:
+        text = line.decode()
+        if text.startswith("{"):
+            found = json.loads(text)
+            return {"time", "level", "message"} <= found.keys()
+        when, level, *_ = text.split(" ")
+        datetime.fromisoformat(when)
+        return level in _LEVELS
+    except (ValueError, RecursionError):
+        return False
