@@ -1,8 +1,8 @@
 """Logs of a command through `logging`: a file of text or JSON lines that rotates, and stderr with priorities under systemd.
 
 Owns the options, the one place where handlers are set up, and the form of a line. A line never makes its writer wait: a thread writes
-the file, behind a queue of bounded length, and what a full disk or a full queue costs is counted. What the command line prints and the events of a run go
-to the logger `pans`; a program that imports pans may add handlers of its own to it.
+the file, behind a queue of bounded length, and what a full disk or a full queue costs is counted. What the command line prints and the
+events of a run go to the logger `pans`; a program that imports pans may add handlers of its own to it.
 """
 
 from __future__ import annotations

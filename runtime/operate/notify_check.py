@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 from pans.runtime.errors import UsageError
@@ -49,7 +50,7 @@ class Heard:
             return float("inf")
         until = self.ended_s if self.asked_s is None else self.asked_s
         times = [self.ready_s, *(at for at in self.watchdog_s if self.ready_s <= at <= until), until]
-        return max(after - before for before, after in zip(times, times[1:]))
+        return max(after - before for before, after in pairwise(times))
 
 
 def start_and_hear(
