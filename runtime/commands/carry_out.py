@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from pans.runtime.live import LiveCore, Recovery, RunConfig, RunResult
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
+    from pans.runtime.monitor import Monitor
     from pans.runtime.record import AnyRecorder
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch import Watchdog
@@ -99,7 +101,8 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
-            return _run_job(job, started_ns or time.perf_counter_ns(), _Ending(stop, watchdog))
+            with _monitor_of(job) as monitor:
+                return _run_job(job, started_ns or time.perf_counter_ns(), _Beside(stop, watchdog, monitor))
         except PansError:
             raise
         except Exception as error:
@@ -108,11 +111,18 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
             raise
 
 
-class _Ending(NamedTuple):
-    """How a run may be ended from outside: asked to, or by force."""
+class _Beside(NamedTuple):
+    """What is there beside a run: how it may be ended from outside, asked to or by force, and who shows it."""
 
     stop: Stop
     watchdog: Watchdog | None
+    monitor: Monitor
+
+
+def _monitor_of(job: Job) -> Monitor:
+    from pans.runtime.monitor import Monitor
+
+    return Monitor(panel=job.shows and sys.stderr.isatty(), address=job.serve, lines=job.shows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +185,10 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, n_objects * job.trials)
 
 
-def _run_job(job: Job, started_ns: int, ending: _Ending) -> Outcome:
+def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
     opening = _Background(lambda: open_link(job.device))
+    if beside.monitor.url:
+        say(f"pans: live page at {beside.monitor.url}")
     try:
         ready = _prepare(job, started_ns)
     except BaseException:
@@ -187,37 +199,37 @@ def _run_job(job: Job, started_ns: int, ending: _Ending) -> Outcome:
     link = opening.result()
     try:
         with claimed(job) as job:
-            return _traced(job, ready, link, ending)
+            return _traced(job, ready, link, beside)
     finally:
         link.close()
 
 
-def _traced(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
+def _traced(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcome:
     """Run with a trace, if one is wanted; one that could not be written to its end is told, and ends nothing."""
     from pans.runtime.link.trace import TracedLink
 
     if job.trace is None:
-        return _recorded(job, ready, link, ending)
+        return _recorded(job, ready, link, beside)
     traced = TracedLink(link, job.trace, job.device, force=job.force)
     try:
-        return _recorded(job, ready, traced, ending)
+        return _recorded(job, ready, traced, beside)
     finally:
         traced.close()
         if traced.trouble:
             say(f"pans: {job.trace}: the trace is not whole: {traced.trouble}")
 
 
-def _recorded(job: Job, ready: _Prepared, link: Link, ending: _Ending) -> Outcome:
+def _recorded(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcome:
     from pans.runtime.live import Recovery
     from pans.runtime.live.continuous import open_recorder
 
     recovery = Recovery.of(link, job.device, job.reconnect_s) if job.reconnect_s else None
     if job.recording is None:
-        result = _watched(job, ready, link, None, recovery, ending)
+        result = _watched(job, ready, link, None, recovery, beside)
         return _conclude(job, ready, result, _summary(job, ready, result))
     limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
     with open_recorder(job.recording, header, _same_bundle(job, ready), limits, force=job.force) as recorder:
-        result = _watched(job, ready, link, recorder, recovery, ending)
+        result = _watched(job, ready, link, recorder, recovery, beside)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
     return _conclude(job, ready, result, summary)
@@ -234,32 +246,48 @@ def _same_bundle(job: Job, ready: _Prepared) -> bytes:
 
 
 def _watched(
-    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, ending: _Ending
+    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, beside: _Beside
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
     from pans.runtime.live import LiveRun, Observers, run_live
-    from pans.runtime.live.view import live_view
     from pans.runtime.watch import Attendants
 
-    bundle, dark, seen = ready.bundle, ready.dark, Attendants(job.continuous, recorder, ending.watchdog)
-    title = f"{bundle.name} on {job.profile.name}"
-    show = live_view(title, bundle.classes, ready.expected_decisions, link.simulated, ready.config.deadline_us)
-    with seen, show if job.shows else nullcontext() as watch:
+    dark, monitor = ready.dark, beside.monitor
+    monitor.begin(ready.bundle, recorder, _facts(job, ready, link))
+    with Attendants(job.continuous, recorder, beside.watchdog) as seen:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
             seen.prepared(run)
+            monitor.prepared(run)
             if ready.flow_run is not None:
                 ready.flow_run.prepared(run)
 
         def look(run: LiveRun, output: Output) -> None:
             dark.look(run, output)
-            if watch is not None:
-                watch(run, output)
+            monitor.watch(run, output)
 
-        observers = Observers(look, prepared, ending.stop)
-        return run_live(link, dark.profile, bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers)
+        observers = Observers(look, prepared, beside.stop)
+        return run_live(
+            link, dark.profile, ready.bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers
+        )
+
+
+def _facts(job: Job, ready: _Prepared, link: Link) -> dict[str, Any]:
+    """What a live view is told before the run."""
+    from pans.runtime.monitor.snapshot import begin_facts
+
+    bundle = ready.bundle
+    return begin_facts(
+        bundle,
+        title=f"{bundle.name} on {job.profile.name}",
+        simulated=link.simulated,
+        expected=ready.expected_decisions,
+        deadline_us=ready.config.deadline_us,
+        trials=job.trials,
+        illumination=bundle.illumination() * job.shots * (1 if job.flow is None else job.flow.pool),
+    )
 
 
 def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:

@@ -58,6 +58,7 @@ class Job:
     continuous: Continuous = field(default_factory=Continuous)
     seed: int | None = None  # of a simulated detector, where the command has one
     shows: bool = True  # what is happening, on stderr
+    serve: str = ""  # HOST:PORT of the live page
 
     @property
     def recording(self) -> Path | None:

@@ -149,6 +149,22 @@ def add_continuous_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_serve_options(parser: argparse.ArgumentParser) -> None:
+    """Add the live page's options to `pans run` and `pans demo`."""
+    group = parser.add_argument_group("live page (docs/how-to/live-view.md)")
+    group.add_argument(
+        "--serve", default="", metavar="HOST:PORT", help="show the run as a web page; a port alone: this machine only"
+    )
+    group.add_argument(
+        "--serve-public", action="store_true", help="let other machines see the page; there is no password"
+    )
+
+
+def serve_of(args: argparse.Namespace) -> str:
+    """Return the address of the live page, checked."""
+    return _address_of(args.serve, args.serve_public, "--serve")
+
+
 def continuous_of(args: argparse.Namespace) -> Continuous:
     """Return what the options ask for; UsageError for what cannot be meant. Commands without the options ask for nothing."""
     rotate_mb, keep_mb = getattr(args, "rotate_mb", 0.0), getattr(args, "keep_mb", 0.0)
@@ -168,13 +184,17 @@ def continuous_of(args: argparse.Namespace) -> Continuous:
 
 
 def _metrics_of(args: argparse.Namespace) -> str:
-    """Return the address for metrics, checked; one that others can reach is said aloud."""
-    address = str(getattr(args, "metrics", ""))
+    """Return the address for metrics, checked."""
+    return _address_of(getattr(args, "metrics", ""), getattr(args, "metrics_public", False), "--metrics")
+
+
+def _address_of(address: str, public: bool, option: str) -> str:
+    """Return the address, checked; one that others can reach is said aloud."""
     if not address:
         return ""
     from pans.runtime.watch.metrics import check_address, is_public
 
-    check_address(address, public=args.metrics_public)
+    check_address(address, public=public, option=option)
     if is_public(address):
         warn(f"other machines can read the figures at {address}; there is no password")
     return address

@@ -27,10 +27,12 @@ from .options import (
     add_continuous_options,
     add_dark_options,
     add_flow_options,
+    add_serve_options,
     add_walk_options,
     continuous_of,
     dark_of,
     flow_of,
+    serve_of,
 )
 
 DEMO_BUNDLE = "fashion-adaptive.pans"
@@ -84,6 +86,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
         default=10.0,
         help="how long to look for a lost device (default 10, 0: not at all)",
     )
+    add_serve_options(parser)
     parser.add_argument(
         "--trace", type=Path, metavar="FILE", help="write all bytes of both directions as hex, with times"
     )
@@ -180,6 +183,7 @@ def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, deci
         dark=dark_of(args),
         continuous=continuous_of(args),
         seed=getattr(args, "seed", None),
+        serve=serve_of(args),
     )
 
 

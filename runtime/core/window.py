@@ -142,6 +142,14 @@ class DecisionWindows:
         known = 0 <= state < len(self.walks.successors) and self._seen[window, 0] == step
         return state if known else -1
 
+    def latest(self) -> tuple[list[int], int] | None:
+        """Return the clicks of the window of this visit that was settled last, and its exposures with light; None before the first.
+
+        For a view beside the loop: it may be read in another thread, and is then of one moment or the next.
+        """
+        at = self._next_window - 1
+        return None if at < 0 else (self._counts[at].tolist(), int(self._seen[at, 0]))
+
     @property
     def half_seen(self) -> bool:
         """Whether a window that is not settled holds exposures already."""

@@ -1,6 +1,6 @@
 """The shell around the core while a device runs: one turn after the other, what is late and why, and how a run ends.
 
-Owns the live loop, reconnection, pulses, the terminal's view, metrics and the state file. It decides nothing itself (core, flow), judges
+Owns the live loop, reconnection and pulses. It decides nothing itself (core, flow), judges
 no file (report) and reads no argument (commands). `run_live` takes an open link and a core and returns a `RunResult`.
 """
 

@@ -43,6 +43,7 @@ class RunTally:
         self.decisions = 0
         self.abstained = 0
         self.unsure = 0  # of them because no class was as sure as was asked for
+        self.known = self.right = 0  # decisions with a known truth, and those of them that are right
         self.clicks = self.exposures = 0  # exposures: of walks
         self.photons = 0.0
         self.photons_known = 0
@@ -64,6 +65,8 @@ class RunTally:
         if decision.truth < 0 or decision.truth >= len(self.confusion):
             return
         right = int(decision.label == decision.truth)
+        self.known += 1
+        self.right += right
         if decision.label != NO_LABEL:
             self.confusion[decision.truth, decision.label] += 1
         trial = decision.shot // self.shots
@@ -103,8 +106,7 @@ class RunTally:
     @property
     def accuracy(self) -> float | None:
         """Right decisions over decisions with a known truth (an abstention is not right); None without any."""
-        total = sum(n for n, _ in self._trials.values())
-        return sum(right for _, right in self._trials.values()) / total if total else None
+        return self.right / self.known if self.known else None
 
     def figures(self) -> TallyFigures:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""

@@ -10,7 +10,7 @@ Every nanosecond between the end of the exposure and the decision is given to th
                 stopped)
     link        the loop was awake and waiting for bytes, and nothing says that the device was late
     device      ... and a message that says when it left shows that the link was open, or that the device held it back
-    decode      the loop's own work, none of the above (reading messages, the live view)
+    decode      the loop's own work, none of the above (reading messages, recording)
 
 The largest share is the cause. What separates link from device is in docs/explanation/timing.md: a click block
 says when it was exposed, never when it was sent, so that only a PONG or a STATUS that falls into the silence can tell; without one the

@@ -48,7 +48,7 @@ class LatencyHistogram:
         for bucket, count in enumerate(self.counts):
             seen += count
             if count and seen >= wanted:
-                return min(_upper_edge(bucket), self.max_ns)
+                return min(upper_edge(bucket), self.max_ns)
         return 0
 
     def summary(self) -> dict[str, float]:
@@ -57,7 +57,8 @@ class LatencyHistogram:
         return {name: self.quantile_ns(q) / 1000 for name, q in edges.items()} | {"max": self.max_ns / 1000}
 
 
-def _upper_edge(bucket: int) -> int:
+def upper_edge(bucket: int) -> int:
+    """Return the longest duration in ns that a bucket of LatencyHistogram counts."""
     if bucket < 2 << SUB_BITS:
         return bucket
     shift = (bucket >> SUB_BITS) - 1

@@ -1,8 +1,11 @@
-"""A small HTTP server for one page: one thread, few connections, little time and few bytes for each, so that no client reaches the loop.
+"""A small HTTP server for one page and its events: one thread, few connections, little time and few bytes for each.
 
-Owns sockets, limits and the few words of HTTP that a scrape needs; the page is the caller's. Whatever clients do, the thread handles a
-few events every ROUND_S and sleeps between, makes the page at most every PAGE_KEPT_S, and holds MAX_CLIENTS connections: a further one
-takes the place of the oldest, so that those who open many and say nothing cannot shut out one who asks.
+Owns sockets, limits and the few words of HTTP that a scrape or a browser needs; page and events are the caller's. Whatever clients do, the
+thread handles a few events every ROUND_S and sleeps between, makes the page at most every PAGE_KEPT_S, and holds MAX_CLIENTS connections:
+a further one takes the place of the oldest, so that those who open many and say nothing cannot shut out one who asks. A browser that
+follows the events (server-sent events, WHATWG HTML 9.2) is one of MAX_LISTENERS; one that does not read misses events and is dropped
+after LISTENER_STUCK_S. On a loopback address, requests that name another host are refused: a web page elsewhere could have made its own
+name point here (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from ipaddress import ip_address
+from typing import Protocol
 
 MAX_CLIENTS = 8
 REQUEST_S = 2.0  # from the connection to the last byte of the answer
@@ -23,6 +28,29 @@ BACKLOG = 128  # in the kernel, where they cost nothing
 PAGE_KEPT_S = 0.25
 POLL_S = 0.25  # how long the end of the server may have to wait
 PATHS = (b"/", b"/metrics")
+EVENTS_PATH = b"/events"
+MAX_LISTENERS = 6
+LISTENER_STUCK_S = 10.0
+KEEP_ALIVE_S = 10.0  # without events a comment goes out, so that a browser that is gone is noticed
+
+
+def is_loopback(host: str) -> bool:
+    """Whether `host`, a name or an address, is this machine itself."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class Feed(Protocol):
+    """Events for browsers: `number` grows with each; `after(n)` returns what one who has seen those up to `n` (-1: none) must be sent."""
+
+    @property
+    def number(self) -> int:
+        """How many there have been."""
+
+    def after(self, number: int) -> bytes:
+        """Return them in the form of server-sent events; older ones that a later one replaces are left out."""
 
 
 class _Client:
@@ -33,11 +61,33 @@ class _Client:
         self.answer = b""
 
 
-class PageServer:
-    """Serves what `page` returns, text in UTF-8 of the type `kind`, at `host`, until `close`; OSError if it cannot listen there."""
+class _Listener:
+    """A browser that follows the events."""
 
-    def __init__(self, host: str, port: int, kind: str, page: Callable[[], bytes]) -> None:
-        self._kind, self._page = kind, page
+    def __init__(self, connection: socket.socket, begin: bytes) -> None:
+        self.connection, self.pending, self.seen = connection, begin, -1
+        self.moved_s = time.monotonic()
+
+
+class PageServer:
+    """Serves what `page` returns, text in UTF-8 of the type `kind`, at `host`, until `close`; OSError if it cannot listen there.
+
+    `headers` are further lines of its answers, each with its line end. With `feed` its events are served at `/events`.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        kind: str,
+        page: Callable[[], bytes],
+        *,
+        headers: str = "",
+        feed: Feed | None = None,
+    ) -> None:
+        self._kind, self._page, self._headers, self._feed = kind, page, headers, feed
+        self._local = is_loopback(host)
+        self._listeners: dict[int, _Listener] = {}  # by file descriptor
         self._made_s, self._made = -PAGE_KEPT_S, b""
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         self._listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
@@ -56,6 +106,9 @@ class PageServer:
         self._thread.join()
         for client in list(self._clients.values()):
             self._drop(client)
+        for listener in list(self._listeners.values()):
+            self._tell(listener, time.monotonic())  # the last word
+            self._drop_listener(listener)
         self._selector.close()
         self._listener.close()
 
@@ -64,9 +117,13 @@ class PageServer:
             for key, _ in self._selector.select(POLL_S):
                 if key.data is None:
                     self._accept()
+                elif isinstance(key.data, _Listener):
+                    self._overhear(key.data)
                 else:
                     self._attend(key.data)
             now_s = time.monotonic()
+            for listener in list(self._listeners.values()):
+                self._tell(listener, now_s)
             for client in [one for one in self._clients.values() if now_s - one.since_s > REQUEST_S]:
                 self._drop(client)
             self._ending.wait(ROUND_S)
@@ -89,7 +146,7 @@ class PageServer:
         try:
             if not client.answer:
                 self._hear(client)
-            if client.answer:
+            if client.answer and client.connection.fileno() in self._clients:
                 client.answer = client.answer[client.connection.send(client.answer) :]
                 if not client.answer:
                     self._drop(client)
@@ -108,6 +165,8 @@ class PageServer:
             client.answer = _answer("431 Request Header Fields Too Large")
         elif end:
             client.answer = self._answer_to(head)
+            if client.answer.startswith(EVENTS_BEGIN):
+                self._follow(client)
         elif not data:
             self._drop(client)
 
@@ -117,7 +176,12 @@ class PageServer:
             return _answer("400 Bad Request")
         if words[0] not in (b"GET", b"HEAD"):
             return _answer("405 Method Not Allowed")
-        if words[1].split(b"?", 1)[0] not in PATHS:
+        if self._local and not _names_this_machine(head):
+            return _answer("403 Forbidden")
+        path = words[1].split(b"?", 1)[0]
+        if self._feed is not None and path == EVENTS_PATH and words[0] == b"GET":
+            return _answer("503 Service Unavailable") if len(self._listeners) >= MAX_LISTENERS else EVENTS_BEGIN
+        if path not in PATHS:
             return _answer("404 Not Found")
         now_s = time.monotonic()
         if now_s - self._made_s >= PAGE_KEPT_S:
@@ -125,7 +189,52 @@ class PageServer:
                 self._made_s, self._made = now_s, self._page()
             except Exception:  # figures that change while they are read: the next scrape has them
                 return _answer("500 Internal Server Error")
-        return _answer("200 OK", self._kind, self._made, head=words[0] == b"HEAD")
+        return _answer("200 OK", self._kind, self._made, head=words[0] == b"HEAD", headers=self._headers)
+
+    # -- events --------------------------------------------------------------------------------------------------------
+
+    def _follow(self, client: _Client) -> None:
+        """Turn a client that asked for the events into a listener."""
+        connection = client.connection
+        del self._clients[connection.fileno()]
+        listener = self._listeners[connection.fileno()] = _Listener(connection, client.answer)
+        self._selector.modify(connection, selectors.EVENT_READ, listener)
+
+    def _overhear(self, listener: _Listener) -> None:
+        """Take note that a listener went away; it has nothing to say."""
+        try:
+            if not listener.connection.recv(HEADER_MAX_BYTES):
+                self._drop_listener(listener)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop_listener(listener)
+
+    def _tell(self, listener: _Listener, now_s: float) -> None:
+        """Send what is new; whoever has not read the last event yet gets none."""
+        assert self._feed is not None
+        if not listener.pending:
+            if self._feed.number != listener.seen:
+                number = self._feed.number
+                listener.pending, listener.seen = self._feed.after(listener.seen), number
+            elif now_s - listener.moved_s > KEEP_ALIVE_S:
+                listener.pending = b":\n\n"
+        if not listener.pending:
+            return
+        try:
+            listener.pending = listener.pending[listener.connection.send(listener.pending) :]
+            listener.moved_s = now_s
+        except BlockingIOError:
+            if now_s - listener.moved_s > LISTENER_STUCK_S:
+                self._drop_listener(listener)
+        except OSError:
+            self._drop_listener(listener)
+
+    def _drop_listener(self, listener: _Listener) -> None:
+        if self._listeners.pop(listener.connection.fileno(), None) is not None:
+            with suppress(KeyError, ValueError):
+                self._selector.unregister(listener.connection)
+        listener.connection.close()
 
     def _drop(self, client: _Client) -> None:
         if self._clients.pop(client.connection.fileno(), None) is not None:
@@ -134,6 +243,28 @@ class PageServer:
         client.connection.close()
 
 
-def _answer(status: str, kind: str = "text/plain", body: bytes = b"", *, head: bool = False) -> bytes:
-    lines = f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+EVENTS_BEGIN = (
+    b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nCache-Control: no-store\r\n"
+    b"X-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n"
+)
+
+
+def _names_this_machine(head: bytes) -> bool:
+    """Whether the Host line, if there is one, names a loopback address: every browser sends it."""
+    for line in head.split(b"\r\n")[1:]:
+        name, _, value = line.partition(b":")
+        if name.strip().lower() == b"host":
+            host = value.strip().decode("latin-1")
+            host = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+            return is_loopback(host)
+    return True
+
+
+def _answer(
+    status: str, kind: str = "text/plain", body: bytes = b"", *, head: bool = False, headers: str = ""
+) -> bytes:
+    lines = (
+        f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n"
+        f"X-Content-Type-Options: nosniff\r\n{headers}Connection: close\r\n\r\n"
+    )
     return lines.encode() + (b"" if head else body)

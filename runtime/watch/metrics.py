@@ -7,12 +7,11 @@ others may read: there is no password. Needs the extra `metrics`; an answer cost
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from ipaddress import ip_address
 from typing import Any
 
 from pans.runtime.errors import UsageError
 
-from .http import PageServer
+from .http import PageServer, is_loopback
 
 LOOPBACK = "127.0.0.1"
 # picture key -> (metric, counts up, help)
@@ -40,36 +39,29 @@ CAUSES = {
 }
 
 
-def parse_address(text: str) -> tuple[str, int]:
-    """Read `PORT`, `HOST:PORT` or `[HOST]:PORT`; a port alone means this machine only."""
+def parse_address(text: str, option: str = "--metrics") -> tuple[str, int]:
+    """Read `PORT`, `HOST:PORT` or `[HOST]:PORT`; a port alone means this machine only. `option` is named in errors."""
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else ""
     if not port.isdecimal() or not 0 <= int(port) <= 65535:
-        raise UsageError(f"--metrics {text!r}: no address", remedy="write 127.0.0.1:PORT, for example 127.0.0.1:9464")
+        raise UsageError(f"{option} {text!r}: no address", remedy="write 127.0.0.1:PORT, for example 127.0.0.1:9464")
     return host or LOOPBACK, int(port)
 
 
-def check_address(text: str, *, public: bool) -> str:
+def check_address(text: str, *, public: bool, option: str = "--metrics") -> str:
     """Return `text`; UsageError if it is no address, or one that other machines can reach without `public`."""
-    host, _ = parse_address(text)
-    if not (public or _is_loopback(host)):
+    host, _ = parse_address(text, option)
+    if not (public or is_loopback(host)):
         raise UsageError(
-            f"--metrics {text}: other machines could read the figures there, and there is no password",
-            remedy="use 127.0.0.1, or say --metrics-public if that is meant",
+            f"{option} {text}: other machines could read the figures there, and there is no password",
+            remedy=f"use 127.0.0.1, or say {option}-public if that is meant",
         )
     return text
 
 
 def is_public(text: str) -> bool:
     """Whether other machines can reach this address."""
-    return not _is_loopback(parse_address(text)[0])
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    return not is_loopback(parse_address(text)[0])
 
 
 class Collector:

@@ -49,7 +49,7 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
     timing, stream, tallies = run.timing, run.core.tracker.counters, run.core.tallies
     incidents, trouble = run.lateness.incidents, run.journal.trouble
     return picture | {
-        "state": _state_of(run),
+        "state": state_of(run),
         "loop_age_s": round(loop_age_s(run), 3),
         "ended": run.ended,
         "decisions": run.core.n_decisions,
@@ -68,7 +68,8 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
     }
 
 
-def _state_of(run: LiveRun) -> str:
+def state_of(run: LiveRun) -> str:
+    """Return what the run does, in one or two words."""
     if run.ended:
         return "stopped"
     if is_stalled(run):

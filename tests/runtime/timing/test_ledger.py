@@ -8,13 +8,13 @@ import sys
 import numpy as np
 import pytest
 
-from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, _upper_edge, arm_realtime
+from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, upper_edge, arm_realtime
 
 
 def test_buckets_tile_the_integers() -> None:
     for bucket in range(2000):
         histogram = LatencyHistogram()
-        edge = _upper_edge(bucket)
+        edge = upper_edge(bucket)
         histogram.add(edge)
         assert histogram.counts[bucket] == 1
         histogram.add(edge + 1)

@@ -1,0 +1,248 @@
+"""The figures of a live view, in words: the same rows for the terminal and the web page, and the curves of the page.
+
+Owns wording, units and when a figure is marked as a warning or worse; it reads a `History` and never measures. All text that comes from
+files or devices is made inert here (safe_text).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from pans.runtime.intervals import wilson_interval
+from pans.runtime.safe_text import one_line
+
+from .history import Bin, History, quantile_us
+
+NAME_CHARACTERS = 40
+NO_LABEL = 0xFFFF  # of a decision that abstained (decide/verdict.py), which would load numpy
+CLASSES_SHOWN = 20
+DISK_LOW_S, DISK_SHORT_S = 3600.0, 86_400.0
+GIB, MIB = 1 << 30, 1 << 20
+LEVELS = {"notice": "note", "warning": "warn", "alarm": "bad"}
+
+
+class Row(NamedTuple):
+    """A figure: its group, name, text, and level ("" as it should be, good, note, warn or bad)."""
+
+    group: str
+    name: str
+    text: str
+    level: str = ""
+
+
+def rows_of(history: History) -> list[Row]:
+    """Return all figures of the present moment; none before the first picture."""
+    picture = history.picture
+    if not picture:
+        return []
+    return [*_run(history), *_results(history), *_time(history), *_instrument(history), *_machine(history)]
+
+
+def title_of(history: History) -> str:
+    """Return what runs where."""
+    title = one_line(history.begin.get("title", "pans"), 120)
+    return f"SIMULATED · {title}" if history.begin.get("simulated") else title
+
+
+def headline(history: History) -> str:
+    """Return the most important figures as one line."""
+    picture, begin = history.picture, history.begin
+    decisions, expected = picture["decisions"], begin.get("expected", 0)
+    accuracy = "" if not picture["known"] else f" · accuracy {picture['right'] / picture['known']:.1%}"
+    clicks = picture["clicks"] / decisions if decisions else 0.0
+    p99 = quantile_us(history.latency, 0.99) or 0.0
+    dark = picture.get("dark_words")
+    return (
+        f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy} · {clicks:.2f} clicks each"
+        f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost']}"
+        + (f" · dark counts: {one_line(dark, 200)}" if dark else "")
+    )
+
+
+def _run(history: History) -> list[Row]:
+    picture, begin = history.picture, history.begin
+    state = picture["state"] + (f": {one_line(picture['ended'], 200)}" if picture["ended"] else "")
+    level = {"running": "good", "stopped": "note", "stalled": "bad", "device lost": "bad"}.get(picture["state"], "note")
+    done, expected = picture["decisions"], begin.get("expected", 0)
+    rate = history.rate("decisions")
+    left = (
+        f", {duration((expected - done) / rate)} left" if expected > done and rate > 0 and not picture["ended"] else ""
+    )
+    rows = [
+        Row("run", "state", state, level),
+        Row("run", "running for", duration(picture["elapsed_s"])),
+        Row("run", "decisions", f"{done:,}" + (f" of {expected:,}" if expected else "") + left),
+        Row("run", "rate", f"{rate:,.1f} decisions and {history.rate('exposures'):,.0f} exposures per second"),
+    ]
+    if picture["reconnects"]:
+        rows.append(Row("run", "reconnections", f"{picture['reconnects']}", "warn"))
+    return rows
+
+
+def _results(history: History) -> list[Row]:
+    picture = history.picture
+    done = picture["decisions"]
+    found = history.accuracy(picture, picture["objects"])
+    rows = []
+    if found is not None:
+        share, low, high = found
+        text = f"{share:.1%}, 95 % interval {low:.1%} to {high:.1%} ({picture['objects']:,} objects)"
+        rows.append(Row("results", "accuracy", text))
+    if not done:
+        return rows
+    abstained = picture["abstained"]
+    rows.append(Row("results", "abstained", f"{abstained:,} ({abstained / done:.2%})", "note" if abstained else ""))
+    photons = picture["photons"] / picture["photons_known"] if picture["photons_known"] else None
+    light = history.begin.get("illumination")
+    light = picture["walk_light"] / done if picture.get("walk_light") is not None else light
+    each = [
+        f"{picture['clicks'] / done:.2f} clicks",
+        "photons unknown" if photons is None else f"{photons:.2f} photons",
+        *([] if light is None else [f"illumination {light:.1f}"]),
+    ]
+    return [*rows, Row("results", "light per decision", ", ".join(each))]
+
+
+def _time(history: History) -> list[Row]:
+    picture, deadline = history.picture, float(history.begin.get("deadline_us", 0.0))
+    p50, p99 = (quantile_us(history.latency, q) for q in (0.5, 0.99))
+    rows = []
+    if p50 is not None and p99 is not None:
+        text = f"p50 {p50:,.0f} us, p99 {p99:,.0f} us, longest {picture['latency_max_us']:,.0f} us"
+        level = "bad" if deadline and p99 > deadline else "warn" if deadline and p99 > 0.8 * deadline else ""
+        rows.append(Row("time", "latency", text, level))
+        if deadline:
+            rows.append(Row("time", "budget", f"{deadline:,.0f} us; p99 takes {p99 / deadline:.0%} of it", level))
+    late, lost = picture["late"], picture["lost"]
+    gaps = f" in {picture['gaps']:,} gaps" if lost else ""
+    return [
+        *rows,
+        Row("time", "late", f"{late:,} decisions", "bad" if late else "good"),
+        Row("time", "lost", f"{lost:,} exposures{gaps}", "bad" if lost else "good"),
+    ]
+
+
+def _instrument(history: History) -> list[Row]:
+    picture = history.picture
+    rows = [_dark(picture)]
+    drift = picture.get("clock_drift_ppm")
+    text = "not known yet" if drift is None else f"drift {drift:+.2f} ppm"
+    rows.append(Row("instrument", "clock", f"{text}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"))
+    if picture["contradictions"]:
+        rows.append(Row("instrument", "contradictions", f"{picture['contradictions']:,} messages", "bad"))
+    if picture["trouble"]:
+        rows.append(Row("instrument", "latest trouble", one_line(picture["trouble"], 200), "warn"))
+    return rows
+
+
+def _dark(picture: dict[str, Any]) -> Row:
+    clicks, exposures = picture["dark_clicks"], picture["dark_exposures"]
+    if not exposures:
+        return Row("instrument", "dark counts", "no dark exposures yet", "note")
+    low, high = wilson_interval(clicks, exposures)
+    text = f"{clicks / exposures:.3g} per exposure, 95 % interval {low:.2g} to {high:.2g}"
+    expected = picture.get("dark_expected")
+    if expected is not None:
+        top = picture["dark_high"]
+        text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
+    words = picture.get("dark_words")
+    return Row(
+        "instrument",
+        "dark counts",
+        text + (f"; {one_line(words, 200)}" if words else "; as expected" if expected is not None else ""),
+        LEVELS.get(picture.get("dark_level", ""), "good" if expected is not None else ""),
+    )
+
+
+def _machine(history: History) -> list[Row]:
+    picture = history.picture
+    free = picture.get("disk_free_bytes")
+    if free is None:
+        return []
+    size, seconds = picture.get("recording_bytes", 0), max(float(picture["elapsed_s"]), 1.0)
+    left_s = free * seconds / size if size else float("inf")
+    level = "bad" if left_s < DISK_LOW_S else "warn" if left_s < DISK_SHORT_S else ""
+    lasts = f", lasts {duration(left_s)}" if left_s < 1e10 else ""
+    return [
+        Row(
+            "machine", "recording", f"{one_line(picture.get('recording', ''), NAME_CHARACTERS)}, {size / MIB:,.1f} MiB"
+        ),
+        Row("machine", "disk", f"{free / GIB:,.1f} GiB free{lasts}", level),
+    ]
+
+
+def class_rows(history: History) -> list[tuple[str, int, int, int]]:
+    """Return name, decisions for it, objects' decisions that it was the truth of, and those of them that are right, for each class."""
+    picture = history.picture
+    counts = zip(picture.get("class_decided", ()), picture.get("class_truth", ()), picture.get("class_right", ()))
+    names = [one_line(name, NAME_CHARACTERS) for name in history.begin.get("classes", ())]
+    rows = [(name, *row) for name, row in zip(names, counts)]
+    return sorted(rows, key=lambda row: -row[1])[:CLASSES_SHOWN] if len(rows) > CLASSES_SHOWN else rows
+
+
+def latest_rows(history: History) -> list[dict[str, Any]]:
+    """Return the latest decisions, the newest first: object, decision, probability, clicks, truth, level."""
+    names = history.begin.get("classes", ())
+    found = []
+    for _, number, label, probability, clicks, truth, _ in reversed(history.picture.get("latest", ())):
+        known = 0 <= truth < len(names)
+        found.append(
+            {
+                "object": number if number != 0xFFFFFFFF else "",
+                "decision": name_of(label, names),
+                "probability": f"{probability:.0%}" if label != NO_LABEL else "",
+                "clicks": clicks,
+                "truth": one_line(names[truth], NAME_CHARACTERS) if known else "unknown",
+                "level": "" if not known or label == NO_LABEL else "good" if truth == label else "bad",
+            }
+        )
+    return found
+
+
+def name_of(label: int, classes: Any) -> str:
+    """Return the class name of a label, "abstained" for none."""
+    if label == NO_LABEL:
+        return "abstained"
+    return one_line(classes[label], NAME_CHARACTERS) if label < len(classes) else "picture"
+
+
+def series(history: History) -> dict[str, list[Any]]:
+    """Return the curves over time: one row per bin, None where nothing is known. Rates and shares, microseconds, ppm."""
+    rows = [_point(history, one) for one in history.bins if one.end_s > one.begin_s]
+    names = rows[0].keys() if rows else ()
+    return {name: [row[name] for row in rows] for name in names}
+
+
+def _point(history: History, one: Bin) -> dict[str, Any]:
+    found, sums = history.accuracy(one.sums), one.sums
+    dark = wilson_interval(sums["dark_clicks"], sums["dark_exposures"]) if sums["dark_exposures"] > 0 else (None, None)
+    return {
+        "s": round((one.begin_s + one.end_s) / 2, 2),
+        "accuracy": found and found[0],
+        "accuracy_low": found and found[1],
+        "accuracy_high": found and found[2],
+        "rate": sums["decisions"] / (one.end_s - one.begin_s),
+        "late": sums["late"],
+        "lost": sums["lost"],
+        "p50": quantile_us(one.latency, 0.5),
+        "p99": quantile_us(one.latency, 0.99),
+        "dark": sums["dark_clicks"] / sums["dark_exposures"] if sums["dark_exposures"] > 0 else None,
+        "dark_low": dark[0],
+        "dark_high": dark[1],
+        "drift": one.drift_ppm,
+    }
+
+
+def duration(seconds: float) -> str:
+    """Return a time span for people: 42 s, 12 min, 5 h 07 min, 3 d 04 h.
+
+    >>> duration(18_420)
+    '5 h 07 min'
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 90 * 60:
+        return f"{seconds / 60:.0f} min"
+    if seconds < 48 * 3600:
+        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+    return f"{int(seconds // 86_400)} d {int(seconds % 86_400 // 3600):02d} h"

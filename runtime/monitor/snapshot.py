@@ -1,0 +1,205 @@
+"""Pictures of a run in progress, taken beside the loop: plain numbers, JSON-able, units in the keys.
+
+Owns what is read from a run and how: only what is there already, by short calls with pauses between, so that the loop never waits long for
+the interpreter. `Snapshots.take` returns one picture; `begin_facts` what does not change. A figure that changes while it is read is that of
+one moment or the next.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
+from pans.runtime.instrument.channel_health import LEVELS
+from pans.runtime.watch.state_file import state_of
+
+if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.core.decision import Decision
+    from pans.runtime.live import LiveRun
+    from pans.runtime.record import AnyRecorder
+
+LATEST = 12  # decisions
+PIXELS_MAX = 64  # of a side, as it is shown
+PATTERNS_MAX = 2048  # whose pixels are told in one run
+DISK_EVERY_S = 5.0
+BREATH_S = 0.0002  # between two readings, for the loop
+
+
+def begin_facts(bundle: Bundle, **facts: Any) -> dict[str, Any]:
+    """Return what is known before a run begins: classes, sizes, and `facts` (title, device, profile, expected decisions and others)."""
+    return {
+        "kind": "begin",
+        "bundle": bundle.name,
+        "classes": list(bundle.classes),
+        "encoder": bundle.encoder,
+        "n_patterns": bundle.n_patterns,
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        **facts,
+    }
+
+
+class Snapshots:
+    """Takes pictures of one run; `latest` are the decisions made last."""
+
+    def __init__(self, run: LiveRun, bundle: Bundle, recorder: AnyRecorder | None, latest: deque[Decision]) -> None:
+        self._run, self._bundle, self._recorder, self._latest = run, bundle, recorder, latest
+        self._began_s = time.monotonic()
+        self._counts = np.zeros(0, np.int64)
+        self._told: set[int] = set()
+        automaton = run.plan.automaton
+        self._light = None if automaton is None else bundle.light_of(automaton)  # of each state
+        self._disk: dict[str, Any] = {}
+        self._disk_due_s = 0.0
+
+    def take(self, breathe: Callable[[float], None] = time.sleep) -> dict[str, Any]:
+        """Return the run's figures as they are now; `breathe` is called between the parts."""
+        picture: dict[str, Any] = {"kind": "picture", "elapsed_s": round(time.monotonic() - self._began_s, 3)}
+        for part in (self._counters, self._latency, self._classes, self._decisions, self._dark, self._clock):
+            picture |= part()
+            breathe(BREATH_S)
+        return picture | self._disk_facts()
+
+    def _counters(self) -> dict[str, Any]:
+        run, tally, stream = self._run, self._run.tally, self._run.core.tracker.counters
+        core: Any = run.core  # of any kind
+        return {
+            "state": state_of(run),
+            "ended": run.ended,
+            "decisions": tally.decisions,
+            "abstained": tally.abstained,
+            "known": tally.known,
+            "right": tally.right,
+            "objects": tally.objects,
+            "clicks": tally.clicks,
+            "photons_known": tally.photons_known,
+            "photons": tally.photons,
+            "walk_light": None if self._light is None else float(core.windows.walks.shown @ self._light),
+            "exposures": stream.exposures,
+            "lost": stream.lost_exposures,
+            "gaps": stream.gaps,
+            "late": run.timing.late,
+            "reconnects": run.reconnects,
+            "contradictions": sum(run.contradictions.values()) + sum(run.core.contradictions.values()),
+        }
+
+    def _latency(self) -> dict[str, Any]:
+        """The histogram of latencies as it has grown since the last picture: [bucket, how many more]."""
+        total = self._run.timing.total
+        counts = np.array(total.counts, np.int64)
+        grown = counts if not len(self._counts) else counts - self._counts
+        self._counts = counts
+        some = np.flatnonzero(grown)
+        return {"latency": np.stack([some, grown[some]], axis=1).tolist(), "latency_max_us": total.max_ns / 1000}
+
+    def _classes(self) -> dict[str, Any]:
+        table = self._run.tally.confusion
+        return {
+            "class_truth": table.sum(axis=1).tolist(),
+            "class_decided": table.sum(axis=0).tolist(),
+            "class_right": table.diagonal().tolist(),
+        }
+
+    def _decisions(self) -> dict[str, Any]:
+        rows = [
+            [row.number, row.object, row.label, round(row.probability, 4), row.clicks, row.truth, row.flags]
+            for row in tuple(self._latest)
+        ]
+        windows = getattr(self._run.core, "windows", None)
+        found = None if windows is None else windows.latest()
+        return {"latest": rows} | ({} if found is None else self._word(*found))
+
+    def _word(self, clicks: list[int], exposures: int) -> dict[str, Any]:
+        """The clicks of the latest decision with the patterns that they were clicks on, and the pixels of those that are new."""
+        automaton = self._run.plan.automaton
+        if automaton is None:
+            shown = list(range(min(len(clicks), PIXELS_MAX)))
+            clicks = clicks[: len(shown)]
+        else:
+            shown, node, clicks = [], 0, [int(click > 0) for click in clicks[:exposures]]
+            for click in clicks:
+                if not 0 <= node < automaton.n_states:
+                    break
+                shown.append(int(automaton.pattern[node]))
+                node = int(automaton.successors[node, click])
+            clicks = clicks[: len(shown)]
+        new = [number for number in dict.fromkeys(shown) if number not in self._told]
+        new = new[: max(0, PATTERNS_MAX - len(self._told))]
+        self._told.update(new)
+        return {"word": {"patterns": shown, "clicks": clicks}, "pixels": {str(n): self._pixels(n) for n in new}}
+
+    def _pixels(self, number: int) -> dict[str, Any]:
+        values = pattern_pixels(self._bundle, number)
+        high = float(values.max()) or 1.0
+        grey = np.round(values * (255 / high)).astype(np.uint8)
+        return {"shape": list(grey.shape), "grey": base64.b64encode(grey.tobytes()).decode()}
+
+    def _dark(self) -> dict[str, Any]:
+        tallies, guard = self._run.core.tallies, getattr(self._run.core, "guard", None)
+        facts: dict[str, Any] = {
+            "dark_exposures": int(tallies[DARK_EXPOSURES]),
+            "dark_clicks": int(tallies[DARK_CLICKS]),
+        }
+        if guard is None:
+            return facts
+        watch = guard.watch
+        if not facts["dark_exposures"]:  # a flow tells by its empty frames
+            facts = {"dark_exposures": watch.exposures * watch.n_channels, "dark_clicks": int(watch.clicks.sum())}
+        return facts | {
+            "dark_expected": float(watch.expected.mean()),
+            "dark_high": float(watch.high.mean()),
+            "dark_words": guard.words(),
+            "dark_level": max((one.level for one in guard.health.present), key=LEVELS.index, default=""),
+        }
+
+    def _clock(self) -> dict[str, Any]:
+        clock = self._run.connection.clock
+        fit = None if clock is None else clock.fit
+        trouble = self._run.journal.trouble
+        return {
+            "clock_drift_ppm": None if fit is None else round(fit.drift_ppm, 4),
+            "clock_uncertainty_us": self._run.timing.worst_uncertainty_ns / 1000,
+            "trouble": "" if trouble is None else _words_of(trouble),
+        }
+
+    def _disk_facts(self) -> dict[str, Any]:
+        recorder = self._recorder
+        if recorder is None:
+            return {}
+        now_s = time.monotonic()
+        if now_s >= self._disk_due_s:
+            self._disk_due_s = now_s + DISK_EVERY_S
+            path = Path(getattr(recorder, "open_path", recorder.path))
+            with suppress(OSError):
+                self._disk = {"disk_free_bytes": shutil.disk_usage(path.parent).free, "recording": path.name}
+                self._disk["recording_bytes"] = os.stat(path).st_size
+        return self._disk
+
+
+def _words_of(event: dict[str, Any]) -> str:
+    why = event.get("why") or event.get("reason") or event.get("message") or event.get("text") or ""
+    kind = "late or missing work" if event.get("kind") == "blame" else str(event.get("kind")).replace("_", " ")
+    return f"{kind}: {why}" if why else kind
+
+
+def pattern_pixels(bundle: Bundle, number: int) -> NDArray[np.float64]:
+    """Return pattern `number`, or row `number` of passive optics (its modulus), float64 (height, width), at most PIXELS_MAX a side."""
+    if bundle.analyser is None:
+        values = bundle.pattern_levels[number].astype(np.float64)
+    else:
+        values = np.abs(bundle.analyser.matrix[number]).astype(np.float64)
+    picture = values.reshape(bundle.image_shape)
+    step = -(-max(picture.shape) // PIXELS_MAX)
+    return np.ascontiguousarray(picture[::step, ::step])

@@ -1,0 +1,126 @@
+"""A headless chromium for tests of pages: widths, light and dark, console errors, and axe-core where it is there.
+
+`AXE_CORE` names axe-core's archive (axe-core-*.tgz) or its axe.min.js; without it the accessibility check is skipped.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import shutil
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Any]:
+    """Yield a driver of a fresh profile in `folder`; skips the test without selenium, chromium and chromedriver."""
+    pytest.importorskip("selenium", reason="needs selenium")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    program = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    driver_program = shutil.which("chromedriver")
+    if program is None or driver_program is None:
+        pytest.skip("needs chromium and chromedriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for flag in (*FLAGS, f"--user-data-dir={folder / 'profile'}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(driver_program))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+def look(driver: Any, width: int, *, dark: bool = False, height: int = 900) -> None:
+    """Let the page be `width` pixels wide, in light or dark colours."""
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+
+
+def picture(driver: Any, path: Path) -> None:
+    """Write a PNG of the whole page."""
+    shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "format": "png"})
+    path.write_bytes(base64.b64decode(shot["data"]))
+
+
+def clipped(driver: Any) -> list[str]:
+    """Return the parts that are wider than the window, or whose text is cut, outside of regions that scroll."""
+    found: list[str] = driver.execute_script(
+        """
+        const bad = [], wide = document.documentElement.clientWidth;
+        for (const one of document.body.querySelectorAll("*")) {
+          if (one.closest(".scroll") && !one.matches(".scroll")) continue;
+          const box = one.getBoundingClientRect();
+          if (box.width && (box.right > wide + 1 || box.left < -1))
+            bad.push(one.tagName + "." + one.getAttribute("class") + ": " + one.textContent.slice(0, 60));
+        }
+        for (const text of document.querySelectorAll("svg text")) {
+          const svg = text.ownerSVGElement.getBoundingClientRect(), box = text.getBoundingClientRect();
+          const inside = box.left > svg.left - 1 && box.right < svg.right + 1 && box.top > svg.top - 1 && box.bottom < svg.bottom + 1;
+          if (svg.width && box.width && !inside)
+            bad.push("svg text: " + text.textContent + " in " + text.ownerSVGElement.getAttribute("aria-label"));
+        }
+        return bad;
+        """
+    )
+    return found
+
+
+def console(driver: Any) -> list[str]:
+    """Return the warnings and errors of the page's console since the last call."""
+    return [entry["message"] for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+
+
+def axe_source() -> str | None:
+    """Return axe-core's script, None where it is not there."""
+    place = Path(os.environ.get("AXE_CORE", ""))
+    if not place.is_file():
+        return None
+    if place.suffix != ".tgz":
+        return place.read_text(encoding="utf-8")
+    with tarfile.open(place) as archive:
+        member = archive.extractfile("package/axe.min.js")
+        assert member is not None
+        return member.read().decode()
+
+
+def serious(driver: Any) -> list[str]:
+    """Return axe-core's serious and critical findings."""
+    source = axe_source()
+    if source is None:
+        pytest.skip("AXE_CORE does not name axe-core")
+    driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
+    driver.execute_script(source)
+    result = driver.execute_async_script(
+        "const done = arguments[0], failed = e => done({violations: [{impact: 'critical', id: String(e), nodes: []}]});"
+        "axe.run(document).then(done, failed);"
+    )
+    return [
+        f"{one['id']}: {node['html'][:120]} {node.get('failureSummary', '')[:300]}"
+        for one in result["violations"]
+        if one["impact"] in ("serious", "critical")
+        for node in one["nodes"] or [{"html": ""}]
+    ]

@@ -1,0 +1,209 @@
+"""The live page: what the server sends and refuses, and the page in a real browser at both widths, in light and dark."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import browser, clipped, console, look, picture, serious
+
+from pans.runtime.monitor.history import History
+from pans.runtime.monitor.server import LivePage, page
+from pans.runtime.watch.http import MAX_LISTENERS
+
+NASTY = '<img src=x onerror="document.title=1">\x1b[2J'
+GREY = "AAECAwQFBgcICQoLDA0ODw=="  # 16 pixels
+
+
+def a_history(pictures: int = 30) -> History:
+    history = History()
+    classes = [NASTY, "T-shirt/top", "a rather long name of a class of objects", *map(str, range(7))]
+    begin = {"bundle": NASTY, "title": f"{NASTY} on a device", "classes": classes, "expected": 1000}
+    history.take({"kind": "begin", "simulated": True, "deadline_us": 2000.0, "encoder": "automaton", **begin})
+    for k in range(1, pictures + 1):
+        facts: dict[str, Any] = {
+            **{"state": "running", "ended": "", "decisions": 20 * k, "abstained": k, "known": 20 * k, "right": 15 * k},
+            **{
+                "objects": 20 * k,
+                "clicks": 90 * k,
+                "photons": 160.0 * k,
+                "photons_known": 20 * k,
+                "walk_light": 7e3 * k,
+            },
+            **{"exposures": 600 * k, "lost": 0, "gaps": 0, "late": k // 10, "reconnects": 0, "contradictions": 0},
+            **{"latency": [[520 + k % 5, 18], [560, 2]], "latency_max_us": 1500.0, "trouble": NASTY},
+            **{"dark_exposures": 50 * k, "dark_clicks": k, "dark_expected": 0.015, "dark_high": 0.02, "dark_words": ""},
+            **{"clock_drift_ppm": -20 + k % 3, "clock_uncertainty_us": 70.0, "disk_free_bytes": 1 << 36},
+            **{"recording": "run.pansrec", "recording_bytes": 1 << 22, "class_decided": list(range(10))},
+            **{
+                "class_truth": [10] * 10,
+                "class_right": [5] * 10,
+                "latest": [[k, k, 0, 0.9, 4, 0, 0], [k, k, 1, 0.5, 2, 0, 0]],
+            },
+            **{"word": {"patterns": list(range(32)), "clicks": [0, 1] * 16}},
+            **{"pixels": {str(n): {"shape": [4, 4], "grey": GREY} for n in range(32)}},
+        }
+        history.take({"kind": "picture", "elapsed_s": 120.0 * k, **facts})
+    return history
+
+
+@pytest.fixture
+def served() -> Iterator[LivePage]:
+    live = LivePage("127.0.0.1", 0, a_history())
+    yield live
+    live.close()
+
+
+def ask(live: LivePage, words: bytes, most: int = 1 << 16) -> bytes:
+    with socket.create_connection(("127.0.0.1", live.port), timeout=5) as client:
+        client.sendall(words)
+        data = b""
+        while len(data) < most and (piece := client.recv(1 << 16)):
+            data += piece
+        return data
+
+
+def events(data: bytes) -> dict[str, Any]:
+    found = {}
+    for part in data.partition(b"\r\n\r\n")[2].decode().split("\n\n"):
+        name, _, rest = part.partition("\n")
+        if name.startswith("event: "):
+            found[name[7:]] = json.loads(rest.removeprefix("data: "))
+    return found
+
+
+def follow(live: LivePage) -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", live.port), timeout=5)
+    client.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    return client
+
+
+def read_events(client: socket.socket) -> dict[str, Any]:
+    data = b""
+    while b"event: curves" not in data or not data.endswith(b"\n\n"):
+        data += client.recv(1 << 16)
+    return events(data)
+
+
+def test_the_page_is_one_small_file_that_loads_nothing() -> None:
+    text = page().decode()
+    assert len(text) < 100_000
+    assert "innerHTML" not in text
+    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
+    assert "https://" not in text
+    assert text.count("<script>") == text.count("<style>") == 1
+
+
+def test_what_is_sent_holds_no_control_characters(served: LivePage) -> None:
+    client = follow(served)
+    found = read_events(client)
+    client.close()
+    assert found["now"]["progress"] == [600, 1000]
+    assert "\x1b" not in json.dumps(found, ensure_ascii=False)
+    assert found["curves"]["accuracy"][0] == 0.75
+    assert len(found["now"]["word"]) == 32
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", b"403"),
+        (b"GET /events HTTP/1.1\r\nHost: evil.example:8000\r\n\r\n", b"403"),
+        (b"GET / HTTP/1.1\r\nHost: localhost:8000\r\n\r\n", b"200"),
+        (b"GET / HTTP/1.1\r\nHost: [::1]:8000\r\n\r\n", b"200"),
+        (b"POST / HTTP/1.1\r\nHost: localhost\r\n\r\n", b"405"),
+        (b"HEAD /events HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
+        (b"GET /../../etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n", b"404"),
+    ],
+)
+def test_requests(served: LivePage, words: bytes, status: bytes) -> None:
+    assert ask(served, words)[9:12] == status
+
+
+def test_the_policy_lets_nothing_else_run(served: LivePage) -> None:
+    head = ask(served, b"HEAD / HTTP/1.1\r\nHost: localhost\r\n\r\n").decode()
+    assert "default-src 'none'; script-src 'sha256-" in head
+    assert "unsafe" not in head
+    assert "frame-ancestors 'none'" in head
+
+
+def test_more_than_a_few_followers_are_refused_and_a_gone_one_makes_room(served: LivePage) -> None:
+    held = [follow(served) for _ in range(MAX_LISTENERS)]
+    for client in held:
+        read_events(client)
+    assert ask(served, b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")[9:12] == b"503"
+    held.pop().close()
+    for _ in range(100):
+        client = follow(served)
+        first = client.recv(100)
+        if first[9:12] == b"200":
+            held.append(client)
+            break
+        client.close()
+        time.sleep(0.02)
+    assert len(held) == MAX_LISTENERS
+    for client in held:
+        client.close()
+
+
+def test_the_page_in_a_browser(served: LivePage, tmp_path: Path) -> None:
+    with browser(tmp_path) as driver:
+        look(driver, 1280)
+        driver.get(f"http://127.0.0.1:{served.port}/")
+        wait_for(driver, "return document.querySelectorAll('svg').length == 5")
+        assert driver.title == "running: SIMULATED · " + NASTY.replace("\x1b", "\\x1b") + " on a device"
+        words = driver.find_element("tag name", "body").text
+        for text in ("75.0%", "600 of 1,000", "SIMULATED", "0.02 per exposure", "<img src=x onerror="):
+            assert text in words
+        for width in (1280, 390):
+            for dark in (False, True):
+                look(driver, width, dark=dark)
+                time.sleep(0.3)  # charts are drawn anew after a change of the width
+                picture(driver, tmp_path / f"live-{width}-{dark}.png")
+                assert clipped(driver) == []
+        assert driver.execute_script("return document.querySelectorAll('#word canvas').length") == 32
+        assert driver.execute_script("return [...document.querySelectorAll('#word li.click')].length") == 16
+        focus = "const one = document.querySelector('.scroll'); one.focus(); return getComputedStyle(one).outlineStyle"
+        assert driver.execute_script(focus) is not None
+        assert console(driver) == []
+        for dark in (False, True):
+            look(driver, 1280, dark=dark)
+            assert serious(driver) == []
+
+
+def wait_for(driver: Any, script: str) -> None:
+    for _ in range(100):
+        if driver.execute_script(script):
+            return
+        time.sleep(0.05)
+    pytest.fail(script)
+
+
+def test_the_page_says_when_the_run_is_over(tmp_path: Path) -> None:
+    history = a_history(3)
+    live = LivePage("127.0.0.1", 0, history)
+    with browser(tmp_path) as driver:
+        try:
+            driver.get(f"http://127.0.0.1:{live.port}/")
+            wait_for(driver, "return document.querySelector('#state').textContent == 'running'")
+            history.picture |= {"ended": "completed", "state": "stopped"}
+            live.draw()
+        finally:
+            live.close()
+        wait_for(driver, "return document.querySelector('#state').textContent == 'the run has ended'")
+        time.sleep(0.5)
+        assert driver.find_element("id", "state").text == "the run has ended"
+
+
+def test_the_server_stops_when_asked() -> None:
+    live = LivePage("127.0.0.1", 0, a_history(1))
+    live.close()
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(f"http://127.0.0.1:{live.port}/", timeout=1)

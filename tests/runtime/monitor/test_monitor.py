@@ -1,0 +1,282 @@
+"""The live view beside a run: pictures of it, their history in bounded memory, the terminal's panel and the plain lines."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+import urllib.request
+from collections import Counter, deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import fixed_run
+
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+from pans.runtime.commands import carry_out
+from pans.runtime.intervals import wilson_interval
+from pans.runtime.monitor import History, Monitor, Snapshots
+from pans.runtime.monitor.figures import class_rows, headline, latest_rows, rows_of, series
+from pans.runtime.monitor.history import MAX_BINS, quantile_us
+from pans.runtime.monitor.snapshot import begin_facts
+from pans.runtime.timing.ledger import LatencyHistogram
+
+NUMBERS = (
+    *("decisions", "abstained", "known", "right", "objects", "clicks", "photons", "photons_known", "exposures", "lost"),
+    *("gaps", "late", "reconnects", "contradictions", "latency_max_us", "dark_exposures", "dark_clicks"),
+    "clock_uncertainty_us",
+)
+
+
+def picture(elapsed_s: float, **more: Any) -> dict[str, Any]:
+    facts = dict.fromkeys(NUMBERS, 0)
+    texts = {"state": "running", "ended": "", "trouble": "", "clock_drift_ppm": None, "walk_light": None, "latest": []}
+    return {"kind": "picture", "elapsed_s": elapsed_s, "latency": [], **facts, **texts, **more}
+
+
+def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
+    history, n = History(), 10_000
+    for step in range(1, n + 1):
+        history.take(
+            picture(
+                65.0 * step,
+                decisions=100 * step,
+                known=100 * step,
+                right=80 * step,
+                late=step // 1000,
+                latency=[[200, 100]],
+            )
+        )
+    assert len(history.bins) <= MAX_BINS
+    assert sum(one.sums["decisions"] for one in history.bins) == 100 * n
+    assert sum(one.sums["late"] for one in history.bins) == n // 1000
+    assert sum((one.latency for one in history.bins), Counter()) == history.latency == Counter({200: 100 * n})
+    assert all(a.end_s == b.begin_s for a, b in zip(history.bins, history.bins[1:]))
+    assert set(series(history)["accuracy"]) == {0.8}
+
+
+def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
+    total, rng = LatencyHistogram(), np.random.default_rng(4)
+    for value in rng.lognormal(12, 1, 3000).astype(int).tolist():
+        total.add(value)
+    counts = Counter({bucket: count for bucket, count in enumerate(total.counts) if count})
+    for q in (0.001, 0.5, 0.99, 0.999):
+        assert quantile_us(counts, q) * 1000 == pytest.approx(total.quantile_ns(q))  # type: ignore[operator]
+    assert quantile_us(Counter(), 0.5) is None
+
+
+def test_trials_of_one_visit_do_not_narrow_the_interval() -> None:
+    history = History()
+    history.take({"kind": "begin", "trials": 5})
+    share, low, high = history.accuracy({"known": 500, "right": 400}) or (0, 0, 0)
+    assert (share, low, high) == (0.8, *wilson_interval(80, 100))
+    assert history.accuracy({"known": 500, "right": 400}, objects=20) == (0.8, *wilson_interval(16, 20))
+    assert history.accuracy({"known": 0}) is None
+
+
+def test_what_is_wrong_is_marked_and_in_words() -> None:
+    history = History()
+    history.take({"kind": "begin", "deadline_us": 1000.0, "classes": ["a\x1b[2J", "b"], "expected": 100})
+    late = picture(
+        10.0, decisions=50, known=50, right=25, objects=50, clicks=100, late=3, lost=7, gaps=2, latency=[[600, 50]]
+    )
+    late |= {
+        "class_decided": [30, 20],
+        "class_truth": [25, 25],
+        "class_right": [20, 10],
+        "latest": [[49, 3, 0, 0.5, 2, 1, 0]],
+    }
+    late |= {"disk_free_bytes": 1 << 20, "recording_bytes": 1 << 20, "recording": "run.pansrec"}
+    history.take(late | {"trouble": "lost\n\x1b[31m", "dark_words": "", "dark_exposures": 100, "dark_clicks": 3})
+    rows = {row.name: row for row in rows_of(history)}
+    assert rows["late"].level == rows["lost"].level == rows["disk"].level == rows["budget"].level == "bad"
+    assert rows["lost"].text == "7 exposures in 2 gaps"
+    assert rows["accuracy"].text.startswith("50.0%, 95 % interval 36.6% to 63.4%")
+    assert "0.03 per exposure" in rows["dark counts"].text
+    assert not any("\x1b" in row.text or "\n" in row.text for row in rows.values())
+    assert class_rows(history)[0] == ("a\\x1b[2J", 30, 25, 20)
+    assert latest_rows(history)[0]["level"] == "bad"
+    assert headline(history).startswith("50 of 100 decisions · accuracy 50.0% · 2.00 clicks each · p99")
+    assert headline(history).endswith("late 3 · lost 7")
+
+
+def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[Any, History]] = []
+
+    class Watched(Monitor):
+        def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
+            self.bundle, self.history = bundle, History()
+            self.history.take(json.loads(json.dumps(facts)))
+
+        def prepared(self, run: Any) -> None:
+            self.snapshots = Snapshots(run, self.bundle, None, self._latest)
+            made.append((run, self.history))
+
+        def watch(self, run: Any, output: Any) -> None:
+            super().watch(run, output)
+            if output.decisions and output.decisions[-1].number % 7 == 0:
+                self.history.take(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
+
+        def __exit__(self, *_: Any) -> None:
+            self.history.take(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
+
+    monkeypatch.setattr(carry_out, "_monitor_of", lambda job: Watched(panel=False))
+    assert main([*fixed_run(60, trials=2), "--out", str(tmp_path / "run")]) == 0
+    (run, history) = made[0]
+    tally, last = run.tally, history.picture
+    assert last["decisions"] == tally.decisions == 120
+    assert last["right"] / last["known"] == tally.accuracy == tally.confusion.trace() / 120
+    assert sum(history.latency.values()) == run.timing.total.total
+    assert last["class_right"] == tally.confusion.diagonal().tolist()
+    assert [row[0] for row in last["latest"]] == list(range(108, 120))
+    bundle, _ = load_bundle(SHIPPED / "fashion10.pans")
+    assert last["word"]["patterns"] == list(range(bundle.n_patterns))
+    assert sum(last["word"]["clicks"]) == last["latest"][-1][4]
+    assert set(history.pixels) == {str(number) for number in range(bundle.n_patterns)}
+    text = " ".join(row.text for row in rows_of(history))
+    assert f"{100 * tally.accuracy:.1f}%" in text
+    assert f"{tally.clicks / 120:.2f} clicks, {tally.photons / 120:.2f} photons" in text
+
+
+def test_a_walk_is_told_pattern_by_pattern(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words: list[dict[str, Any]] = []
+
+    class Watched(Monitor):
+        def begin(self, bundle: Any, recorder: Any, facts: dict[str, Any]) -> None:
+            self.bundle = bundle
+
+        def prepared(self, run: Any) -> None:
+            self.run, self.snapshots = run, Snapshots(run, self.bundle, None, self._latest)
+
+        def watch(self, run: Any, output: Any) -> None:
+            super().watch(run, output)
+            if output.decisions:
+                words.append(self.snapshots.take(lambda _: None))
+
+        def __exit__(self, *_: Any) -> None:
+            automaton = self.run.plan.automaton
+            for one in words:
+                word, node = one["word"], 0
+                for pattern, click in zip(word["patterns"], word["clicks"]):
+                    assert automaton.pattern[node] == pattern
+                    node = automaton.successors[node][click]
+                assert node >= automaton.n_states  # at a leaf
+                assert sum(word["clicks"]) == one["latest"][-1][4]
+
+    monkeypatch.setattr(carry_out, "_monitor_of", lambda job: Watched(panel=False))
+    assert main(["demo", "--pace", "fast", "--seconds", "0.2", "--out", str(tmp_path / "run")]) == 0
+    assert len(words) > 10
+    assert begin_facts(load_bundle(SHIPPED / "fashion-adaptive.pans")[0])["encoder"] == "automaton"
+
+
+def test_without_a_terminal_there_are_plain_lines(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pans.runtime.monitor import monitor as module
+
+    monkeypatch.setattr(module, "LINE_EVERY_S", 0.0)
+    monkeypatch.setattr(module, "EVERY_S", 0.01)
+    shown = Monitor(panel=False)
+    with shown:
+        assert shown._child is None
+        shown.begin(
+            None, None, {"kind": "begin", "title": "a bundle on an instrument", "simulated": True, "expected": 500}
+        )  # type: ignore[arg-type]
+        pictures = deque(picture(float(k), decisions=k) for k in range(1, 10_000))
+
+        class Pictures:
+            def take(self) -> dict[str, Any]:
+                return pictures.popleft()
+
+        shown._snapshots = Pictures()  # type: ignore[assignment]
+        while len(pictures) > 9_990:
+            pass
+    lines = capfd.readouterr().err.splitlines()
+    assert (
+        lines[0]
+        == "SIMULATED · a bundle on an instrument: 1 of 500 decisions · 0.00 clicks each · p99 0.00 ms · late 0 · lost 0"
+    )
+    assert len(lines) > 5
+
+
+def test_a_panel_is_drawn_on_a_terminal_and_removed(tmp_path: Path) -> None:
+    own, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 60, 130, 0, 0))
+    words = [sys.executable, "-P", "-m", "pans.runtime.monitor.child", "--panel"]
+    environment = os.environ | {"TERM": "xterm-256color"}
+    child = subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=theirs, text=True, env=environment
+    )
+    assert child.stdin is not None
+    messages = [
+        {
+            "kind": "begin",
+            "title": "a bundle on a device",
+            "classes": ["shoe", "bag"],
+            "expected": 10,
+            "deadline_us": 100.0,
+        }
+    ]
+    told = picture(
+        3.0,
+        decisions=4,
+        known=4,
+        right=3,
+        objects=4,
+        clicks=8,
+        class_decided=[3, 1],
+        class_truth=[2, 2],
+        class_right=[2, 1],
+    )
+    for message in [*messages, told | {"latest": [[3, 7, 0, 0.9, 2, 0, 0]]}]:
+        child.stdin.write(json.dumps(message) + "\n")
+    child.stdin.close()
+    assert child.wait(20) == 0
+    os.close(theirs)
+    shown = b""
+    while piece := _rest(own):
+        shown += piece
+    for text in ("a bundle on a device", "accuracy", "75.0%", "shoe", "✓ 0 decisions", "4 of 10"):
+        assert text in shown.decode()
+    assert shown.rindex(b"\x1b[?25h") > shown.rindex(b"\x1b[?25l")  # the cursor is back
+
+
+def _rest(handle: int) -> bytes:
+    try:
+        return os.read(handle, 1 << 16)
+    except OSError:  # the other end is closed, and all is read
+        return b""
+
+
+def test_a_drawing_process_that_dies_ends_no_run(capfd: pytest.CaptureFixture[str]) -> None:
+    shown = Monitor(panel=False, address="127.0.0.1:0", lines=False)
+    with shown:
+        assert shown._child is not None
+        with urllib.request.urlopen(shown.url, timeout=10) as answer:
+            assert b"EventSource" in answer.read()
+        shown._child.kill()
+        shown._child.wait()
+        assert shown._tell(picture(1.0) | {"fill": "x" * (1 << 20)}) is False
+
+
+def test_a_busy_port_is_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Monitor(panel=False, address="127.0.0.1:0", lines=False) as shown:
+        address = shown.url.removeprefix("http://").rstrip("/")
+        assert main([*fixed_run(5), "--out", str(tmp_path / "run"), "--serve", address]) == 2
+    assert "choose another port" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:8000", "example.org:80", "[::]:1"])
+def test_a_page_for_others_must_be_meant(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*fixed_run(5), "--out", str(tmp_path / "run"), "--serve", address]) == 2
+    assert "--serve-public" in capsys.readouterr().err
