@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, upper_edge, arm_realtime
+from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, arm_realtime, upper_edge
 
 
 def test_buckets_tile_the_integers() -> None:
