@@ -62,7 +62,8 @@ def _commands() -> Iterator[tuple[str, _Words]]:
 
 
 def _words_of(parser: argparse.ArgumentParser) -> _Words:
-    options, places = [], []
+    options: list[_Option] = []
+    places: list[str] = []
     for action in parser._actions:
         choices = tuple(str(choice) for choice in action.choices or ())
         if action.option_strings:
