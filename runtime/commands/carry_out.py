@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.link.base import open_link
-from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
+from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, Stop, stop_signals
 
 from .job import Job, recording_header, what_was_run
 from .run_files import check_run_files, claimed
@@ -255,7 +255,7 @@ def _watched(
 
     dark, monitor = ready.dark, beside.monitor
     monitor.begin(ready.bundle, recorder, _facts(job, ready, link))
-    with Attendants(job.continuous, recorder, beside.watchdog) as seen:
+    with Attendants(job.continuous, recorder, beside.watchdog, beside.stop) as seen:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
@@ -266,6 +266,7 @@ def _watched(
 
         def look(run: LiveRun, output: Output) -> None:
             dark.look(run, output)
+            seen.tell(run)
             monitor.watch(run, output)
 
         observers = Observers(look, prepared, beside.stop)
@@ -343,6 +344,8 @@ def _exit_code(summary: Summary) -> int:
         return EXIT_FINE  # what went wrong on the way stands in the summary
     if summary.ended == INTERRUPTED:
         return EXIT_INTERRUPTED
+    if summary.ended == DISK_NEARLY_FULL:
+        return EXIT_ALERT
     if summary.link_lost:
         return EXIT_DEVICE
     if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions:

@@ -18,6 +18,7 @@ from pans.runtime.live.continuous import Continuous
 from pans.runtime.ranges import Range
 
 MIB = 1 << 20
+DISK_RESERVE_MB = 64.0  # half a minute of the fastest shipped profile, and room for the summary
 # What the numbers of a run may be. 10**12 decisions are thirty years at 1000 a second; 1e9 s are as many years.
 RANGES = {
     "shots": Range(1, 1 << 20, whole=True),
@@ -32,6 +33,7 @@ RANGES = {
     "calibration_max_age_h": Range(1e-9, 1e6),
     "rotate_mb": Range(0, 1e6),
     "keep_mb": Range(0, 1e9),
+    "disk_reserve_mb": Range(0, 1e9),
     "confidence": Range(0.0, 1.0),
     "seed": Range(0, (1 << 63) - 1, whole=True),
 }
@@ -137,6 +139,13 @@ def add_continuous_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="delete the oldest parts above N MiB (default: keep all)",
     )
+    group.add_argument(
+        "--disk-reserve-mb",
+        type=RANGES["disk_reserve_mb"].option,
+        default=DISK_RESERVE_MB,
+        metavar="N",
+        help=f"stop in order before less than N MiB are free on the recording's disk (default {DISK_RESERVE_MB:g}; 0: never)",
+    )
     group.add_argument("--state", type=Path, metavar="FILE", help="write the run's state there as JSON, each second")
     group.add_argument(
         "--metrics",
@@ -180,7 +189,8 @@ def continuous_of(args: argparse.Namespace) -> Continuous:
     from pans.runtime.record.part_keeper import PartLimits
 
     limits = PartLimits(max(1, round(rotate_mb * MIB)), round(keep_mb * MIB)) if rotate_mb else None
-    return Continuous(limits, getattr(args, "state", None), _metrics_of(args))
+    reserve = round(getattr(args, "disk_reserve_mb", DISK_RESERVE_MB) * MIB)
+    return Continuous(limits, getattr(args, "state", None), _metrics_of(args), reserve)
 
 
 def _metrics_of(args: argparse.Namespace) -> str:

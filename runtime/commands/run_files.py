@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qsl
 
+from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder, refuse_existing
 from pans.runtime.record.part_keeper import files_of_parts, index_path
 from pans.runtime.run_folder import locked, new_run_folder
 
 from .job import Job
+from .options import MIB
 
 STATE_FORMAT = "pans-state 1"
 STATE_MAX_BYTES = 1 << 16
@@ -34,6 +37,7 @@ def check_run_files(job: Job) -> None:
             raise refuse_existing(parts[0])
     if job.out_root is not None:
         outputs.append(job.out_root / ".new" / "run")
+    _check_disk(job)
     state = job.continuous.state
     if state is not None:
         check_outputs([state], inputs=inputs, force=job.force, ours=is_state_file)  # its folder must be there
@@ -45,6 +49,20 @@ def check_run_files(job: Job) -> None:
         ours=lambda path: path == state and is_state_file(path),
         makes_folders=True,
     )
+
+
+def _check_disk(job: Job) -> None:
+    """A run that would be stopped at once does not begin."""
+    folder = job.out_root if job.out_root is not None else None if job.recording is None else job.recording.parent
+    if folder is None or not job.continuous.stop_below:
+        return
+    there = next((path for path in (folder, *folder.absolute().parents) if path.is_dir()), Path.cwd())
+    free = shutil.disk_usage(there).free
+    if free < job.continuous.stop_below:
+        raise UsageError(
+            f"{folder}: {free / MIB:.1f} MiB are free on its disk, and a run stops below {job.continuous.stop_below / MIB:.1f}",
+            remedy="make room (pans runs prune), record elsewhere, or lower --disk-reserve-mb",
+        )
 
 
 @contextmanager

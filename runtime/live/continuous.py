@@ -23,17 +23,24 @@ if TYPE_CHECKING:  # the options must not load what a run needs
 
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"
+DISK_NEARLY_FULL = "the disk is nearly full"
 LOADERS = frozenset(("numba", "llvmlite", "importlib", "_frozen_importlib"))  # top-level modules
 AGAIN_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Continuous:
-    """What was asked for: parts (None: one recording), a state file, an address for metrics."""
+    """What was asked for: parts (None: one recording), a state file, an address for metrics, what is to stay free on the disk."""
 
     limits: PartLimits | None = None
     state: Path | None = None
     metrics: str = ""
+    disk_reserve: int = 0  # bytes; 0: the disk is not watched over
+
+    @property
+    def stop_below(self) -> int:
+        """Bytes of free disk below which a run ends. Where parts can be deleted that comes first (part_keeper.py)."""
+        return self.disk_reserve if self.limits is None else min(self.disk_reserve, self.limits.rotate_bytes // 2)
 
 
 def open_recorder(
@@ -56,6 +63,10 @@ class Stop:
         self.raised = False  # KeyboardInterrupt, wherever the main thread was
         self._continuous = continuous
         self._waits = False  # a signal that came while libraries were loaded comes again
+
+    def request(self, why: str) -> None:
+        """Ask for an end at the end of a turn, from another thread; a signal that came before is the reason."""
+        self.word = self.word or why
 
     def ask(self, signum: int, frame: FrameType | None) -> None:
         """Take a signal; a run without an end of its own ends well when SIGTERM asks for it."""

@@ -1,4 +1,4 @@
-"""What lives as long as a run does: state file, metrics, systemd's messages, and the watchdog's knowledge of the run.
+"""What lives as long as a run does: state file, metrics, systemd's messages, the watch on the computer, the watchdog's facts.
 
 Owns their beginning and end. They are started before the loop asks for real-time privileges, so that none of their threads inherits them.
 """
@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
-    from pans.runtime.live.continuous import Continuous
+    from pans.runtime.live.continuous import Continuous, Stop
     from pans.runtime.record import AnyRecorder
 
+    from .host import HostWatch
     from .state_file import StateFile
     from .systemd import Notifier
     from .watchdog import Watchdog
@@ -23,8 +25,15 @@ if TYPE_CHECKING:
 class Attendants:
     """State file, metrics and messages of one run; enter before it, `prepared` when it is there."""
 
-    def __init__(self, wanted: Continuous, recorder: AnyRecorder | None, watchdog: Watchdog | None = None) -> None:
-        self._wanted, self._recorder, self._watchdog = wanted, recorder, watchdog
+    def __init__(
+        self,
+        wanted: Continuous,
+        recorder: AnyRecorder | None,
+        watchdog: Watchdog | None = None,
+        stop: Stop | None = None,
+    ) -> None:
+        self._wanted, self._recorder, self._watchdog, self._stop = wanted, recorder, watchdog, stop
+        self._host: HostWatch | None = None
         self._run: LiveRun | None = None
         self._state: StateFile | None = None
         self._notifier: Notifier | None = None
@@ -33,11 +42,15 @@ class Attendants:
         self.metrics_url = ""
 
     def __enter__(self) -> Self:
+        from .host import HostWatch
         from .metrics import MetricsServer
         from .state_file import StateFile
         from .systemd import Notifier
 
         with ExitStack() as opening:
+            ask = (lambda why: None) if self._stop is None else self._stop.request
+            self._host = HostWatch(self._recorded, self._wanted.stop_below, ask)
+            opening.callback(self._host.close)
             if self._wanted.metrics:
                 server = MetricsServer(self._wanted.metrics, self.look)
                 opening.callback(server.close)
@@ -58,6 +71,8 @@ class Attendants:
     ) -> None:
         if self._watchdog is not None:
             self._watchdog.closes()
+        if self._run is not None and error is None:
+            self.tell(self._run)  # the recording is still open
         self._open.close()
 
     def prepared(self, run: LiveRun) -> None:
@@ -72,7 +87,19 @@ class Attendants:
         """Return the picture as it is now."""
         from .state_file import picture_of
 
-        return picture_of(self._run, self._recorder, self._started_s)
+        facts = {} if self._host is None else self._host.facts()
+        return picture_of(self._run, self._recorder, self._started_s) | facts
+
+    def tell(self, run: LiveRun) -> None:
+        """Note in the journal of `run` what was found about the computer; called by the loop."""
+        if self._host is not None:
+            for event in self._host.news():
+                run.journal.note(**event)
+
+    def _recorded(self) -> Path | None:
+        """Return the file that is being written."""
+        recorder = self._recorder
+        return None if recorder is None else Path(getattr(recorder, "open_path", recorder.path))
 
     def _told(self, why: str) -> None:
         """The watchdog ends the process: leave word."""

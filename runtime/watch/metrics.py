@@ -31,6 +31,11 @@ FIGURES = {
     "threads": ("pans_threads", False, "Threads"),
     "loop_age_s": ("pans_loop_age_seconds", False, "Since the loop turned last"),
     "uptime_s": ("pans_uptime_seconds", False, "Since the start of the command"),
+    "disk_free_bytes": ("pans_disk_free_bytes", False, "Free bytes on the disk of the recording"),
+    "disk_left_s": ("pans_disk_seconds_left", False, "Until that disk is full at the rate of the last ten minutes"),
+    "recording_bytes": ("pans_recording_bytes", False, "Size of the recording, or of its open part"),
+    "host_clock_steps": ("pans_host_clock_steps", True, "Times the computer's clock was set during the run"),
+    "host_clock_synchronised": ("pans_host_clock_synchronised", False, "Whether the computer's clock is synchronised"),
     "parts": ("pans_recording_parts", True, "Parts of the recording that were begun"),
 }
 CAUSES = {

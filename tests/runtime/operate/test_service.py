@@ -1,0 +1,168 @@
+"""`pans service`: units that systemd accepts, the protocol heard on a real socket, and nobody else's unit touched."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import json_of
+
+from pans.firmware_sim.testing import small_setup
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import write_bundle
+from pans.runtime.cli import main
+from pans.runtime.errors import UsageError
+from pans.runtime.operate.notify_check import Heard, start_and_hear
+from pans.runtime.operate.unit import MARK, Service, check_name, command_line, command_of, unit_text
+
+NASTY = ["/a b/pans", "50%.pans", "$HOME", 'say "hi"', "a\\b", "tab\tend", "Größe", "%n%%", "$$", "line\nend", ""]
+
+
+def test_every_word_comes_back_from_a_unit() -> None:
+    service = Service("lab", tuple(NASTY), Path('/data/50% of "it" \\'), (), 20.0, "lab")
+    words, folder = command_of(unit_text(service))
+    assert words == NASTY
+    assert folder == service.folder
+    assert "\n" not in command_line(NASTY)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../x", "a/b", ".hidden", "x" * 101, "größe"])
+def test_names_that_no_unit_can_have(name: str) -> None:
+    with pytest.raises(UsageError, match="--name"):
+        check_name(name)
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a bundle and options of a run without an end; its name is not easy to quote."""
+    folder = tmp_path / "my lab, 50%"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    write_bundle(small_setup("sequential")[1], Path("grid.pans"))
+    device = "sim:ideal?scene=uniform&seed=3"
+    words = ["run", "grid.pans", "--device", device, "--no-realtime", "--state", "state.json", "--log-file", "logs/l"]
+    assert main([*words[:-2], "--write-config", "lab.toml"]) == 0
+    return folder
+
+
+def service(capsys: pytest.CaptureFixture[str], *words: Any, code: int | None = 0) -> dict[str, Any]:
+    return json_of(capsys, "service", *words, "--unit-dir", "units", code=code)
+
+
+def test_a_unit_is_installed_verified_and_removed(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = service(capsys, "install", "--config", "lab.toml", "--run-as", "root")
+    unit = Path("units/pans-lab.service")
+    assert found["unit"] == str(unit)
+    text = unit.read_text()
+    for line in ("Type=notify", "WatchdogSec=20", "Restart=on-failure", "RestartPreventExitStatus=2", "User=root"):
+        assert f"\n{line}\n" in text
+    assert "\nLimitRTPRIO=10\nLimitMEMLOCK=infinity\n" in text
+    assert found["command"] == [sys.executable, "-m", "pans", "run", "--config", str(lab / "lab.toml")]
+    assert found["folder"] == str(lab)
+    if shutil.which("systemd-analyze"):
+        assert [one["found"] for one in found["findings"]] == ["no complaints"]
+        unit.write_text(text.replace("Restart=on-failure", "Restart=sometimes").replace("UMask=0027", "Umask=9"))
+        findings = service(capsys, "verify", "--name", "lab", code=1)["findings"]
+        assert "sometimes" in findings[0]["found"]
+        service(capsys, "install", "--config", "lab.toml")  # a unit of ours is written again
+    assert service(capsys, "verify", "--name", "lab")["findings"][-1]["ok"]
+    assert service(capsys, "remove", "--name", "lab")["removed"] == str(unit)
+    assert not unit.exists()
+
+
+def test_folders_that_the_run_writes_to_are_writable(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path("lab.toml").read_text()
+    Path("lab.toml").write_text(text + 'log-file = "/var/tmp/pans-test-logs/l"\nout = "out"\n')
+    shown = service(capsys, "show", "--config", "lab.toml", "--name", "other")["text"]
+    paths = re.findall(r'^ReadWritePaths="(.*)"$', shown, re.MULTILINE)
+    inside = str(lab).replace("%", "%%")
+    assert set(paths) == {inside, f"{inside}/out", "/var/tmp/pans-test-logs"}
+    assert not Path("units").exists()
+
+
+def test_the_users_own_manager(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = service(capsys, "show", "--config", "lab.toml", "--user")["text"]
+    assert "User=" not in shown
+    assert "WantedBy=default.target" in shown
+
+
+def test_foreign_units_stay(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unit = Path("units/pans-lab.service")
+    unit.parent.mkdir()
+    unit.write_text("[Service]\nExecStart=/bin/true\n")
+    for words in (["install", "--config", "lab.toml"], ["verify", "--name", "lab"], ["remove", "--name", "lab"]):
+        assert main(["service", *words, "--unit-dir", "units"]) == 2
+        assert "remedy: " in capsys.readouterr().err
+    assert unit.read_text() == "[Service]\nExecStart=/bin/true\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["install"], "needs --config"),
+        (["show", "--name", "x"], "needs --config"),
+        (["verify"], "needs --name"),
+        (["remove", "--name", "none"], "cannot be read"),
+        (["install", "--config", "none.toml"], "none.toml"),
+        (["install", "--config", "lab.toml", "--folder", "none"], "is not a folder"),
+        (["install", "--config", "lab.toml", "--start", "3"], "--start has no effect"),
+        (["verify", "--name", "lab", "--force"], "--force has no effect"),
+        (["monitoring"], "needs a folder"),
+        (["monitoring", "--out", "m", "--config", "lab.toml"], "--config has no effect"),
+        (["install", "--config", "lab.toml", "--name", "a/b"], "--name"),
+    ],
+)
+def test_what_cannot_be_meant(lab: Path, words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["service", *words]) == 2
+    said = capsys.readouterr().err
+    assert wrong in said
+    assert "remedy: " in said
+    assert sorted(path.name for path in lab.iterdir()) == ["grid.pans", "lab.toml"]
+
+
+@pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
+def test_a_run_tells_systemd_that_it_is_ready_that_it_lives_and_that_it_stops(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    service(capsys, "install", "--config", "lab.toml")
+    found = service(capsys, "verify", "--name", "lab", "--start", "4")
+    said = {one["check"]: one for one in found["findings"]}
+    assert all(one["ok"] for one in said.values()), said
+    assert {"READY", "WATCHDOG", "STOPPING", "end"} <= said.keys()
+    assert said["end"]["found"].startswith("exit code 0")
+    assert json.loads(Path("state.json").read_text())["ended"] == "stopped by SIGTERM"
+
+
+@pytest.mark.skipif(not hasattr(socket, "AF_UNIX") or sys.platform == "win32", reason="needs AF_UNIX")
+def test_a_service_that_says_nothing_or_hangs_is_found(tmp_path: Path) -> None:
+    silent = [sys.executable, "-c", "import sys; sys.exit('no device')"]
+    heard, errors = start_and_hear(silent, tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=1)
+    assert (heard.ready_s, heard.exit_code, errors) == (None, 1, "no device\n")
+    speak = "import os, signal, socket, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM); s.connect(os.environ['NOTIFY_SOCKET'])"
+    hangs = f"{speak}; signal.signal(signal.SIGTERM, signal.SIG_IGN); s.send(b'READY=1'); s.send(b'WATCHDOG=1'); time.sleep(60)"
+    heard, _ = start_and_hear([sys.executable, "-c", hangs], tmp_path, watchdog_s=1, seconds=1, start_s=30, stop_s=0.3)
+    assert heard.ready_s is not None
+    assert (heard.exit_code, heard.stopping_s, len(heard.watchdog_s)) == (None, None, 1)
+    assert heard.longest_silence_s() > 0.9
+
+
+def test_silence_is_counted_from_ready_to_the_end() -> None:
+    heard = Heard(ready_s=2.0, watchdog_s=[1.0, 3.0, 4.5, 9.0], asked_s=5.0, ended_s=9.5)
+    assert heard.longest_silence_s() == 1.5
+    heard.take("STATUS=x\nWATCHDOG=1\nSTOPPING=1", 9.2)
+    assert (heard.watchdog_s[-1], heard.stopping_s) == (9.2, 9.2)
+
+
+def test_monitoring_files_are_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "m"
+    found = json_of(capsys, "service monitoring", "--out", out)
+    assert [Path(path).name for path in found["files"]] == ["prometheus-alerts.yml", "grafana-dashboard.json"]
+    assert all(Path(path).read_bytes() == (SHIPPED / Path(path).name).read_bytes() for path in found["files"])
+    assert main(["service", "monitoring", "--out", str(out)]) == 2
+    assert MARK.startswith("#")

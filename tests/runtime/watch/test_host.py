@@ -1,0 +1,142 @@
+"""The computer around a run: how long a disk lasts, clocks that are set, and a run that stops before its disk is full."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.bundle.model import write_bundle
+from pans.runtime.cli import main
+from pans.runtime.live.continuous import Continuous
+from pans.runtime.record import read_recording
+from pans.runtime.record.part_keeper import PartLimits
+from pans.runtime.watch import host
+from pans.runtime.watch.host import ClockSteps, DiskTrend, HostWatch, clock_is_synchronised, clock_offset_ns
+
+Usage = namedtuple("Usage", "total used free")
+MIB = 1 << 20
+
+
+def test_time_left_at_the_present_rate() -> None:
+    trend = DiskTrend()
+    for second in range(0, 30, 5):
+        trend.add(second, 10**9 - 10**6 * second)
+        assert trend.left_s() is None  # too short to tell
+    trend.add(30.0, 10**9 - 30 * 10**6)
+    assert trend.left_s() == pytest.approx(970)
+    trend.add(35.0, 2 * 10**9)  # something was deleted
+    assert trend.left_s() is None
+    for second in range(40, 80, 5):
+        trend.add(second, 2 * 10**9)
+    assert trend.left_s() is None  # nobody writes
+
+
+def test_the_rate_is_that_of_the_last_ten_minutes() -> None:
+    trend = DiskTrend()
+    free = 10**12
+    for second in range(0, 2400, 5):
+        free -= 5 * (10**6 if second < 1200 else 10**3)
+        trend.add(second, free)
+    assert trend.left_s() == pytest.approx(free / 10**3, rel=1e-6)
+
+
+def test_a_clock_that_is_set_is_a_step_and_one_that_is_slewed_is_none() -> None:
+    steps = ClockSteps()
+    offset = 10**18
+    assert steps.step_ns(offset) == 0
+    for _ in range(1000):  # 500 ppm
+        offset += 2_500_000
+        assert steps.step_ns(offset) == 0
+    assert steps.step_ns(offset - 3_600_000_000_000) == -3_600_000_000_000
+    assert steps.step_ns(offset) == 3_600_000_000_000
+    assert steps.steps == 2
+
+
+def test_the_offset_is_that_of_the_two_clocks() -> None:
+    assert abs(clock_offset_ns() - (time.time_ns() - time.monotonic_ns())) < 1_000_000_000
+    assert abs(clock_offset_ns() - clock_offset_ns()) < host.STEP_NS
+    assert clock_is_synchronised() in (True, False, None)
+
+
+def watch_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: list[int], reserve: int
+) -> tuple[HostWatch, list[str]]:
+    """A watch whose thread never looks, on a disk with these bytes free at each look."""
+    left, asked = iter(free), list[str]()
+    monkeypatch.setattr(host.shutil, "disk_usage", lambda path: Usage(0, 0, next(left)))
+    monkeypatch.setattr(host, "EVERY_S", 3600.0)
+    watch = HostWatch(lambda: tmp_path / "run.pansrec", reserve, asked.append)
+    for _ in free[1:]:
+        watch.look()
+    watch.close()
+    return watch, asked
+
+
+def test_short_space_is_told_once_and_too_little_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.pansrec").write_bytes(bytes(7))
+    free = [600 * MIB, 499 * MIB, 480 * MIB, 700 * MIB, 400 * MIB, 99 * MIB, 50 * MIB]
+    watch, asked = watch_of(tmp_path, monkeypatch, free, 100 * MIB)
+    news = list(watch.news())
+    assert [one["kind"] for one in news] == ["disk_short", "disk_short", "disk_nearly_full"]
+    assert [one["free_bytes"] for one in news] == [499 * MIB, 400 * MIB, 99 * MIB]
+    assert asked == [host.DISK_NEARLY_FULL]
+    assert watch.facts()["disk_free_bytes"] == 50 * MIB
+    assert watch.facts()["recording_bytes"] == 7
+    assert list(watch.news()) == []
+
+
+def test_without_a_reserve_nothing_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    watch, asked = watch_of(tmp_path, monkeypatch, [3, 2, 1, 0], 0)
+    assert (asked, list(watch.news())) == ([], [])
+
+
+def test_parts_are_deleted_before_a_run_is_stopped() -> None:
+    assert Continuous(None, disk_reserve=64 * MIB).stop_below == 64 * MIB
+    assert Continuous(PartLimits(10 * MIB), disk_reserve=64 * MIB).stop_below == 5 * MIB  # the keeper deletes below 20
+    assert Continuous(PartLimits(10 * MIB), disk_reserve=0).stop_below == 0
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    write_bundle(small_setup("sequential")[1], tmp_path / "grid.pans")
+    device = "sim:ideal?scene=uniform&seed=3&pace=fast"
+    return ["run", str(tmp_path / "grid.pans"), "--device", device, "--out", str(tmp_path / "out"), "--json"]
+
+
+def test_a_run_stops_in_order_before_its_disk_is_full(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = tmp_path / "out" / "run.pansrec"
+
+    def usage(path: Path) -> Usage:
+        return Usage(0, 0, 63 * MIB if recorded.exists() and recorded.stat().st_size > 50_000 else 10**12)
+
+    monkeypatch.setattr(host.shutil, "disk_usage", usage)
+    monkeypatch.setattr(host, "EVERY_S", 0.1)
+    assert main([*words, "--seconds", "100000"]) == 1
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["ended"] == host.DISK_NEARLY_FULL
+    assert summary["verdict"] == "FAIL"
+    assert host.DISK_NEARLY_FULL in summary["faults"]
+    recording = read_recording(recorded)
+    assert recording.complete
+    assert recording.n_decisions == summary["decisions"] > 0
+    kinds = [event["kind"] for event in recording.events()]
+    assert kinds.count("disk_nearly_full") == 1
+
+
+def test_a_run_does_not_begin_on_a_disk_that_is_nearly_full(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(host.shutil, "disk_usage", lambda path: Usage(0, 0, 63 * MIB))
+    assert main([*words, "--decisions", "3"]) == 2
+    said = capsys.readouterr().err
+    assert "63.0 MiB are free" in said
+    assert "--disk-reserve-mb" in said
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--decisions", "3", "--disk-reserve-mb", "63"]) == 0
