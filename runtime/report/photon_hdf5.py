@@ -3,6 +3,8 @@
 Owns the mapping onto that format; never reads a message (exposures.py). Needs h5py (extra `export`), imported by name when a file
 is written: the lean runtime does not know it.
 
+Each field of the format has the title that the format's definition gives it: readers such as phconvert refuse other words.
+
 A binary click becomes a photon: its timestamp is the **begin of its exposure** in device ticks (when in the exposure it fell is not known),
 its detector the channel that clicked. Which pattern was shown, which object stood there and what was decided is in `/user/pans`; the format
 leaves `/user` to its users.
@@ -27,6 +29,7 @@ from pans.runtime.record.exposures import ClickList
 
 FORMAT_NAME, FORMAT_VERSION = "Photon-HDF5", "0.5"
 FORMAT_URL = "http://photon-hdf5.org/"
+_ROOT_TITLE = "A file format for photon-counting detector based single-molecule spectroscopy experiments."
 
 
 def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: ClickList, *, force: bool = False) -> None:
@@ -49,20 +52,25 @@ def write_photon_hdf5(path: Path, recording: Recording, plan: Plan, clicks: Clic
     with h5py.File(image, "w") as file:
         file.attrs["format_name"] = np.bytes_(FORMAT_NAME)
         file.attrs["format_version"] = np.bytes_(FORMAT_VERSION)
+        file.attrs["TITLE"] = np.bytes_(_ROOT_TITLE)
         _write(file, _tree(path, recording, plan, clicks))
     write_file(path, image.getbuffer(), force=force)
 
 
-def _write(group: Any, tree: dict[str, Any]) -> None:
+def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
     """Text as bytes, and a title on every node: what readers of the format expect."""
     for name, value in tree.items():
+        where = f"{path}/{name}"
         if isinstance(value, dict):
             node = group.create_group(name)
-            _write(node, value)
+            _write(node, value, where)
         else:
             data = np.bytes_(value.encode()) if isinstance(value, str) else value
             node = group.create_dataset(name, data=data)
-        node.attrs["TITLE"] = np.bytes_(_TITLES.get(name, name.replace("_", " ")))
+            if isinstance(value, str):  # so that PyTables, with which readers are written, reads bytes and not an array
+                for key, said in (("CLASS", "ARRAY"), ("VERSION", "2.4"), ("FLAVOR", "python")):
+                    node.attrs[key] = np.bytes_(said)
+        node.attrs["TITLE"] = np.bytes_(_TITLES.get(where, name.replace("_", " ")).encode())
 
 
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
@@ -71,11 +79,14 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
     simulated = recording.simulated
     profile = recording.header.get("profile", {})
     device = recording.summary.get("device", {})
+    classes = recording.bundle().classes if recording.bundle_place else ()
     described = (
         f"{'SIMULATED. ' if simulated else ''}Binary clicks of {plan.n_patterns} patterns, {plan.mode}, exposures of "
         f"{plan.exposure_us:g} us; timestamps are the begin of the exposure. Profile {profile.get('name')}."
     )
     return {
+        "format_name": FORMAT_NAME,
+        "format_version": FORMAT_VERSION,
         "acquisition_duration": (clicks.last_tick - clicks.first_tick) * unit_s,
         "description": described,
         "photon_data": {
@@ -112,6 +123,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
                 "object": clicks.object,
                 "pattern": clicks.pattern,
                 "decisions": recording.decisions(),
+                "classes": np.array([name.encode() for name in classes], dtype=np.bytes_),
                 "decisions_sha256": recording.decisions_sha256,
                 "device": str(device.get("firmware", "unknown")),
                 "profile": str(profile.get("toml", "")),
@@ -120,14 +132,79 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
     }
 
 
+_ORIGIN = {  # of a file and of the one that it was made from
+    "software": "Software used to save the original data file.",
+    "software_version": "Version of the software used to save the original data file.",
+    "creation_time": "Creation time of the original data file.",
+    "filename": "File name of the original data file before conversion to Photon-HDF5.",
+    "filename_full": "File name (with full path) of the original data file before conversion to Photon-HDF5.",
+}
+_IDENTITY = {
+    "author": "Author of the current data file.",
+    "author_affiliation": "Company or institution the author is affiliated with.",
+    "creator": "Creator of the current Photon-HDF5 file.",
+    "creator_affiliation": "Company or institution the creator is affiliated with.",
+    "filename": "Original file name of the current Photon-HDF5 file (i.e. file name at creation time).",
+    "filename_full": (
+        "Original file name (with full path) of the current Photon-HDF5 file (i.e. full file name at creation time)."
+    ),
+    "creation_time": "Creation time of the current Photon-HDF5 file.",
+    "software": "Name of the software used to create the current Photon-HDF5 file.",
+    "software_version": "Version of the software used to create current the Photon-HDF5 file.",
+    "format_name": "Name of the file format.",
+    "format_version": "Version for the Photon-HDF5 format.",
+    "format_url": "Official URL for the Photon-HDF5 format.",
+}
+_SETUP = {
+    "num_pixels": "Total number of detector pixels.",
+    "num_spots": 'Number of excitation (or detection) "spots" in the sample.',
+    "num_spectral_ch": "Number of distinct spectral bands which are acquired.",
+    "num_polarization_ch": "Number of distinct polarization states which are acquired.",
+    "num_split_ch": (
+        "Number of distinct detection channels detecting the same spectral band and polarization. "
+        "This value is > 1 when using a non-polarizing beam splitter."
+    ),
+    "modulated_excitation": (
+        "True (i.e. 1) if there is any form of excitation modulation of excitation wavelength (as in us-ALEX or PAX) or "
+        "polarization. This field is also True for pulse-interleaved excitation (PIE) or ns-ALEX measurements."
+    ),
+    "lifetime": (
+        "True (i.e. 1) if the measurement includes a nanotimes array of photon arrival times with respect to a laser "
+        "pulse (as in TCSPC measurements)."
+    ),
+    "excitation_alternated": (
+        "New in version 0.5. Indicates whether each excitation source is alternated (True, or 1) or not alternated (False, or 0)."
+    ),
+    "excitation_cw": (
+        "For each excitation source, this field indicates whether excitation is continuous wave (CW), True (i.e. 1), "
+        "or pulsed, False (i.e. 0)."
+    ),
+}
+# The format's own words, to the letter (photon-hdf5.org, version 0.5); below /user ours.
 _TITLES = {
-    "photon_data": "Group containing arrays of photon-data.",
-    "timestamps": "Begin of the exposure of each click, in timestamps_unit.",
-    "timestamps_unit": "Length of one device tick in seconds.",
-    "detectors": "Channel that clicked.",
-    "acquisition_duration": "Measurement duration in seconds.",
-    "pattern": "Pattern that was shown during the exposure of each click; 65535: dark slot.",
-    "object": "Object that stood before the detector at each click; 4294967295: not known.",
+    "/format_name": _IDENTITY["format_name"],
+    "/format_version": _IDENTITY["format_version"],
+    "/acquisition_duration": "Measurement duration in seconds.",
+    "/description": "A user-defined comment describing the data file.",
+    "/photon_data": "Group containing arrays of photon-data.",
+    "/photon_data/timestamps": (
+        "Array of photon timestamps. Units specified in timestamps_units (defined in timestamps_specs/)."
+    ),
+    "/photon_data/timestamps_specs": "Specifications for timestamps.",
+    "/photon_data/timestamps_specs/timestamps_unit": "Value of 1-unit timestamp-increment in seconds.",
+    "/photon_data/detectors": "Array of pixel IDs for each timestamp.",
+    "/photon_data/measurement_specs": ("Metadata necessary for interpretation of the particular type of measurement."),
+    "/photon_data/measurement_specs/measurement_type": "Name of the measurement the data represents.",
+    "/photon_data/measurement_specs/detectors_specs": "Mapping between the pixel IDs and the detection channels.",
+    "/setup": "Information about the experimental setup.",
+    "/identity": "Information about the Photon-HDF5 data file.",
+    "/provenance": "Information about the original data file.",
+    **{f"/setup/{name}": title for name, title in _SETUP.items()},
+    **{f"/identity/{name}": title for name, title in _IDENTITY.items()},
+    **{f"/provenance/{name}": title for name, title in _ORIGIN.items()},
+    "/user/pans/pattern": "Pattern that was shown during the exposure of each click; 65535: dark slot.",
+    "/user/pans/object": "Object that stood before the detector at each click; 4294967295: not known.",
+    "/user/pans/classes": "Names of the classes, in the order of the labels in decisions.",
 }
 
 
