@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import threading
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,8 @@ def scrapes(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         while not ended.wait(0.1):
             if servers:
                 address = f"http://{servers[0].host}:{servers[0].port}/metrics"
-                answers.append(urllib.request.urlopen(address, timeout=10).read().decode())
+                with suppress(OSError):  # the run ends while it is asked
+                    answers.append(urllib.request.urlopen(address, timeout=10).read().decode())
 
     reader = threading.Thread(target=scrape, daemon=True)
     reader.start()
