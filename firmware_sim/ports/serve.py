@@ -32,6 +32,7 @@ DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
 CHILD_GOODBYE_S = 2.0
 MAX_BUFFER_MESSAGES = 1 << 16
+ENGINES = ("python", "c")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ class SimOptions:
     buffer: int = option(BUFFER_MESSAGES, f"stream messages that the device can hold back (default {BUFFER_MESSAGES})")
     optics: str = option("", "look through the passive optics of this bundle: no projector", metavar="BUNDLE")
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
+    engine: str = option("python", "python, or c: the reference firmware, built with the system's compiler")
 
 
 def parse_sim_url(url: str) -> SimOptions:
@@ -80,16 +82,31 @@ def check_options(options: SimOptions) -> SimOptions:
     if not 0 <= options.offset < 1 << 60:
         raise UsageError(f"offset={options.offset}: allowed are 0..2^60-1 ticks")
     check_possible(parse_faults(options.faults), pace=options.pace)
+    _check_engine(options)
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
     return options
 
 
+def _check_engine(options: SimOptions) -> None:
+    if options.engine not in ENGINES:
+        raise UsageError(f"engine={options.engine}: allowed are {' and '.join(ENGINES)}")
+    if options.engine == "python":
+        return
+    if options.pace == "fast":
+        raise UsageError("engine=c runs at real pace only", remedy="leave pace=fast out, or engine=c")
+    for name in ("faults", "changes", "optics"):
+        if getattr(options, name):
+            raise UsageError(f"engine=c has no {name}", remedy=f"leave {name} out, or engine=c")
+
+
 def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, DeviceClock]:
     """Make the instrument, switched on at `host_ns`, and its clock; ConfigError for an impossible profile or scene.
 
-    With faults, the instrument stands behind a bad link.
+    With faults, the instrument stands behind a bad link. The C engine is a process and no object of this one: UsageError.
     """
+    if options.engine != "python":
+        raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
     scene = open_scene(options.scene, options.changes)
