@@ -60,7 +60,7 @@ CASES = {
         f"{RUN} --out out/new --state state.json", ("out/new/run.pansrec", "out/new/summary.md"), may=("state.json",)
     ),
     "run in parts": Case(
-        f"{RUN} --decisions 150 --rotate-mb 0.05 --out out", ("out/run-0001.pansrec", "out/run.parts.json")
+        f"{RUN} --rotate-mb 0.2 --out out", ("out/run-0001.pansrec", "out/run.parts.json")
     ),
     "run --force": Case(f"{RUN} --record old.pansrec --force", ("old.pansrec", "old.summary.md")),
     "calibrate": Case(f"calibrate --device {DEVICE}&scene=uniform --seconds 0.5 -o c.json", ("c.json",)),
@@ -70,7 +70,7 @@ CASES = {
     "export": Case("export r.pansrec --format csv -o out/csv", ("out/csv/about.json", "out/csv/clicks.csv")),
     "export hdf5": Case("export r.pansrec --format photon-hdf5 -o r.h5", ("r.h5",), "h5py"),
     "bundle": Case("bundle --patterns p.npy --table t.npy --classes a,b -o old.pans --force", ("old.pans",)),
-    "train": Case("train scene.npz --features 2 --epochs 3 --hidden 4 --batch 16 -o t.pans", ("t.pans",), "torch"),
+    "train": Case("train scene.npz --features 13 --epochs 3 --hidden 4 --batch 16 -o t.pans", ("t.pans",), "torch"),
 }
 FAULTS = (
     (Fault.FAIL_ONCE, errno.EIO),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import gc
 import json
 import os
 import shutil
@@ -105,6 +106,8 @@ def _serve(shim: str, folder: str) -> None:
         asked = json.loads(line)
         if "warm" in asked:
             found: dict[str, Any] = {"codes": [main(words) for words in asked["warm"]]}
+            gc.collect()
+            gc.freeze()  # or every child, before it arms, looks at all that this process has loaded, and copies it
         else:
             found = _forked(main, faults, asked)
         print(json.dumps(found), file=answers, flush=True)
