@@ -59,9 +59,7 @@ CASES = {
     "run --state": Case(
         f"{RUN} --out out/new --state state.json", ("out/new/run.pansrec", "out/new/summary.md"), may=("state.json",)
     ),
-    "run in parts": Case(
-        f"{RUN} --rotate-mb 0.2 --out out", ("out/run-0001.pansrec", "out/run.parts.json")
-    ),
+    "run in parts": Case(f"{RUN} --rotate-mb 0.2 --out out", ("out/run-0001.pansrec", "out/run.parts.json")),
     "run --force": Case(f"{RUN} --record old.pansrec --force", ("old.pansrec", "old.summary.md")),
     "calibrate": Case(f"calibrate --device {DEVICE}&scene=uniform --seconds 0.5 -o c.json", ("c.json",)),
     "calibrate --force": Case(

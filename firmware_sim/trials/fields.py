@@ -7,8 +7,10 @@ and no PASS where the evidence contradicts what was said. Host, instrument and r
 
 from __future__ import annotations
 
+import gc
 import os
 import random
+import resource
 import threading
 import time
 import traceback
@@ -48,6 +50,7 @@ OBJECTS = 12
 SESSIONS_AT_ONCE = 10  # that one process is given
 SHOTS = 1
 MAX_GROWTH_MIB = 300  # of the process, during any number of sessions: below 400 with the 100 that it starts with
+MAX_MIB = 400  # of each process of sessions in several, at its highest
 MAX_SESSION_S = 30.0  # of processor time; one takes some 50 ms
 EDGES = (0, 1, 2, 1 << 15, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 32, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 REALS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 3e38, 1e-45)
@@ -293,12 +296,23 @@ def tcp_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
         port.close()
 
 
+@contextmanager
+def frozen_heap() -> Iterator[None]:
+    """Let no session look for garbage in what was there before: that would be half of its processor time."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
 def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str], list[str]]:
     """Run `count` sessions, one mutation each, or two; return how they ended and what was wrong, with the seed of each."""
     stages = {mode: Stage(mode, over) for mode in MODES}
     ended: Counter[str] = Counter()
     wrong: list[str] = []
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, frozen_heap():
         for number in range(seed, seed + count):
             dice = random.Random(number)
             mode = dice.choice(tuple(stages))
@@ -309,19 +323,25 @@ def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str]
     return ended, wrong
 
 
-def sessions_beside(seed: int, count: int, over: str, jobs: int) -> tuple[Counter[str], list[str]]:
-    """As `sessions`, in `jobs` processes: over a socket most of a session is waiting."""
-    if jobs == 1:
-        return sessions(seed, count, over)
+def _measured(seed: int, count: int, over: str) -> tuple[Counter[str], list[str], int]:
+    """As `sessions`, with the most memory that this process has ever held, in MiB."""
+    ended, wrong = sessions(seed, count, over)
+    return ended, wrong, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+
+
+def sessions_beside(seed: int, count: int, over: str, jobs: int) -> tuple[Counter[str], list[str], int]:
+    """As `sessions`, in `jobs` processes: over a socket most of a session is waiting. Also return the most MiB that one of them held."""
     firsts = range(seed, seed + count, SESSIONS_AT_ONCE)
     counts = [min(SESSIONS_AT_ONCE, seed + count - first) for first in firsts]
     ended: Counter[str] = Counter()
     wrong: list[str] = []
+    most_mib = 0
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for some, found in pool.map(sessions, firsts, counts, [over] * len(counts)):
+        for some, found, mib in pool.map(_measured, firsts, counts, [over] * len(counts)):
             ended += some
             wrong += found
-    return ended, wrong
+            most_mib = max(most_mib, mib)
+    return ended, wrong, most_mib
 
 
 def _ending(session: Session) -> str:

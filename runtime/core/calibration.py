@@ -257,7 +257,7 @@ def calibration_values(parts: Sequence[Counts], model: CountModel, design: Desig
     channels = [_channel(part, model, level) for part in parts]
     dark = sum(row["dark_clicks"] for row in channels), sum(row["dark_exposures"] for row in channels)
     return {
-        "made_utc": now_utc().isoformat(),
+        "made_utc": now_utc().isoformat(timespec="seconds"),
         "profile": {"name": profile.name, "sha256": profile.sha256},
         "exposure_us": exposure_us,
         "photons_per_level": level,

@@ -170,8 +170,8 @@ def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: flo
 
 
 def now_utc() -> datetime:
-    """This machine's date, to the second."""
-    return datetime.now(UTC).replace(microsecond=0)
+    """This machine's date and time."""
+    return datetime.now(UTC)
 
 
 def _check(values: Mapping[str, Any]) -> None:

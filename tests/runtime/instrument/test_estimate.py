@@ -156,6 +156,8 @@ def test_command_and_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         find_objections(calibration, load_profile("ideal"), None)
     assert find_warnings(calibration, now_utc()) == []
     assert "25.0 h old" in find_warnings(calibration, calibration.made + timedelta(hours=25))[0]
+    later = calibration.made + timedelta(milliseconds=1)  # within the second of its stamp
+    assert "calibrate again" in find_warnings(calibration, later, max_age_h=1e-9)[0]
     assert "no calibration" in find_warnings(None, now_utc())[0]
     assert calibration.applied_to(profile) is profile  # within the interval
     brighter = replace(profile, projector=replace(profile.projector, peak_photoelectrons_hz=3000.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import subprocess
 import sys
 
 import numpy as np
@@ -67,6 +68,41 @@ def test_recording_is_not_part_of_the_deadline() -> None:
     ledger = TimingLedger(deadline_ns=1000)
     assert not ledger.judge((0, 1, 2, 3, 10_000), 0)
     assert ledger.stages["record"].max_ns == 9997
+
+
+def test_a_heap_that_the_caller_has_frozen_stays_frozen() -> None:
+    gc.freeze()
+    try:
+        with arm_realtime(False):
+            assert gc.get_freeze_count() > 0
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
+    with arm_realtime(False):
+        assert gc.get_freeze_count() > 0
+    assert gc.get_freeze_count() == 0
+
+
+LOCKED = """
+import ctypes, mmap
+from pans.runtime.timing import arm_realtime
+here = mmap.mmap(-1, 256 << 20)  # as large a library as nobody calls
+with arm_realtime(True) as granted:
+    held = {line.split(":")[0]: int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("Vm")}
+    print(granted["mlockall"], held["VmLck"], held["VmRSS"])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_locked_memory_is_what_was_touched() -> None:
+    said = subprocess.run([sys.executable, "-c", LOCKED], capture_output=True, text=True, check=True).stdout.rsplit(
+        maxsplit=2
+    )
+    if said[0] != "granted":
+        pytest.skip(f"mlockall: {said[0]}")
+    locked_kb, resident_kb = map(int, said[1:])
+    assert locked_kb > 256 << 10
+    assert resident_kb < 200 << 10
 
 
 def test_the_realtime_set_up_is_undone() -> None:
