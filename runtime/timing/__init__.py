@@ -15,7 +15,7 @@ from .attribution import Incidents, LateAttribution, MissingAttribution
 from .clock import ClockModel
 from .cpu import busy_core
 from .evidence import Evidence
-from .ledger import LatencyHistogram, TimingLedger, arm_realtime
+from .ledger import LatencyHistogram, TimingLedger, arm_realtime, frozen_heap
 
 __all__ = [
     "ClockModel",
@@ -27,4 +27,5 @@ __all__ = [
     "TimingLedger",
     "arm_realtime",
     "busy_core",
+    "frozen_heap",
 ]

@@ -99,20 +99,40 @@ class TimingLedger:
         return True
 
 
+class _Heap:
+    """Whether a caller has frozen what this process holds; the interpreter would count every object to say so."""
+
+    frozen = False
+
+
+_heap = _Heap()
+
+
+@contextmanager
+def frozen_heap() -> Iterator[None]:
+    """Freeze what this process has loaded, for many short runs: none of them looks for garbage in it, which takes 50 to 100 ms."""
+    gc.collect()
+    gc.freeze()
+    _heap.frozen = True
+    try:
+        yield
+    finally:
+        _heap.frozen = False
+        gc.unfreeze()
+
+
 @contextmanager
 def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
     """Ask for a steady process while the loop runs; yield {what: "granted" or the reason why not}, undo it afterwards.
 
-    The garbage collector is frozen and switched off in any case: a collection costs milliseconds with numba loaded. A heap that the
-    caller has frozen stays frozen: what a process of many runs has loaded need not be looked at before each of them. With `wanted`,
+    The garbage collector is frozen and switched off in any case: a collection costs milliseconds with numba loaded. With `wanted`,
     SCHED_FIFO (for this thread and `other_threads`, by native id) and locked memory are asked for; both need privileges, and
     neither is needed to be correct. Locked is what has been touched, and what will be: libraries that the loop never calls stay out.
     """
     granted: dict[str, Any] = {}
     interval = sys.getswitchinterval()
-    frozen = gc.get_freeze_count() > 0
     gc.collect()
-    if not frozen:
+    if not _heap.frozen:
         gc.freeze()
     gc.disable()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -127,7 +147,7 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     finally:
         sys.setswitchinterval(interval)
         gc.enable()
-        if not frozen:
+        if not _heap.frozen:
             gc.unfreeze()
         if granted.get("sched_fifo") == "granted":
             for thread in threads:

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, arm_realtime, upper_edge
+from pans.runtime.timing.ledger import N_BUCKETS, LatencyHistogram, TimingLedger, arm_realtime, frozen_heap, upper_edge
 
 
 def test_buckets_tile_the_integers() -> None:
@@ -71,13 +71,11 @@ def test_recording_is_not_part_of_the_deadline() -> None:
 
 
 def test_a_heap_that_the_caller_has_frozen_stays_frozen() -> None:
-    gc.freeze()
-    try:
+    with frozen_heap():
         with arm_realtime(False):
             assert gc.get_freeze_count() > 0
         assert gc.get_freeze_count() > 0
-    finally:
-        gc.unfreeze()
+    assert gc.get_freeze_count() == 0
     with arm_realtime(False):
         assert gc.get_freeze_count() > 0
     assert gc.get_freeze_count() == 0
