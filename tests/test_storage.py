@@ -217,7 +217,7 @@ def tried(bench: Bench, name: str, drawn: int | None) -> int:
     judge(bench, case, before, clean, Fault.NONE)
     assert clean.code in (0, 1), clean
     assert clean.calls > 0
-    runs = 0
+    runs, wrong = 0, []
     for fault, error in FAULTS if drawn is None else chosen.sample(FAULTS, drawn):
         calls = range(1, clean.calls + 1)
         for at in calls if drawn is None else [chosen.choice(calls)]:
@@ -225,10 +225,10 @@ def tried(bench: Bench, name: str, drawn: int | None) -> int:
             ended = bench.run(case, at, fault, error)
             try:
                 judge(bench, case, before, ended, fault)
-            except (AssertionError, pytest.fail.Exception) as wrong:
-                words = f"{name}: {fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}, PANS_SEED={SEED}"
-                raise AssertionError(f"{words}: {wrong}\n{ended}") from wrong
+            except (AssertionError, pytest.fail.Exception) as found:
+                wrong.append(f"{fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}: {found}; {ended}")
             runs += 1
+    assert not wrong, f"{name}, PANS_SEED={SEED}, {len(wrong)} of {runs} runs:\n" + "\n".join(wrong)
     return runs
 
 

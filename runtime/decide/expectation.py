@@ -1,7 +1,8 @@
 """What an automaton does on given objects, exactly: no trials, no sampling error.
 
 Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
-edges into s', in float64: every state is at one depth, so that alpha is whole when its slot comes. Never draws anything.
+edges into s', in float64: every state is at one depth, so that alpha is whole when its slot comes. Where the detector has afterpulses,
+a click depends on the click before: alpha is then carried for both outcomes of the last exposure. Never draws anything.
 """
 
 from __future__ import annotations
@@ -43,14 +44,20 @@ def expected_walk(
     transmission: NDArray[np.floating[Any]],
     law: ClickLaw,
     photons_per_level: float = 1.0,
+    *,
+    afterpulse: float = 0.0,
 ) -> ExpectedWalk:
     """Return what `automaton` does on each of n objects, exactly.
 
     `patterns` (n_patterns, pixels) times `photons_per_level` are photoelectrons per exposure and unit transmission, lit all the
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
-    ValueError for shapes that do not fit and for more than one channel.
+    `afterpulse` is the chance that a click makes the next exposure click as well; the exposure before a walk is taken to have none (that
+    of the last object's end is forgotten, at most `afterpulse` clicks per walk). ValueError for shapes that do not fit and for more than
+    one channel.
     """
     _check_arguments(automaton, patterns, transmission)
+    if not 0 <= afterpulse < 1:
+        raise ValueError(f"afterpulse is {afterpulse:g}, allowed: from 0 to below 1")
     n, n_leaves = len(transmission), automaton.n_leaves
     found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)))
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
@@ -59,7 +66,7 @@ def expected_walk(
     for start in range(0, n, step):
         here = slice(start, min(start + step, n))
         light = pattern_light(patterns, transmission[here], photons_per_level)
-        _walk_block(automaton, slots, light, shown, law, found, here)
+        _walk_block(automaton, slots, light, shown, (law, afterpulse), found, here)
     return found
 
 
@@ -99,35 +106,44 @@ def _walk_block(
     slots: list[NDArray[np.int64]],
     light: F64,
     shown: F64,
-    law: ClickLaw,
+    detector: tuple[ClickLaw, float],
     found: ExpectedWalk,
     here: slice,
 ) -> None:
-    alpha = np.zeros((len(light), len(automaton.posteriors)))
-    alpha[:, 0] = 1.0
+    law, afterpulse = detector
+    alpha = np.zeros((2 if afterpulse else 1, len(light), len(automaton.posteriors)))
+    alpha[0, :, 0] = 1.0
     sums = np.zeros((4, len(light)))
     for states in slots:
         pattern = automaton.pattern[states]
         share = automaton.dwell[states] / automaton.dwell_steps
         photoelectrons = light[:, pattern] * share
         click, miss = both_chances(law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
-        reached = alpha[:, states]
-        sums[0] += (reached * click).sum(axis=1)
+        clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
+        reached = alpha[:, :, states].sum(axis=0)
+        sums[0] += (reached * click + clicked).sum(axis=1)
         sums[1] += (reached * photoelectrons).sum(axis=1)
         sums[2] += reached @ (shown[pattern] * share)
         sums[3] += reached.sum(axis=1)
-        pass_on(alpha, states, automaton.successors, click, miss)
+        pass_on(alpha, states, automaton.successors, (click, miss), afterpulse)
     for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
         total[here] = row
-    found.leaves[here] = alpha[:, automaton.n_states :]
+    found.leaves[here] = alpha[:, :, automaton.n_states :].sum(axis=0)
 
 
 @njit(cache=True, nogil=True)
-def pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], click: F64, miss: F64) -> None:
-    """Add what leaves each of `states` (m,) to its successors: alpha (n, nodes), click and miss (n, m) the chances of both outcomes."""
-    for i in range(alpha.shape[0]):
-        for k in range(states.size):
-            state = states[k]
-            reached = alpha[i, state]
-            alpha[i, successors[state, 0]] += reached * miss[i, k]
-            alpha[i, successors[state, 1]] += reached * click[i, k]
+def pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: tuple[F64, F64], afterpulse: float) -> None:
+    """Add what leaves each of `states` (m,) to its successors: alpha (k, n, nodes), chances (n, m) of a click and of none.
+
+    alpha[1] is what came by a click, which `afterpulse` adds to the next; with k = 1 what was before makes no difference.
+    """
+    click, miss = chances
+    last = alpha.shape[0] - 1
+    for before in range(alpha.shape[0]):
+        stays = 1.0 - afterpulse * before
+        for i in range(alpha.shape[1]):
+            for k in range(states.size):
+                state = states[k]
+                reached = alpha[before, i, state]
+                alpha[0, i, successors[state, 0]] += reached * miss[i, k] * stays
+                alpha[last, i, successors[state, 1]] += reached * (click[i, k] + miss[i, k] * (1.0 - stays))

@@ -27,9 +27,10 @@ def walk(automaton: Automaton, word: Sequence[int]) -> Walk:
     return Walk(states, node - automaton.n_states)
 
 
-def expectation(automaton: Automaton, click: Sequence[Any], one: Any) -> dict[str, Any]:
+def expectation(automaton: Automaton, click: Sequence[Any], one: Any, afterpulse: Any = 0) -> dict[str, Any]:
     """Sums over all 2**T words of one object: `click[s]` is the chance of a click in state s, `one` the number 1 of their type.
 
+    Behind a click, an exposure that would not have clicked does so with the chance `afterpulse`; before the walk there was none.
     Returns clicks, exposures, the chance that each state is shown and the chance of each leaf.
     """
     zero = one * 0
@@ -41,8 +42,9 @@ def expectation(automaton: Automaton, click: Sequence[Any], one: Any) -> dict[st
         words[word[: len(passed.states)]] = passed  # words that differ after the leaf are one walk
     for word, passed in words.items():
         chance = one
-        for state, bit in zip(passed.states, word):
-            chance *= click[state] if bit else one - click[state]
+        for state, bit, before in zip(passed.states, word, (0, *word)):
+            miss = (one - click[state]) * (one - before * afterpulse)
+            chance *= one - miss if bit else miss
         found["clicks"] += chance * sum(word)
         found["exposures"] += chance * len(passed.states)
         found["leaves"][passed.leaf] += chance

@@ -115,15 +115,16 @@ def walks_of(
     parts: list[Walks] = []
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
     rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
+    afterpulse = profile.detector.afterpulse_probability
     for start in range(0, len(images), step):
         part = images[start : start + step]
         seen = object_transmission(profile, part.reshape(len(part), -1))
         sums: _Sums
         if trials is None:
-            found = expected_walk(automaton, bundle.pattern_levels, seen, law, scale)
+            found = expected_walk(automaton, bundle.pattern_levels, seen, law, scale, afterpulse=afterpulse)
             sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
         else:
-            sums = _sampled(automaton, bundle.pattern_levels, seen, law, scale, trials, rng)
+            sums = _sampled(automaton, bundle.pattern_levels, seen, (law, afterpulse), scale, trials, rng)
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     return _together(parts, trials or 0)
 
@@ -154,23 +155,26 @@ def _sampled(
     automaton: Automaton,
     patterns: NDArray[Any],
     seen: NDArray[Any],
-    law: ClickLaw,
+    detector: tuple[ClickLaw, float],
     scale: float,
     trials: int,
     rng: np.random.Generator,
 ) -> _Sums:
     """Draw `trials` walks of every object; means per walk, and the share of each leaf."""
+    law, afterpulse = detector
     n, rows = len(seen), np.arange(len(seen))
     light = pattern_light(patterns, seen, scale)
     whole = patterns.sum(axis=1, dtype=np.float64) * scale
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
     for _ in range(trials):
-        node, going = np.zeros(n, np.int64), rows
+        node, going, before = np.zeros(n, np.int64), rows, np.zeros(n, np.bool_)
         while going.size:
             state = node[going]
             pattern, share = automaton.pattern[state], automaton.dwell[state] / automaton.dwell_steps
             photoelectrons = light[going, pattern] * share
-            click = rng.random(going.size) < click_probability(law, photoelectrons)
+            probability = click_probability(law, photoelectrons)
+            probability += (1 - probability) * afterpulse * before[going]
+            before[going] = click = rng.random(going.size) < probability
             for total, values in zip(sums, (click, photoelectrons, whole[pattern] * share, 1.0)):
                 total[going] += values
             node[going] = automaton.successors[state, click.astype(np.int64)]

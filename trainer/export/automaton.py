@@ -170,7 +170,8 @@ def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: floa
     decided = posteriors.argmax(axis=1)
     light, right, leaves = [], [], []
     for first in range(0, len(objects), AT_ONCE):
-        found = _expected(bundle, objects.images[first : first + AT_ONCE], profile, dark)
+        part = objects.images[first : first + AT_ONCE]
+        found = _expected(bundle, part, profile, dark, profile.detector.afterpulse_probability)
         labels = objects.labels[first : first + AT_ONCE]
         light.append(np.stack([found.clicks, found.photons, found.illumination, found.exposures], axis=1))
         right.append((found.leaves * (decided == labels[:, None])).sum(axis=1))
@@ -178,7 +179,9 @@ def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: floa
     return Walked(np.concatenate(light), np.concatenate(right), objects.labels, leaves, posteriors)
 
 
-def _expected(bundle: Bundle, images: NDArray[np.uint8], profile: Profile, dark: float | None) -> ExpectedWalk:
+def _expected(
+    bundle: Bundle, images: NDArray[np.uint8], profile: Profile, dark: float | None, afterpulse: float = 0.0
+) -> ExpectedWalk:
     assert bundle.automaton is not None
     law = click_law(
         profile, max(profile.exposure.min_us, exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1)))
@@ -187,11 +190,15 @@ def _expected(bundle: Bundle, images: NDArray[np.uint8], profile: Profile, dark:
         law = type(law)(dark, law.read_noise_e, law.threshold_e)
     flat = images.reshape(len(images), -1)
     transmission = object_transmission(profile, flat)
-    return expected_walk(bundle.automaton, bundle.pattern_levels, transmission, law, bundle.photons_per_level)
+    levels, scale = bundle.pattern_levels, bundle.photons_per_level
+    return expected_walk(bundle.automaton, levels, transmission, law, scale, afterpulse=afterpulse)
 
 
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
-    """Hold the file's chances of every class and its light against the model's, on held-out objects; PansError where they differ."""
+    """Hold the file's chances of every class and its light against the model's, on held-out objects; PansError where they differ.
+
+    Both without afterpulses, which no training knows.
+    """
     objects = task.test.first(COMPARED_OBJECTS)
     found = _expected(bundle, objects.images, profile, trained.options.dark)
     assert bundle.automaton is not None

@@ -119,18 +119,19 @@ LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2,
 
 
 @pytest.mark.uncompiled
+@pytest.mark.parametrize("afterpulse", [0.0, 0.25])
 @pytest.mark.parametrize("law", LAWS, ids=str)
 @pytest.mark.parametrize("automaton", [early_leaf(), diamond(), random_automaton(5, slots=8)])
-def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLaw) -> None:
+def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLaw, afterpulse: float) -> None:
     patterns, objects = of_objects(automaton)
-    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5)
+    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5, afterpulse=afterpulse)
     for i, seen in enumerate(objects):
         light = [
             1.5 * float(patterns[p] @ seen) * d / automaton.dwell_steps
             for p, d in zip(automaton.pattern, automaton.dwell)
         ]
         click = [float(click_probability(law, mu)) for mu in light]
-        wanted = naive.expectation(automaton, [Fraction(p) for p in click], Fraction(1))
+        wanted = naive.expectation(automaton, [Fraction(p) for p in click], Fraction(1), Fraction(afterpulse))
         assert found.clicks[i] == pytest.approx(float(wanted["clicks"]), rel=1e-12)
         assert found.exposures[i] == pytest.approx(float(wanted["exposures"]), rel=1e-12)
         assert found.leaves[i] == pytest.approx([float(chance) for chance in wanted["leaves"]], rel=1e-11, abs=1e-300)
@@ -168,10 +169,10 @@ def test_chances_keep_their_digits_however_small(brightness: float) -> None:
 def test_objects_in_pieces_are_objects_together(monkeypatch: pytest.MonkeyPatch) -> None:
     automaton = random_automaton(7, slots=6)
     patterns, objects = of_objects(automaton, n=23)
-    whole = expected_walk(automaton, patterns, objects, ClickLaw(0.01))
+    whole = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulse=0.1)
     monkeypatch.setattr("pans.runtime.decide.expectation._NUMBERS_AT_ONCE", 5 * len(automaton.posteriors))
     monkeypatch.setattr("pans.runtime.decide.expectation._PATTERNS_AT_ONCE", 2)
-    pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01))
+    pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulse=0.1)
     for name in ("clicks", "photons", "illumination", "exposures", "leaves"):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-13)
 
@@ -183,5 +184,7 @@ def test_expectations_refuse_what_does_not_fit() -> None:
         expected_walk(automaton, patterns[:, 1:], objects, ClickLaw())
     with pytest.raises(ValueError, match="shows pattern 2 of 2"):
         expected_walk(automaton, patterns[:2], objects, ClickLaw())
+    with pytest.raises(ValueError, match="afterpulse is 1"):
+        expected_walk(automaton, patterns, objects, ClickLaw(), afterpulse=1.0)
     with pytest.raises(ValueError, match="2 channels"):
         expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,13 @@ def test_exact_figures_are_sums_over_all_words(dark: float, eta: float, confiden
     assert np.trace(confusion_of(walks)) == pytest.approx(wanted["right"], rel=1e-9)
 
 
-def test_trials_agree_with_the_expectation_within_their_error() -> None:
+@pytest.mark.parametrize("afterpulse", [0.0, 0.4])
+def test_trials_agree_with_the_expectation_within_their_error(afterpulse: float) -> None:
     """400 walks of each object; 5 standard errors, seed fixed."""
     model, trials = bundle(), 400
-    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, dark=0.02, confidence=0.7))
-    sampled = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, dark=0.02, confidence=0.7, trials=trials, seed=4))
+    profile = replace(PROFILE, detector=replace(PROFILE.detector, afterpulse_probability=afterpulse))
+    exact = measured_walks(walks_of(model, profile, IMAGES, LABELS, dark=0.02, confidence=0.7))
+    sampled = measured_walks(walks_of(model, profile, IMAGES, LABELS, dark=0.02, confidence=0.7, trials=trials, seed=4))
     assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(trials)
     n = len(LABELS) * trials
     assert abs(sampled.abstained - exact.abstained) < 5 * math.sqrt(0.25 / n)
