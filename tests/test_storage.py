@@ -226,7 +226,9 @@ def tried(bench: Bench, name: str, drawn: int | None) -> int:
             try:
                 judge(bench, case, before, ended, fault)
             except (AssertionError, pytest.fail.Exception) as found:
-                wrong.append(f"{fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}: {found}; {ended}")
+                wrong.append(
+                    f"{fault.name} {errno.errorcode.get(error, '')} at call {at} of {clean.calls}: {found}; {ended}"
+                )
             runs += 1
     assert not wrong, f"{name}, PANS_SEED={SEED}, {len(wrong)} of {runs} runs:\n" + "\n".join(wrong)
     return runs

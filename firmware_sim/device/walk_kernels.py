@@ -40,19 +40,33 @@ def follow(limits, successors, adaptive, key, first, begin, stamps, clicks):  # 
 
 @njit(cache=True, nogil=True)
 def expected_light(probability, light, successors):  # type: ignore[no-untyped-def]
-    """The light of a walk in expectation: probability and light float64 (states,) of an exposure in each, successors int64 (states, 2)."""
+    """The light of a walk in expectation, the exposure before it without a click.
+
+    probability float64 (2, states): of a click in each after an exposure without and with one; light float64 (states,) of an exposure in
+    each; successors int64 (states, 2).
+    """
     n_states = successors.shape[0]
-    reached = np.zeros(n_states)
-    reached[0] = 1.0
+    reached = np.zeros((2, n_states))
+    reached[0, 0] = 1.0
     total = 0.0
     for state in range(n_states):
-        total += reached[state] * light[state]
+        total += (reached[0, state] + reached[1, state]) * light[state]
         dark, clicked = successors[state, 0], successors[state, 1]
-        if dark < n_states:
-            reached[dark] += reached[state] * (1.0 - probability[state])
-        if clicked < n_states:
-            reached[clicked] += reached[state] * probability[state]
+        for before in range(2):
+            if dark < n_states:
+                reached[0, dark] += reached[before, state] * (1.0 - probability[before, state])
+            if clicked < n_states:
+                reached[1, clicked] += reached[before, state] * probability[before, state]
     return total
+
+
+def chances(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the chances of a click, float64 (2, n), after an exposure without and with a click; light float64 (n,): photoelectrons."""
+    probability = first_click_probability(model, light)
+    primed = probability
+    if model.afterpulse_probability:
+        primed = 1.0 - (1.0 - probability) * (1.0 - model.afterpulse_probability)
+    return np.stack([probability, primed])
 
 
 def thresholds(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.uint64]:
@@ -60,11 +74,7 @@ def thresholds(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.u
 
     light float64 (n,): photoelectrons expected.
     """
-    probability = first_click_probability(model, light)
-    primed = probability
-    if model.afterpulse_probability:
-        primed = 1.0 - (1.0 - probability) * (1.0 - model.afterpulse_probability)
-    return click_thresholds(np.stack([probability, primed]))
+    return click_thresholds(chances(model, light))
 
 
 def key_of(seed: int) -> np.uint64:
@@ -85,4 +95,4 @@ def warm_up() -> None:
         np.zeros(1, np.uint16),
         np.zeros((1, 1), np.uint8)[:, 0],
     )
-    expected_light(np.zeros(1), np.zeros(1), successors)
+    expected_light(np.zeros((2, 1)), np.zeros(1), successors)

@@ -202,7 +202,7 @@ class WalkSource:
             from . import walk_kernels
 
             light = self._light(number)
-            probability = first_click_probability(self._walked.model, light)
+            probability = walk_kernels.chances(self._walked.model, light)
             found = self._expected[number] = float(
                 walk_kernels.expected_light(probability, light, self._states.successors)
             )

@@ -132,7 +132,9 @@ def _walk_block(
 
 
 @njit(cache=True, nogil=True)
-def pass_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: tuple[F64, F64], afterpulse: float) -> None:
+def pass_on(
+    alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: tuple[F64, F64], afterpulse: float
+) -> None:
     """Add what leaves each of `states` (m,) to its successors: alpha (k, n, nodes), chances (n, m) of a click and of none.
 
     alpha[1] is what came by a click, which `afterpulse` adds to the next; with k = 1 what was before makes no difference.

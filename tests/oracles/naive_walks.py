@@ -45,15 +45,17 @@ def exposures(
     return stamps, clicks
 
 
-def expected_light(states: list[tuple[int, float, int, int]], light: Callable[[int], float], dark: float) -> float:
-    """Photoelectrons of a walk in expectation, by going through every walk."""
+def expected_light(
+    states: list[tuple[int, float, int, int]], light: Callable[[int], float], dark: float, p_ap: float
+) -> float:
+    """Photoelectrons of a walk in expectation, by going through every walk; a click makes the next one likelier by `p_ap`."""
 
-    def beyond(node: int) -> float:
+    def beyond(node: int, before: int) -> float:
         if node >= len(states):
             return 0.0
         pattern, lit, unclicked, clicked = states[node]
         mean = lit * light(pattern)
-        p = 1 - math.exp(-mean - dark)
-        return mean + (1 - p) * beyond(unclicked) + p * beyond(clicked)
+        miss = math.exp(-mean - dark) * (1 - p_ap if before else 1)
+        return mean + miss * beyond(unclicked, 0) + (1 - miss) * beyond(clicked, 1)
 
-    return beyond(0)
+    return beyond(0, 0)

@@ -202,7 +202,9 @@ def test_marks_tell_the_light_of_a_walk_in_expectation() -> None:
     dark = profile.detector.dark_rate_hz * seconds
     for mark in of_type(messages, wire.Mark):
         row = lambdas[mark.object_index % 5]
-        wanted = naive_walks.expected_light(states, lambda pattern, row=row: row[pattern], dark)
+        wanted = naive_walks.expected_light(
+            states, lambda pattern, row=row: row[pattern], dark, profile.detector.afterpulse_probability
+        )
         assert mark.photons == pytest.approx(wanted, rel=1e-6)
     hosted, plan_of_host = bright(automaton, "host")
     run(hosted, plan_of_host, 1)
@@ -296,8 +298,10 @@ def test_the_kernels_walk_as_the_oracle_does() -> None:
         )  # fmt: skip
         before = int(clicks[walk, -1])
     assert (stamps.ravel().tolist(), clicks.ravel().tolist()) == wanted
-    expected = walk_kernels.expected_light(-np.expm1(-light), light, successors)
-    assert expected == pytest.approx(naive_walks.expected_light(states, lambda pattern: light[pattern], 0.0))
+    for p_ap in (0.0, 0.3):
+        p = -np.expm1(-light)
+        expected = walk_kernels.expected_light(np.stack([p, p + p_ap * (1 - p)]), light, successors)
+        assert expected == pytest.approx(naive_walks.expected_light(states, lambda pattern: light[pattern], 0.0, p_ap))
 
 
 # -- what the host names -----------------------------------------------------------------------------------------------
