@@ -1,10 +1,12 @@
 """The finished automaton as arrays: patterns in projector levels, dwell, successors and posteriors, numbered as a bundle holds them.
 
-Owns the way from brightness to whole dwell steps or levels, the numbering, and patterns that several states share; never trains.
+Owns the way from brightness to whole dwell steps or levels, the last step to the budget, the numbering, and patterns that several
+states share; never trains.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +15,15 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import Profile
 
+from .figures import figures
 from .light import Bits
-from .machine import Machine
+from .machine import Machine, Sight
+from .objects import Block
 from .posteriors import Posteriors
+from .tune import Price
+
+UNDER_BUDGET = 0.99  # of the budget is what drawn objects may take: others take a little more or less
+DIMMINGS = 6  # steps of the search for the brightness that meets the budget
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +69,46 @@ def to_grid(machine: Machine, grid: Grid) -> None:
             assert isinstance(light, Bits)
             units = (light.log_light.exp() / grid.top * grid.steps).round().clamp(1, grid.steps)
             light.log_light.copy_((units / grid.steps * grid.top).log())
+
+
+def meet_budget(
+    machine: Machine, price: Price, grid: Grid | None, sight: Callable[[], Sight], drawn: list[Block]
+) -> None:
+    """Dim or brighten all patterns alike until the objects `drawn` take 99 % of the budget; a few percent at most.
+
+    They are drawn from those that were fitted, as light is not learned by heart.
+    """
+    if price.budget is None:
+        return
+    bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
+    exact = [light.log_light.clone() for light in bits]  # before it is rounded to whole steps, which raises the darkest
+    for _ in range(DIMMINGS):
+        if grid is not None:
+            to_grid(machine, grid)
+        found = figures(machine, sight(), drawn)
+        wanted = UNDER_BUDGET * price.budget / (found.clicks if price.of_clicks else found.photons)
+        if 0.995 <= wanted <= 1.0:
+            return
+        for light, before in zip(bits, exact):
+            light.log_light.copy_(before)
+        scale_light(machine, wanted**1.1)
+        exact = [light.log_light.clone() for light in bits]
+
+
+def scale_light(machine: Machine, factor: float) -> None:
+    """Multiply the light of all patterns by `factor`."""
+    with torch.no_grad():
+        done: set[int] = set()
+        for level in machine.levels:
+            light = level.light
+            if isinstance(light, Bits):
+                if id(light.log_light) not in done:
+                    light.log_light.add_(torch.log(torch.tensor(factor)))
+                    done.add(id(light.log_light))
+                light.settle()
+            else:
+                light.root.mul_(factor**0.5)
+                light.top *= factor
 
 
 def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: Grid | None) -> Finished:

@@ -12,7 +12,8 @@ of no click and beta the expected loss from there on:
     d loss / d light(s) = alpha(s) * (sum_k q_k'(s) beta'(successor_k(s)) + price)
 
 The logarithm of a leaf's posterior is its loss; the class counts behind it are running means, whose own gradient vanishes at the
-optimum (envelope theorem).
+optimum (envelope theorem). Decisions, the largest counts, are constant but where two are equal; a loss that counts wrong ones has
+a gradient all the same, as it is the probability of the leaves that changes.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from .light import Light
 from .outcomes import no_click
 
 OUTCOMES = 2  # no click, click
+WRONG = 2.2  # nats, of a wrong decision: about the odds of ten classes, so that both parts of the loss are of one size
 COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
 
 
@@ -155,24 +157,45 @@ def leaf_losses(counts: Tensor, one_hot: Tensor) -> Tensor:
     return -torch.log(counts / counts.sum(dim=1, keepdim=True)) @ one_hot
 
 
-def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, passed: Pass, price: float) -> None:
-    """Set the gradients of the mean of loss + price * photons over the objects of `passed`.
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """What training makes small, the mean of loss + price * photons + exposure_price * exposures.
 
-    `price` is per photoelectron. The gradients replace those that were there.
+    Prices are in nats, of a photoelectron and of an exposure (saved where a walk ends early). Of the loss `decide` is the part that
+    counts wrong decisions, `WRONG` nats each; the rest is the log loss.
     """
+
+    price: float
+    exposure_price: float = 0.0
+    decide: float = 0.0
+
+    def at_leaves(self, counts: Tensor, one_hot: Tensor) -> Tensor:
+        """Return the loss of the objects in every leaf of these class counts, (leaves, objects)."""
+        if not self.decide:
+            return leaf_losses(counts, one_hot)
+        table = -(1.0 - self.decide) * torch.log(counts / counts.sum(dim=1, keepdim=True)) + self.decide * WRONG
+        decided = counts.argmax(dim=1, keepdim=True)
+        table.scatter_add_(1, decided, torch.full_like(table[:, :1], -self.decide * WRONG))
+        return table @ one_hot
+
+
+def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, passed: Pass, aim: Aim) -> None:
+    """Set the gradients of what `aim` makes small over the objects of `passed`; they replace those that were there."""
     for tensor in machine.parameters():
         tensor.grad = None
     share = 1.0 / len(grey)
-    beta = leaf_losses(machine.counts[-1], one_hot)
+    beta = aim.at_leaves(machine.counts[-1], one_hot)
     for number in range(len(machine.levels) - 1, -1, -1):
         level, step = machine.levels[number], passed.steps[number]
         after_click = beta[level.successors[1]]
         gain = beta[level.successors[0]].sub_(after_click)  # what no click costs more than a click
-        slope = torch.mul(step.fall, gain).neg_().add_(price).mul_(step.alpha).mul_(share)
+        slope = torch.mul(step.fall, gain).neg_().add_(aim.price).mul_(step.alpha).mul_(share)
         mask_slope = sight.mask_slope(slope, grey)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
         level.light.take(mask_slope if scale is None else mask_slope.mul_(scale), light_slope)
-        beta = gain.mul_(step.dark).add_(after_click).add_(step.light, alpha=price)
+        beta = gain.mul_(step.dark).add_(after_click).add_(step.light, alpha=aim.price)
+        if aim.exposure_price:
+            beta += aim.exposure_price
         if number and len(machine.counts[number - 1]):
-            beta = torch.cat([beta, leaf_losses(machine.counts[number - 1], one_hot)])
+            beta = torch.cat([beta, aim.at_leaves(machine.counts[number - 1], one_hot)])

@@ -1,7 +1,8 @@
 """What the training of an automaton sees: grey values of the objects, in an order and a distortion that change from epoch to epoch.
 
 Owns the split into objects to fit and objects held back (they set prices and calibrate, no pattern is trained on them), the random
-order, and blocks of one size. Grey values stay whole numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey.
+order, soft targets in place of the labels (train/teacher.py), and blocks of one size. Grey values stay whole
+numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pans.runtime.instrument.profile import Profile
@@ -25,7 +27,7 @@ ORDER_STREAM = 0xA07
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Some objects: `grey` (objects, pixels) in the type of the matrix products, `one_hot` (classes, objects) of their labels."""
+    """Some objects: `grey` (objects, pixels) in the type of the matrix products, `one_hot` (classes, objects) of labels, or soft."""
 
     grey: Tensor
     one_hot: Tensor
@@ -67,6 +69,19 @@ class TrainingObjects:
         self.floor = profile.min_transmission
         self.gain = (1.0 - self.floor) / (self._levels - 1)
         self._seed, self._augmentation = seed, augmentation
+        self._targets: NDArray[np.float32] | None = None
+
+    @property
+    def fitted(self) -> Objects:
+        """The objects to fit, as they are, in the order of the file."""
+        return self._fit
+
+    def soften(self, answers: NDArray[np.float32], weight: float) -> None:
+        """Give every object to fit class probabilities for its label: `weight` of `answers` (objects, classes), of the label the rest."""
+        if answers.shape != (self.n_fit, self.n_classes):
+            raise ValueError(f"answers {answers.shape}, allowed: {(self.n_fit, self.n_classes)}")
+        labels = np.eye(self.n_classes, dtype=np.float32)[self._fit.labels]
+        self._targets = weight * answers + np.float32(1.0 - weight) * labels
 
     def mean_transmission(self) -> Tensor:
         """Return the mean transmission of every pixel over the first objects, float32 (pixels,)."""
@@ -82,7 +97,8 @@ class TrainingObjects:
         random = np.random.default_rng([ORDER_STREAM, self._seed, number])
         order = random.permutation(self.n_fit)
         objects = self._fit if plain else self._augmented(number)
-        return list(self._blocks(Objects(objects.images[order], objects.labels[order]), size, dtype))
+        targets = None if self._targets is None else self._targets[order]
+        return list(self._blocks(Objects(objects.images[order], objects.labels[order]), size, dtype, targets))
 
     def held_back(self, size: int, dtype: torch.dtype) -> list[Block]:
         """Return the objects held back, as they are."""
@@ -104,10 +120,15 @@ class TrainingObjects:
         table = np.rint(np.arange(256) / 255.0 * (self._levels - 1)).astype(np.uint8)
         return np.asarray(table[flat])
 
-    def _blocks(self, objects: Objects, size: int, dtype: torch.dtype) -> Iterator[Block]:
+    def _blocks(
+        self, objects: Objects, size: int, dtype: torch.dtype, targets: NDArray[np.float32] | None = None
+    ) -> Iterator[Block]:
         grey, labels = self._grey(objects.images), objects.labels
         for first in range(0, len(labels), size):
             part = torch.from_numpy(grey[first : first + size].copy())
-            one_hot = torch.zeros(self.n_classes, len(part))
-            one_hot[here(torch.from_numpy(labels[first : first + size])), torch.arange(len(part))] = 1.0
+            if targets is None:
+                one_hot = torch.zeros(self.n_classes, len(part))
+                one_hot[here(torch.from_numpy(labels[first : first + size])), torch.arange(len(part))] = 1.0
+            else:
+                one_hot = here(torch.from_numpy(np.ascontiguousarray(targets[first : first + size].T)))
             yield Block(here(part).to(dtype), one_hot)

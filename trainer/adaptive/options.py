@@ -6,7 +6,7 @@ Owns names, defaults and limits; never trains. `check_automaton_options` returns
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
 from pans.runtime.errors import PlanError, UsageError
@@ -18,6 +18,9 @@ PRICE_AT_10 = 0.02  # nats per photoelectron at which training spends about 10 o
 PRICE_POWER = 1.6  # how the price falls with the budget
 GROWN_PRICE = 0.7  # of the last level grown, over the price of the budget: tuning saves light
 DEFAULT_PHOTONS = 10.0
+# by task, where they helped on held-back objects (docs/how-to/automaton.md)
+COPIES_OF = {"mnist": 20}
+SOFT_OF = {"fashion-mnist": 0.5}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class AutomatonOptions:
     exposures: int = 0
     states: int = 0
     seed: int = 0
-    batch: int = 500
+    batch: int = 250
     grow_epochs: int = 2
     candidates: int = 6
     first_price: float = (
@@ -43,10 +46,18 @@ class AutomatonOptions:
     reroutes: int = 2  # sweeps that move edges to better states, after the first epochs of the last stage
     shift_px: int = 0  # training images are moved by up to that much along the rows, anew in every epoch
     offset_px: int = 0  # and across them
-    copies: int = 0  # distorted versions of every training image, which the epochs take in turn (distort.py)
+    copies: int | None = (
+        None  # distorted versions of every training image, which the epochs take in turn; None: COPIES_OF
+    )
     grey: bool = False  # patterns in all levels of the projector, instead of one bit and a brightness
     strength: float = 0.3  # of these distortions; at full strength they cost more than they bring
+    decide: float = (
+        0.7  # of the loss counts wrong decisions, from the second epoch of the last stage on; the rest is the log loss
+    )
+    exposure_price: float = 0.0  # nats per exposure: walks end early where what follows is worth less
     patterns: int = 0  # at most so many different patterns, which states share; 0: as many as the projector holds
+    soft: float | None = None  # weight of a network's answers in the targets, the labels have the rest; None: SOFT_OF
+    teacher_epochs: int = 6  # of that network
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
 
 
@@ -62,6 +73,10 @@ LIMITS = {
     "reroutes": (0, 1000),
     "shift_px": (0, 65536),
     "strength": (0, 10),
+    "soft": (0, 1),
+    "decide": (0, 1),
+    "exposure_price": (0, 10),
+    "teacher_epochs": (1, 1000),
     "patterns": (0, 65_535),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
@@ -114,12 +129,20 @@ def price_at(options: AutomatonOptions, level: int) -> float:
     return last + (max(last, options.first_price) - last) * 0.5 ** (level / options.half)
 
 
+def for_task(options: AutomatonOptions, task: str) -> AutomatonOptions:
+    """Return `options` with soft targets and copies spelt out where they were left to the task of that name."""
+    soft = SOFT_OF.get(task, 0.0) if options.soft is None else options.soft
+    copies = COPIES_OF.get(task, 0) if options.copies is None else options.copies
+    return replace(options, soft=soft, copies=copies)
+
+
 def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:
     """Raise UsageError or PlanError for what cannot be trained for this task on this profile."""
     for name, (low, high) in LIMITS.items():
-        if not low <= getattr(options, name) <= high:
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:
             flag = "--" + name.replace("_", "-")
-            raise UsageError(f"{flag} is {getattr(options, name)}, allowed: {low} to {high}")
+            raise UsageError(f"{flag} is {value}, allowed: {low} to {high}")
     for name in ("photons", "clicks"):
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and 0.1 <= value <= 1000):

@@ -25,11 +25,12 @@ LOSS_SPREAD = 0.5  # nats
 
 @dataclass(frozen=True, slots=True)
 class Rerouted:
-    """How many edges moved, how many nodes were left empty and revived, and the loss saved per object, nats."""
+    """How many edges moved (`stopped`: to leaves of their own) and empty nodes were revived, and the loss saved per object, nats."""
 
     moved: int
     revived: int
     saved: float
+    stopped: int = 0
 
 
 class _Sweep:
@@ -37,6 +38,8 @@ class _Sweep:
 
     def __init__(self, machine: Machine, sight: Sight, blocks: list[Block]) -> None:
         self.machine, self.sight, self.blocks = machine, sight, blocks
+        counted = sum(float(counts.sum()) for counts in machine.counts)
+        self.scale = counted / sum(len(block) for block in blocks)  # the sweep may be over a part of the objects
         self.kept: list[list[tuple[Tensor, Tensor]]] = []
         for block in blocks:
             steps = forward(machine, sight, block.grey).steps
@@ -68,7 +71,12 @@ class _Sweep:
         for beta in self.betas:
             beta[target] = beta[source]
 
-    def step_back(self, number: int, price: float) -> None:
+    def add_leaves(self, counts: Tensor) -> None:
+        """Put leaves of these class counts (leaves, classes) behind the nodes behind the present level."""
+        for index, block in enumerate(self.blocks):
+            self.betas[index] = torch.cat([self.betas[index], leaf_losses(counts, block.one_hot)])
+
+    def step_back(self, number: int, price: float, exposure_price: float) -> None:
         """Replace the expected losses behind level `number` by those before it, under its present successors."""
         level = self.machine.levels[number]
         for index, (kept, block) in enumerate(zip(self.kept, self.blocks)):
@@ -76,6 +84,7 @@ class _Sweep:
             beta = self.betas[index]
             after = beta[level.successors[1]]
             before = after + dark * (beta[level.successors[0]] - after) + price * kept[number][1].float()
+            before += exposure_price
             if number and len(self.machine.counts[number - 1]):
                 before = torch.cat([before, leaf_losses(self.machine.counts[number - 1], block.one_hot)])
             self.betas[index] = before
@@ -85,11 +94,14 @@ class _Sweep:
         return alpha.float(), no_click(light.float(), self.sight.law)[0]
 
 
-def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float) -> Rerouted:
-    """Move the edges of `machine` to better nodes, by the objects in `blocks`; `price` is that of a photoelectron."""
+def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0) -> Rerouted:
+    """Move the edges of `machine` to better nodes, by the objects in `blocks`; `price` is that of a photoelectron.
+
+    With an `exposure_price` an edge may end the walk: it goes to a new leaf where to decide at once costs less than what follows.
+    """
     with torch.no_grad():
         sweep = _Sweep(machine, sight, blocks)
-        moved = revived = 0
+        moved = revived = stopped = 0
         saved = 0.0
         for number in range(len(machine.levels) - 1, -1, -1):
             level = machine.levels[number]
@@ -100,11 +112,34 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float) -
             level.successors = torch.where(better, best, level.successors)
             moved += int(better.sum())
             saved += float((now - least)[better].sum())
+            if exposure_price and number + 1 < len(machine.levels):
+                ended, gained = _stop(machine, number, sweep, torch.minimum(now, least), arrived, error)
+                stopped, saved = stopped + ended, saved + gained
             for full, empty in _revive(machine, number, arrived):
                 sweep.copy_node(full, empty)
                 revived += 1
-            sweep.step_back(number, price)
-    return Rerouted(moved, revived, saved / sum(len(block) for block in blocks))
+            sweep.step_back(number, price, exposure_price)
+    return Rerouted(moved + stopped, revived, saved / sum(len(block) for block in blocks), stopped)
+
+
+def _stop(
+    machine: Machine, number: int, sweep: _Sweep, cost: Tensor, arrived: Tensor, error: Tensor
+) -> tuple[int, float]:
+    """Give edges leaves of their own where that costs less than `cost`; all (2, states). Returns how many, and what is saved.
+
+    A leaf states the posterior of the objects that arrive, with one more object spread over the classes, so that few of them
+    promise little.
+    """
+    counts = arrived + 1.0 / arrived.shape[2]
+    at_once = -(arrived * torch.log(counts / counts.sum(dim=2, keepdim=True))).sum(dim=2)
+    level, ends = machine.levels[number], at_once < cost - SURE * error
+    n_leaves, n_nodes = int(ends.sum()), machine.n_nodes(number)
+    if n_leaves:
+        level.successors[ends] = torch.arange(n_nodes, n_nodes + n_leaves)
+        leaves = counts[ends] * sweep.scale
+        machine.counts[number] = torch.cat([machine.counts[number], leaves])
+        sweep.add_leaves(leaves)
+    return n_leaves, float((cost - at_once)[ends].sum())
 
 
 def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, int]]:
@@ -113,6 +148,7 @@ def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, i
     Returns the copies made, (full, empty).
     """
     level, n_nodes = machine.levels[number], machine.n_nodes(number)
+    n_states = n_nodes - len(machine.counts[number])
     targets, edges = level.successors.flatten(), arrived.flatten(0, 1)
     mass = edges.sum(dim=1)
     in_edges = torch.bincount(targets, minlength=n_nodes)
@@ -120,6 +156,7 @@ def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, i
     for empty in (in_edges == 0).nonzero().flatten().tolist():
         load = torch.zeros(n_nodes).index_add_(0, targets, mass)
         load[in_edges < 2] = -1.0
+        load[(torch.arange(n_nodes) < n_states) != (empty < n_states)] = -1.0  # a leaf is no copy of a state
         full = int(load.argmax())
         if load[full] < 0:
             break
@@ -155,8 +192,6 @@ def _copy_node(machine: Machine, number: int, source: int, target: int, counts: 
         whole = machine.counts[number]
         share = counts / counts.sum().clamp(min=1e-9)
         whole[target - n_states] = share * whole[source - n_states].sum() / 2 + COUNT_FLOOR
-        return
-    if source >= n_states or target >= n_states:
         return
     level = machine.levels[number + 1]
     for tensor in _by_state(level.light):

@@ -4,11 +4,13 @@ Owns the order of the stages, the checkpoint between them and the way into the a
 export) and never sees the held-out objects. `train_automaton` returns a `TrainedAutomaton` whose figures are of objects held back.
 
 Sources: finite-state controllers and their improvement (Hansen 1998), decision jungles (Shotton et al. 2013), the agglomerative
-information bottleneck (Slonim and Tishby 1999), sequential decisions on photons (Chen and Perona 2017) and in general (Wald 1945).
+information bottleneck (Slonim and Tishby 1999), distillation (Hinton, Vinyals and Dean 2015), sequential decisions
+on photons (Chen and Perona 2017) and in general (Wald 1945).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,9 +26,10 @@ from pans.trainer.device import new_generator
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
+from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
 from .figures import Figures, figures
-from .finished import Finished, Grid, bit_grid, dwell_steps, finished, to_grid
+from .finished import Finished, bit_grid, dwell_steps, finished, meet_budget, to_grid
 from .grow import GrowOptions, Growth, sum_of
 from .light import Bits, Grey, as_bits
 from .machine import COUNT_FLOOR, Machine, Sight, forward
@@ -34,6 +37,7 @@ from .objects import Augmentation, Block, TrainingObjects
 from .options import (
     AutomatonOptions,
     check_automaton_options,
+    for_task,
     patterns_at_most,
     photons_wanted,
     price_at,
@@ -53,9 +57,8 @@ REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/training.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
-UNDER_BUDGET = 0.99  # of the budget is what they may take: others take a little more or less
-DIMMINGS = 6  # steps of the search for the brightness that meets the budget
 STAGES = ("grow", "grey", "shown")
+NETWORK = "network"  # a stage before them, where targets are soft
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
 
 
@@ -108,11 +111,13 @@ def train_automaton(
     resume: bool = False,
     report: Callable[[Progress], None] = lambda _: None,
     held_back: int = 0,
+    teacher: Path | None = None,
 ) -> TrainedAutomaton:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
 
     After every level and epoch the state goes to `checkpoint`; with `resume` a training goes on from there. `held_back` objects (0: one
-    in twelve) set the price and calibrate; no pattern is trained on them. KeyboardInterrupt passes through.
+    in twelve) set the price and calibrate; no pattern is trained on them. Soft targets are read from the file
+    `teacher` where there is one, else made and kept there. KeyboardInterrupt passes through.
     """
     check_automaton_options(options, task, profile)
     saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
@@ -124,6 +129,7 @@ def train_automaton(
         if checkpoint:
             write_checkpoint(checkpoint, options, task.sha256, {"run": run.state()})
 
+    run.soften(task, teacher, keep)
     run.grow(keep)
     run.tune("grey", options.tune_epochs, options.tune_rate, keep)
     run.start_showing()
@@ -142,8 +148,9 @@ class _Run:
         report: Callable[[Progress], None],
         held_back: int,
     ) -> None:
-        self.profile, self.options, self.report = profile, options, report
-        changes = Augmentation(options.shift_px, options.offset_px, options.copies, options.strength)
+        self.profile, self.options, self.report = profile, for_task(options, task.name), report
+        options = self.options
+        changes = Augmentation(options.shift_px, options.offset_px, options.copies or 0, options.strength)
         self.objects = TrainingObjects(task, profile, options.seed, changes, held_back)
         self.exposures, self.states = with_defaults(options, profile)
         self.stage, self.epoch = "grow", 0
@@ -153,6 +160,7 @@ class _Run:
         self.tuning: Tuning | None = None
         self.saved_tuning: dict[str, Any] | None = None
         self.products = product_dtype()
+        self.answers: NDArray[np.float32] | None = None
 
     @property
     def steps(self) -> int:
@@ -171,6 +179,27 @@ class _Run:
         return Sight(law, self.objects.gain, self.objects.floor, products)
 
     # ---- the stages ----
+
+    def soften(self, task: Task, file: Path | None, keep: Callable[[], None]) -> None:
+        """Let a network's answers take the place of the labels, as far as is wanted: those of the checkpoint, of `file`, or new ones."""
+        weight = self.options.soft
+        if not weight:
+            return
+        taught = Taught(task.sha256, self.objects.n_fit, self.options.teacher_epochs)
+        if self.answers is None and file is not None and file.exists():
+            self.answers = read_targets(file, taught, self.objects.n_classes)
+        if self.answers is None:
+            epochs = self.options.teacher_epochs
+            self.answers = soft_targets(self.objects.fitted, self.objects.n_classes, epochs, self._taught)
+            if file is not None:
+                write_targets(file, self.answers, taught)
+            keep()
+        self.objects.soften(self.answers, weight)
+
+    def _taught(self, epoch: int, loss: float) -> None:
+        self.report(
+            Progress(NETWORK, epoch + 1, self.options.teacher_epochs, loss, math.nan, 0.0, 0.0, self.price.value)
+        )
 
     def grow(self, keep: Callable[[], None]) -> None:
         """Grow levels until there are as many as exposures."""
@@ -265,6 +294,7 @@ class _Run:
         steps = max(1, epochs * -(-self.objects.n_fit // size))
         if self.tuning is None:
             self.tuning = Tuning(self.machine, self.sight(self.products), self.price, rate, steps)
+            self.tuning.exposure_price = self.options.exposure_price
             if self.saved_tuning is not None:
                 self.tuning.restore(self.saved_tuning)
                 self.saved_tuning = None
@@ -272,6 +302,7 @@ class _Run:
             if stage == "shown" and not self.options.grey:
                 self._choose_top()
             self.tuning.sight = self.sight(self.products)
+            self.tuning.decide = self.options.decide if stage == "shown" and self.epoch else 0.0
             if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
                 self._reroute()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
@@ -311,6 +342,7 @@ class _Run:
             self.sight(self.products),
             blocks[: max(1, REROUTE_NUMBERS // (GROWTH_BLOCK * states))],
             self.price.value,
+            self.options.exposure_price,
         )
 
     # ---- the end ----
@@ -319,7 +351,7 @@ class _Run:
         """Meet the budget, round the brightness, count the leaves anew and calibrate the posteriors."""
         held_back = self.objects.held_back(GROWTH_BLOCK, torch.float32)
         grid = None if self.options.grey else bit_grid(self.machine.levels[0].light.top, self.profile)
-        self._meet_budget(grid)
+        meet_budget(self.machine, self.price, grid, self.sight, self._drawn())
         if grid is not None:
             to_grid(self.machine, grid)
         sight = self.sight()
@@ -330,31 +362,9 @@ class _Run:
             arrays, self.machine, posteriors, sight, self.objects.wide, measured, self.price.value, self.options
         )
 
-    def _meet_budget(self, grid: Grid | None) -> None:
-        """Dim or brighten all patterns alike until training objects take 99 % of the budget; a few percent at most.
-
-        They are drawn from those that were fitted: the last ones of a file need not be like the others (those of MNIST are darker), and
-        light is not learned by heart.
-        """
-        if self.price.budget is None:
-            return
-        bits = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
-        exact = [
-            light.log_light.clone() for light in bits
-        ]  # before it is rounded to whole steps, which raises the darkest
-        drawn = self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)[:BUDGET_BLOCKS]
-        for _ in range(DIMMINGS):
-            if grid is not None:
-                to_grid(self.machine, grid)
-            found = figures(self.machine, self.sight(), drawn)
-            spent = found.clicks if self.price.of_clicks else found.photons
-            wanted = UNDER_BUDGET * self.price.budget / spent
-            if 0.995 <= wanted <= 1.0:
-                return
-            for light, before in zip(bits, exact):
-                light.log_light.copy_(before)
-            scale_light(self.machine, wanted**1.1)
-            exact = [light.log_light.clone() for light in bits]
+    def _drawn(self) -> list[Block]:
+        """Objects drawn from all that were fitted: the last ones of a file need not be like the others (those of MNIST are darker)."""
+        return self.objects.epoch(0, GROWTH_BLOCK, torch.float32, plain=True)[:BUDGET_BLOCKS]
 
     def _posteriors(self, sight: Sight, held_back: list[Block]) -> Posteriors:
         """Calibrated posteriors of all nodes; the machine's leaves are counted anew."""
@@ -374,6 +384,7 @@ class _Run:
             "price": self.price.value,
             "machine": machine_state(self.machine),
             "tuning": None if self.tuning is None else self.tuning.state(),
+            "answers": None if self.answers is None else torch.from_numpy(self.answers),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -381,22 +392,7 @@ class _Run:
         self.stage, self.epoch, self.price.value = state["stage"], state["epoch"], state["price"]
         self.machine = machine_from(state["machine"])
         self.saved_tuning = state["tuning"]
-
-
-def scale_light(machine: Machine, factor: float) -> None:
-    """Multiply the light of all patterns by `factor`."""
-    with torch.no_grad():
-        done: set[int] = set()
-        for level in machine.levels:
-            light = level.light
-            if isinstance(light, Bits):
-                if id(light.log_light) not in done:
-                    light.log_light.add_(torch.log(torch.tensor(factor)))
-                    done.add(id(light.log_light))
-                light.settle()
-            else:
-                light.root.mul_(factor**0.5)
-                light.top *= factor
+        self.answers = None if state["answers"] is None else state["answers"].numpy()
 
 
 def product_dtype() -> torch.dtype:

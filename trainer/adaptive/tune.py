@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from .machine import COUNT_FLOOR, Machine, Sight, backward, forward
+from .machine import COUNT_FLOOR, Aim, Machine, Sight, backward, forward
 from .objects import Block
 
 COUNT_SHARE = 0.02  # of a step in the running class counts
@@ -54,6 +54,7 @@ class Tuning:
 
     def __init__(self, machine: Machine, sight: Sight, price: Price, rate: float, steps: int) -> None:
         self.machine, self.sight, self.price, self.rate, self.steps = machine, sight, price, rate, steps
+        self.exposure_price = self.decide = 0.0  # see Aim; they may change from epoch to epoch
         self.done = self.epochs = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
@@ -80,7 +81,8 @@ class Tuning:
         machine = self.machine
         with torch.no_grad():
             passed = forward(machine, self.sight, block.grey)
-            backward(machine, self.sight, block.grey, block.one_hot, passed, self.price.value)
+            aim = Aim(self.price.value, self.exposure_price, self.decide)
+            backward(machine, self.sight, block.grey, block.one_hot, passed, aim)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5
             self.optimiser.step()

@@ -59,15 +59,26 @@ NUMBERS = (
     ("shift_px", "X", "move training images by up to X along the rows (default 0)"),
     ("offset_px", "Y", "and by up to Y across them (default 0)"),
     ("strength", "F", "of an automaton: of the distortions, times the usual (default 0.3)"),
-    ("copies", "N", "add N distorted copies of every training image: turned, stretched, bent a little (default 0)"),
+    ("decide", "F", "of an automaton: part of the last loss that counts wrong decisions (default 0.7)"),
+    ("exposure_price", "P", "of an automaton: nats per exposure; walks then end early where that pays (default 0)"),
+    (
+        "soft",
+        "W",
+        "of an automaton: weight of a network's answers in the targets (default: 0.5 for fashion-mnist, else 0)",
+    ),
+    (
+        "copies",
+        "N",
+        "add N distorted copies of every training image: turned, stretched, bent a little (default 0; of an automaton for mnist 20)",
+    ),
     ("seed", "N", "of everything random (default 0)"),
     ("hidden", "H", "hidden units of the head (default 512)"),
-    ("batch", "B", "objects per step (default 512)"),
+    ("batch", "B", "objects per step (default 512; of an automaton 250)"),
     ("slope", "S", "slope annealing: light at the start times S"),
     ("clamp", "L", "clamp photoelectrons early in training"),
     ("dark", "R", "dark photoelectrons per exposure in training, instead of the profile's"),
 )
-OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength")
+OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher")
 AS_GIVEN = (
     *("features", "photons", "budget", "complex_field", "conserving"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
@@ -99,6 +110,12 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"
+    )
+    parser.add_argument(
+        "--teacher",
+        type=Path,
+        metavar="FILE.npz",
+        help="of an automaton: the network's answers are read from there; where nothing is, they are made and kept there",
     )
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
     parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
@@ -149,8 +166,10 @@ def _train(args: argparse.Namespace) -> int:
     if args.features is None:
         raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
     for name in OF_AUTOMATA:
-        if getattr(args, name):
-            raise UsageError(f"--{name} belongs to an automaton", remedy="add --encoder automaton, or leave it out")
+        if getattr(args, name) not in (None, False):
+            raise UsageError(
+                f"--{name.replace('_', '-')} belongs to an automaton", remedy="add --encoder automaton, or leave it out"
+            )
     check_files(args, checkpoint)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile

@@ -39,6 +39,9 @@ TAKEN = (
     "offset_px",
     "copies",
     "strength",
+    "decide",
+    "exposure_price",
+    "soft",
     "dark",
 )
 FOREIGN = (
@@ -65,7 +68,9 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path) -> int:
     started = time.perf_counter()
     try:
         with usage_errors(), _progress() as show, computing_on(args.device):
-            trained = train_automaton(task, profile, options, checkpoint=checkpoint, resume=args.resume, report=show)
+            trained = train_automaton(
+                task, profile, options, checkpoint=checkpoint, resume=args.resume, report=show, teacher=args.teacher
+            )
             exported = _export(args, trained, task, profile, time.perf_counter() - started)
     except KeyboardInterrupt:
         say(f"interrupted; the last whole step is in {checkpoint}\n  go on: the same command with --resume")
@@ -159,6 +164,8 @@ def _progress() -> Iterator[Callable[[Progress], None]]:
 
 
 def _line(told: Progress) -> str:
+    if told.stage == "network":
+        return f"network for soft targets, epoch {told.done}/{told.steps}: loss {told.loss:.3f}"
     return (
         f"{told.stage} {told.done}/{told.steps}: loss {told.loss:.3f}, accuracy {100 * told.accuracy:.1f} %, "
         f"{told.clicks:.2f} clicks, {told.photons:.2f} photons"

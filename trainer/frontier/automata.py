@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pans.trainer.adaptive.options import AutomatonOptions
 
 PROFILE = "ideal"
+OLDER = {"soft": 0.0, "decide": 0.0}  # options whose default does what bundles from before them did not
 
 
 def bundle_path(cache: Path, stem: str, seed: int) -> Path:
@@ -33,7 +34,7 @@ def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any]
     """Return the figures of an automaton of that budget (see `automaton_recipe`), trained now unless its bundle is in the cache."""
     from pans.trainer.export.automaton import measure_walks
 
-    options = automaton_recipe(budget, seed)
+    options = automaton_recipe(task.name, budget, seed)
     path = bundle_path(asked.cache, stem, seed)
     seconds = None
     if _trained(path, options) is None:
@@ -47,13 +48,13 @@ def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any]
     return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}
 
 
-def automaton_recipe(budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
-    """Return the options for a budget (`photons` or `clicks`) and perhaps a size; by default that of the budget, spelt out."""
-    from pans.trainer.adaptive.options import AutomatonOptions, with_defaults
+def automaton_recipe(task: str, budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
+    """Return the options for a budget (`photons` or `clicks`) and what else is given; defaults of budget and task are spelt out."""
+    from pans.trainer.adaptive.options import AutomatonOptions, for_task, with_defaults
 
     options = AutomatonOptions(seed=seed, **budget)
     exposures, states = with_defaults(options, load_profile(PROFILE))
-    return replace(options, exposures=exposures, states=states)
+    return for_task(replace(options, exposures=exposures, states=states), task)
 
 
 def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
@@ -62,8 +63,8 @@ def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
         return None
     bundle, _ = load_bundle(path)
     found, wanted = bundle.provenance.get("options"), asdict(options)
-    # options that are newer than the bundle are at their defaults there; `pans train` adds threads and device
-    same = isinstance(found, dict) and wanted.items() <= (asdict(type(options)()) | found).items()
+    # what is newer than the bundle was not done in it, or at its default; `pans train` adds threads and device
+    same = isinstance(found, dict) and wanted.items() <= (asdict(type(options)()) | OLDER | found).items()
     same = same and bundle.provenance.get("profile") == PROFILE
     return bundle if same and bundle.automaton is not None else None
 
@@ -76,13 +77,16 @@ def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions) -> f
     check_cached_bundle(path)
     keep_freed_memory()
     started, profile, checkpoint = time.process_time(), load_profile(PROFILE), path.with_suffix(".checkpoint")
+    teacher = asked.cache / f"frontier-{task.name}-soft-targets.npz"  # of all seeds
 
     def said(progress: Any) -> None:
         if progress.done % 8 == 0:
             asked.report(f"{path.stem}: {progress.stage}, {progress.done} of {progress.steps}")
 
     goes_on = checkpoint.is_file()
-    trained = train_automaton(task, profile, options, checkpoint=checkpoint, resume=goes_on, report=said)
+    trained = train_automaton(
+        task, profile, options, checkpoint=checkpoint, resume=goes_on, report=said, teacher=teacher
+    )
     seconds = time.process_time() - started
     provenance: dict[str, Any] = {"command": "pans reproduce frontier", "options": asdict(options)}
     provenance |= {"training_seconds": round(seconds, 1)} if not goes_on else {}

@@ -115,9 +115,10 @@ def missing(rows: Rows) -> Rows:
 
 
 def commands(rows: Rows) -> Rows:
-    """Return the first row of each task and way that has a command of its own."""
-    first: dict[tuple[str, str], Row] = {}
+    """Return the first row of each task and way that has a command of its own; of automata, whose sizes differ, of each level."""
+    first: dict[tuple[str, str, float], Row] = {}
     for row in rows:
         if "command" in row:
-            first.setdefault((row["task"], row["way"]), row)
+            level = row["level"] if row["way"] in AUTOMATA else 0.0
+            first.setdefault((row["task"], row["way"], level), row)
     return list(first.values())

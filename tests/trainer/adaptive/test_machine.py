@@ -13,7 +13,7 @@ from trainings import random_machine
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
 from pans.trainer.adaptive.figures import figures
 from pans.trainer.adaptive.light import Bits, as_bits
-from pans.trainer.adaptive.machine import Sight, backward, brought, forward
+from pans.trainer.adaptive.machine import WRONG, Aim, Sight, backward, brought, forward
 from pans.trainer.adaptive.objects import Block
 from pans.trainer.adaptive.outcomes import no_click
 
@@ -71,37 +71,46 @@ def test_probability_of_no_click_is_the_runtimes(law):
     np.testing.assert_allclose(fall.numpy(), slope, rtol=2e-5, atol=1e-8)
 
 
-def loss_of(machine, sight, price):
+def loss_of(machine, sight, aim):
     passed = forward(machine, sight, GREY)
-    total = price * float(passed.photons().mean())
+    total = aim.price * float(passed.photons().mean())
+    total += aim.exposure_price * sum(float(step.alpha.sum()) for step in passed.steps) / len(GREY)
     for counts, leaves in zip(machine.counts, passed.leaves):
         log = torch.log(counts / counts.sum(dim=1, keepdim=True))
-        total -= float(((leaves @ ONE_HOT.T) * log).sum()) / len(GREY)
+        arrived = leaves @ ONE_HOT.T
+        total -= (1 - aim.decide) * float((arrived * log).sum()) / len(GREY)
+        wrong = arrived.sum() - arrived[torch.arange(len(counts)), counts.argmax(dim=1)].sum()
+        total += aim.decide * WRONG * float(wrong) / len(GREY)
     return total
+
+
+AIMS = [Aim(0.07), Aim(0.07, decide=1.0), Aim(0.05, 0.03, 0.6)]
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("floor", [0.0, 0.02])
-def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor):
-    machine, sight, price = random_machine(3), wide(law, floor), 0.07
-    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), price)
+@pytest.mark.parametrize("aim", AIMS)
+def test_gradient_of_grey_patterns_is_that_of_the_loss(law, floor, aim):
+    machine, sight = random_machine(3), wide(law, floor)
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
     step = 1e-6
     for level in machine.levels:
         gradient = level.light.root.grad.clone()
         for index in np.ndindex(*level.light.root.shape):
             there = level.light.root[index].item()
             level.light.root[index] = there + step
-            above = loss_of(machine, sight, price)
+            above = loss_of(machine, sight, aim)
             level.light.root[index] = there - step
-            below = loss_of(machine, sight, price)
+            below = loss_of(machine, sight, aim)
             level.light.root[index] = there
             assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_gradient_of_the_brightness_of_bits(shared):
-    machine, sight, price = random_machine(4, bits=True, shared=shared), wide(ClickLaw(0.01), 0.01), 0.05
-    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), price)
+@pytest.mark.parametrize("aim", AIMS)
+def test_gradient_of_the_brightness_of_bits(shared, aim):
+    machine, sight = random_machine(4, bits=True, shared=shared), wide(ClickLaw(0.01), 0.01)
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
     step = 1e-6
     tensors = {id(level.light.log_light): level.light.log_light for level in machine.levels}
     assert len(tensors) == (1 if shared else 3)
@@ -110,9 +119,9 @@ def test_gradient_of_the_brightness_of_bits(shared):
         for index in np.ndindex(*tensor.shape):
             there = tensor[index].item()
             tensor[index] = there + step
-            above = loss_of(machine, sight, price)
+            above = loss_of(machine, sight, aim)
             tensor[index] = there - step
-            below = loss_of(machine, sight, price)
+            below = loss_of(machine, sight, aim)
             tensor[index] = there
             assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
 

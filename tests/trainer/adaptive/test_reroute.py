@@ -12,7 +12,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import reroute as module
 from pans.trainer.adaptive.figures import figures
 from pans.trainer.adaptive.grow import GrowOptions, Growth
-from pans.trainer.adaptive.machine import Sight
+from pans.trainer.adaptive.machine import Sight, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
 from pans.trainer.adaptive.reroute import reroute
 
@@ -62,6 +62,32 @@ def test_nodes_without_an_edge_are_revived(grown, monkeypatch):
     assert reroute(machine, sight, blocks, PRICE).revived >= 7
     used = torch.bincount(machine.levels[3].successors.flatten(), minlength=8)
     assert bool((used > 0).all())
+
+
+DEAR = 0.03  # nats per exposure
+
+
+def test_walks_end_where_exposures_cost_more_than_they_bring(grown, monkeypatch):
+    machine, sight, blocks = grown
+    monkeypatch.setattr(module, "SURE", 0.0)
+
+    def dear():
+        return cost(machine, sight, blocks) + DEAR * figures(machine, sight, blocks).exposures
+
+    before, all_of_them = dear(), figures(machine, sight, blocks).exposures
+    found = reroute(machine, sight, blocks, PRICE, DEAR)
+    after, walked = dear(), figures(machine, sight, blocks)
+    assert all_of_them == pytest.approx(6.0, abs=1e-4)
+    assert found.stopped > 0
+    assert walked.exposures < 5.5
+    assert sum(len(counts) for counts in machine.counts[:-1]) == found.stopped
+    assert before - after > 0.9 * found.saved > 0.01  # what the sweep promised; revived leaves are counted anew later
+    first = next(number for number, counts in enumerate(machine.counts) if len(counts))
+    early = sum(float(forward(machine, sight, block.grey).leaves[first].sum()) for block in blocks)
+    counted = float(machine.counts[first].sum()) - len(machine.counts[first])  # and an object per leaf, for its doubts
+    assert counted == pytest.approx(
+        early, rel=0.05
+    )  # nothing before it moved after it; the sweep sees light in bfloat16
 
 
 def test_only_sure_gains_move_edges(grown, monkeypatch):

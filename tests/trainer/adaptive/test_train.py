@@ -2,6 +2,7 @@
 
 # ruff: noqa: E402  (what follows needs torch)
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -15,10 +16,12 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import PansError, PlanError, UsageError
 from pans.runtime.instrument.profile import load_profile, parse_profile
 from pans.trainer.adaptive.finished import Grid, to_grid
+from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
 from pans.trainer.adaptive.options import (
     AutomatonOptions,
     check_automaton_options,
     default_size,
+    for_task,
     price_at,
     states_at_most,
     with_defaults,
@@ -98,6 +101,66 @@ def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_p
     assert resumed == (stop_at > 7)  # the first state is kept after the first whole epoch of tuning
     np.testing.assert_array_equal(went_on.arrays.pattern_levels, trained.arrays.pattern_levels)
     np.testing.assert_array_equal(went_on.arrays.posteriors, trained.arrays.posteriors)
+
+
+def test_a_price_per_exposure_ends_walks_early(task, trained):
+    found = train_automaton(task, IDEAL, replace(SMALL, exposure_price=0.03))
+    bundle = export_bundle(found, task)
+    walked = measure_walks(bundle, task.test, IDEAL).figures()
+    whole = measure_walks(export_bundle(trained, task), task.test, IDEAL).figures()
+    assert whole.exposures_mean == pytest.approx(6.0)
+    assert walked.exposures_mean < 5.5
+    assert walked.exposures_mean == pytest.approx(found.held_back.exposures, rel=0.1)  # of 66 objects
+    assert walked.accuracy_mean > whole.accuracy_mean - 0.1
+    assert walked.photons_mean < 4.0 * 1.05
+
+
+def test_soft_targets_are_kept_and_go_on_from_a_checkpoint(task, tmp_path):
+    options, file, path = replace(SMALL, soft=1.0, teacher_epochs=3), tmp_path / "answers.npz", tmp_path / "checkpoint"
+    told = []
+
+    def stop(progress):
+        told.append(progress.stage)
+        if progress.stage == "grow":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_automaton(task, IDEAL, options, checkpoint=path, report=stop, teacher=file)
+    assert told == ["network"] * 3 + ["grow"]
+    stages = []
+    went_on = train_automaton(
+        task, IDEAL, options, checkpoint=path, resume=True, report=lambda p: stages.append(p.stage)
+    )
+    assert "network" not in stages
+    again = train_automaton(task, IDEAL, options, teacher=file, report=lambda p: stages.append(p.stage))
+    assert "network" not in stages
+    np.testing.assert_array_equal(went_on.arrays.posteriors, again.arrays.posteriors)
+    assert went_on.options.soft == 1.0
+    with pytest.raises(UsageError, match="another file"):
+        train_automaton(task, IDEAL, replace(options, teacher_epochs=4), teacher=file)
+
+
+def test_soft_targets_stand_for_the_labels_of_the_objects_to_fit_alone(task):
+    objects = TrainingObjects(task, IDEAL, 0, Augmentation())
+    answers = np.full((objects.n_fit, 4), 0.25, np.float32)
+    objects.soften(answers, 0.4)
+    (fitted,), (back,) = (made(10_000, torch.float32) for made in (partial(objects.epoch, 3), objects.held_back))
+    assert torch.allclose(fitted.one_hot.amax(dim=0), torch.tensor(0.7))
+    assert torch.allclose(fitted.one_hot.sum(dim=0), torch.tensor(1.0))
+    images = {image.tobytes(): label for image, label in zip(task.train.images, task.train.labels)}
+    shown = [images[grey.numpy().astype(np.uint8).tobytes()] for grey in fitted.grey]
+    assert fitted.one_hot.argmax(dim=0).tolist() == shown  # in the order of the epoch
+    assert set(back.one_hot.unique().tolist()) == {0.0, 1.0}
+    with pytest.raises(ValueError, match="answers"):
+        objects.soften(answers[1:], 1.0)
+
+
+def test_what_a_task_is_best_served_with_is_the_default_and_can_be_turned_off():
+    assert for_task(AutomatonOptions(), "fashion-mnist").soft == 0.5
+    assert for_task(AutomatonOptions(), "mnist").copies == 20
+    assert for_task(AutomatonOptions(), "cells") == replace(AutomatonOptions(), soft=0.0, copies=0)
+    off = AutomatonOptions(soft=0.0, copies=0)
+    assert for_task(off, "mnist") == for_task(off, "fashion-mnist") == off
 
 
 def test_a_checkpoint_of_other_options_is_refused(task, tmp_path):

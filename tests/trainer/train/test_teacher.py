@@ -1,0 +1,90 @@
+"""Soft targets: what the network learns, that its answers repeat, and the file they are kept in."""
+
+# ruff: noqa: E402  (what follows needs torch)
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from trainings import bars_task
+
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
+
+TAUGHT = Taught("0" * 64, 3, 2)
+TARGETS = np.array([[0.5, 0.25, 0.25], [0, 1, 0], [0.2, 0.2, 0.6]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def bars():
+    return bars_task(600).train
+
+
+@pytest.fixture(scope="module")
+def answers(bars):
+    return soft_targets(bars, 4, 12)
+
+
+def test_the_network_knows_its_objects_as_probabilities(bars, answers):
+    assert answers.shape == (len(bars), 4)
+    np.testing.assert_allclose(answers.sum(axis=1), 1.0, atol=1e-5)
+    assert (answers.argmax(axis=1) == bars.labels).mean() > 0.9  # by chance 0.25
+    assert 0.5 < answers.max(axis=1).mean() < 1.0
+
+
+def test_answers_repeat_and_leave_the_random_numbers_of_torch_alone(bars, answers):
+    torch.manual_seed(5)
+    wanted = torch.rand(3)
+    torch.manual_seed(5)
+    told = []
+    again = soft_targets(bars, 4, 12, lambda epoch, loss: told.append((epoch, loss)))
+    np.testing.assert_array_equal(again, answers)
+    assert torch.equal(torch.rand(3), wanted)
+    assert [epoch for epoch, _ in told] == list(range(12))
+    assert told[-1][1] < told[0][1] / 2
+
+
+def test_what_was_written_is_read(tmp_path):
+    path = tmp_path / "answers.npz"
+    write_targets(path, TARGETS, TAUGHT)
+    np.testing.assert_array_equal(read_targets(path, TAUGHT, 3), TARGETS)
+
+
+@pytest.mark.parametrize("other", [{"task": "1" * 64}, {"fitted": 4}, {"epochs": 3}])
+def test_answers_of_other_objects_are_refused(tmp_path, other):
+    path = tmp_path / "answers.npz"
+    write_targets(path, TARGETS, TAUGHT)
+    with pytest.raises(UsageError, match=r"answers\.npz holds Taught"):
+        read_targets(path, replace(TAUGHT, **other), 3)
+
+
+@pytest.mark.parametrize(
+    "unfit",
+    [TARGETS[:2], TARGETS[:, :2], TARGETS.astype(np.float64), TARGETS * 2, -TARGETS, TARGETS * np.nan],
+    ids=["objects", "classes", "type", "sums", "negative", "nan"],
+)
+def test_unfit_targets_are_refused(tmp_path, unfit):
+    path = tmp_path / "answers.npz"
+    write_targets(path, unfit, TAUGHT)
+    with pytest.raises(DamagedFileError, match="each row probabilities that sum to 1"):
+        read_targets(path, TAUGHT, 3)
+
+
+def damaged(path, kind):
+    if kind == "cut":
+        path.write_bytes(path.read_bytes()[:-40])
+    elif kind == "objects":  # what would run code when read
+        np.savez(path, task="0" * 64, fitted=3, epochs=2, targets=np.array([object()], dtype=object))
+    else:
+        np.savez(path, task="0" * 64, fitted=3, targets=TARGETS)
+
+
+@pytest.mark.parametrize("kind", ["cut", "objects", "field"])
+def test_a_damaged_file_is_refused(tmp_path, kind):
+    path = tmp_path / "answers.npz"
+    write_targets(path, TARGETS, TAUGHT)
+    damaged(path, kind)
+    with pytest.raises(DamagedFileError, match="no soft targets"):
+        read_targets(path, TAUGHT, 3)
