@@ -107,7 +107,7 @@ class LightService:
         return self._file(model, table.probability, table.photoelectrons.sum(axis=1))
 
     def _followed(self, light: PatternLight, model: DetectorModel, rows: NDArray[np.uint32]) -> U64:
-        from pans.firmware_sim.device.walk_kernels import expected_light
+        from pans.firmware_sim.device.walk_kernels import chances, expected_light
 
         states = States(rows[:, 0].astype(np.int64), rows[:, 1] / rows[:, 2], rows[:, 3:].astype(np.int64))
         n_objects = self._scene.n_objects
@@ -115,8 +115,9 @@ class LightService:
         probability, photons = np.empty((n_objects, len(rows) + 1)), np.empty(n_objects)
         for number in range(n_objects):
             photoelectrons = np.asarray(light.of(number)[states.pattern] * states.light)
-            probability[number] = first_click_probability(model, np.append(photoelectrons, 0.0))
-            photons[number] = expected_light(probability[number, :-1], photoelectrons, states.successors)
+            both = chances(model, np.append(photoelectrons, 0.0))
+            probability[number] = both[0]
+            photons[number] = expected_light(both[:, :-1], photoelectrons, states.successors)
         return self._file(model, probability, photons)
 
     def _named(self, light: PatternLight, model: DetectorModel, n_patterns: int) -> U64:
