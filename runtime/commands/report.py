@@ -1,6 +1,6 @@
-"""`pans report`: one self-contained HTML page of a recording or a bundle (extra `plot`).
+"""`pans report`: one self-contained HTML page of a recording or a bundle.
 
-Owns the command; the page is page_run.py's. The page loads nothing from elsewhere and runs nothing.
+Owns the command; the page is pages/run.py's. The page loads nothing from elsewhere and runs nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     check_outputs([args.out], inputs=[args.path], force=args.force)
-    from pans.runtime.report import page_of
+    from pans.runtime.pages import page_of
     from pans.runtime.report.verify import file_kind
 
     page = page_of(args.path)

@@ -13,18 +13,16 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .page_run import page_of
     from .summary import Summary, summarise
     from .verify import FileVerdict, verify_file
 
-__all__ = ["FileVerdict", "Summary", "page_of", "summarise", "verify_file"]
+__all__ = ["FileVerdict", "Summary", "summarise", "verify_file"]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "FileVerdict": ".verify",
         "Summary": ".summary",
-        "page_of": ".page_run",
         "summarise": ".summary",
         "verify_file": ".verify",
     },

@@ -173,7 +173,7 @@ def _words(cause: str, share: int, facts: Facts) -> str:
         "gc": "a garbage collection held the interpreter",
         "disk": "writing the recording did not return",
         "inference": "the decision back end computed",
-        "decode": "the loop was busy with its own work, reading messages or drawing the view,",
+        "decode": "the loop was busy with its own work, reading messages,",
         "link": "the host was awake and waited for bytes",
         "device": "the device had not sent the block",
     }[cause]

@@ -11,10 +11,8 @@ import pytest
 from commands import page_of, words_of
 
 from pans.runtime.cli import main
+from pans.runtime.pages.flow import _late_numbers, _pulses, _spread
 from pans.runtime.record import read_recording
-from pans.runtime.report.page_flow import _late_numbers, _pulses, _spread
-
-pytest.importorskip("matplotlib", reason="needs the plot extra")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +38,7 @@ def test_the_page_says_what_the_run_said(run: Path, tmp_path: Path) -> None:
     ):
         assert text in words
     assert "spread over trials" not in words
-    assert "Late and missing" not in words
+    assert "Late and missing work" not in words
 
 
 def test_a_cut_recording_still_tells_of_its_passages(run: Path, tmp_path: Path) -> None:
@@ -100,7 +98,7 @@ def test_late_decisions_stand_on_the_page_with_their_causes(
     events = list(recording.events())
     monkeypatch.setattr(type(recording), "events", lambda self: iter([*events, *extra]))
     words = words_of(page_of(run, tmp_path))
-    assert "Late and missing, by cause" in words
+    assert "Late and missing work, by cause" in words
     for text in ("gc", "it swept", "device", "it dropped them", "Late decisions over the run"):
         assert text in words
 

@@ -1,6 +1,6 @@
 """The report page's part on an automaton's walks: the tree of their first steps, their lengths, how sure their decisions were.
 
-Owns the sums behind the drawings, from recorded clicks and decisions; never draws (figures.py).
+Owns the sums behind the drawings, from recorded clicks and decisions; the tree is tree.py's.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.record import Recording
 
-from . import figures as draw
+from .bundle import outcomes
+from .charts import Axis, Bars, Chart, Curve, percent
 from .page import Page
-from .page_rates import Rates
+from .rates import Rates
+from .tree import Tree, TreeNode
 
 TREE_LEVELS = 4
 TREE_STATES = 15  # of a tree that can be looked at
@@ -32,22 +34,46 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
         page.text("No walk has come to its leaf.", "note")
         return
     nodes = _first_states(automaton)
-    pictures = bundle.pattern_levels[automaton.pattern[nodes]].astype(np.float64) / (bundle.levels - 1)
-    pictures *= (automaton.dwell[nodes] / automaton.dwell_steps)[:, None]
+    exposures = np.bincount(whole["exposures"], minlength=automaton.n_slots + 1)[1:]
     page.figure(
-        draw.tree(pictures.reshape(-1, *bundle.image_shape), _tree_of(automaton, nodes, rates)),
-        "The first steps of the walks, as the run went: each state's pattern (brightness times the time that it is on), which share of the "
-        "walks came there, and how often it clicked. Grey ways are those without a click, red ones those with one; where several meet, the "
-        "state is drawn once.",
+        tree_drawing(bundle, automaton, nodes, rates),
+        "The first steps of the walks, as the run went: each state's pattern (by its own brightest pixel), which share of the walks "
+        "came there, and how often it clicked. Solid ways are those after a click, dashed ones those without; where several "
+        "meet, the state is drawn once.",
+    )
+    page.table(
+        _meanings(automaton, nodes, bundle, rates),
+        ("state", "walks", "clicked", "most probable after a click", "without a click"),
     )
     page.figure(
-        draw.lengths(
-            np.bincount(whole["exposures"], minlength=automaton.n_slots + 1)[1:], np.bincount(whole["clicks"])
-        ),
+        _counted("exposures of a walk", exposures, 1),
         f"Exposures and clicks of {len(whole)} whole walks: {whole['exposures'].mean():.2f} exposures of {automaton.n_slots} at most, "
         f"{whole['clicks'].mean():.2f} clicks on average.",
     )
+    page.figure(_counted("clicks of a walk", np.bincount(whole["clicks"]), 0), "Clicks of the same walks.")
     _add_confidence(page, whole)
+
+
+def _counted(what: str, counts: NDArray[np.int64], first: int) -> Chart:
+    """How many walks had each number of something."""
+    edges = first + np.arange(len(counts) + 1) - 0.5
+    return Chart(
+        label=f"How many walks had each number of {what}",
+        x=Axis(what, float(edges[0]), float(edges[-1]), text=lambda value: f"{value:.0f}"),
+        y=Axis("walks", 0.0, 1.05 * max(int(counts.max(initial=0)), 1)),
+        bars=[Bars(edges, counts)],
+        height=170,
+    )
+
+
+def _meanings(automaton: Automaton, nodes: NDArray[np.int64], bundle: Bundle, rates: Rates) -> list[tuple[str, ...]]:
+    """What a click in each of the first states says: the most probable class after either outcome."""
+    rows = []
+    for node in _tree_of(automaton, nodes, rates):
+        clicked = "never shown" if np.isnan(node.rate) else f"{100 * node.rate:.1f} %"
+        said = [text.partition(": ")[2] for text in outcomes(automaton, node.state, bundle.classes)]
+        rows.append((str(node.state), f"{100 * node.share:.0f} %", clicked, *said))
+    return rows
 
 
 def _add_confidence(page: Page, whole: NDArray[np.void]) -> None:
@@ -61,9 +87,20 @@ def _add_confidence(page: Page, whole: NDArray[np.void]) -> None:
     bins = _reliability(known["probability"], known["label"] == known["truth"])
     error = sum(share * abs(accuracy - probability) for probability, accuracy, share in bins)
     page.figure(
-        draw.reliability(bins, f"{len(known)} decisions"),
+        _reliability_chart(bins),
         f"Share of right decisions against the probability that they stated ({said}). The difference, weighted by the decisions in each "
         f"bin, is {error:.3f}; so few decisions give about {_chance_error(bins, len(known)):.3f} by chance alone.",
+    )
+
+
+def _reliability_chart(bins: list[tuple[float, float, float]]) -> Chart:
+    probability, accuracy, _ = np.array(bins).T
+    return Chart(
+        label="Share of right decisions against the probability that they stated",
+        x=Axis("probability that the decision stated", 0.0, 1.0, text=percent),
+        y=Axis("share of right decisions", 0.0, 1.0, text=percent),
+        curves=[Curve([0.0, 1.0], [0.0, 1.0], "as sure as right", "b"), Curve(probability, accuracy, "decisions", "a")],
+        height=260,
     )
 
 
@@ -91,7 +128,13 @@ def _first_states(automaton: Automaton) -> NDArray[np.int64]:
     return nodes
 
 
-def _tree_of(automaton: Automaton, nodes: NDArray[np.int64], rates: Rates) -> list[draw.TreeNode]:
+def tree_drawing(bundle: Bundle, automaton: Automaton, nodes: NDArray[np.int64], rates: Rates) -> Tree:
+    """Return the tree of the first states with their patterns."""
+    pictures = bundle.pattern_levels[automaton.pattern[nodes]].astype(np.float64).reshape(-1, *bundle.image_shape)
+    return Tree(_tree_of(automaton, nodes, rates), pictures)
+
+
+def _tree_of(automaton: Automaton, nodes: NDArray[np.int64], rates: Rates) -> list[TreeNode]:
     place = {int(node): number for number, node in enumerate(nodes)}
     walks = max(float(rates.state_exposures[0]), 1.0)
     found = []
@@ -99,5 +142,5 @@ def _tree_of(automaton: Automaton, nodes: NDArray[np.int64], rates: Rates) -> li
         exposures, clicks = float(rates.state_exposures[node]), float(rates.state_clicks[node])
         leads = tuple(place.get(int(successor), -1) for successor in automaton.successors[node])
         rate = clicks / exposures if exposures else float("nan")
-        found.append(draw.TreeNode(node, int(automaton.depth[node]), exposures / walks, rate, leads))
+        found.append(TreeNode(node, int(automaton.depth[node]), exposures / walks, rate, leads))
     return found

@@ -1,6 +1,6 @@
 """The report page's part on objects that passed by: what they were worth, what became of pulses, what was late and why.
 
-Owns the sums behind these sections; the order of the page is page_run.py's, the drawings figures.py's. Figures come from a replay of
+Owns the sums behind these sections; the order of the page is run.py's. Figures come from a replay of
 the recorded messages, so that a recording that was cut, or one part of a longer one, has them too.
 """
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record import Recording
+from pans.runtime.report.words import flow_rows
 
-from . import figures as draw
-from .page import Page
-from .words import flow_rows
+from .charts import Axis, Bars, Chart, seconds
+from .page import CONFUSION_MAX, Page
 
 BINS = 60
 I64 = NDArray[np.int64]
@@ -45,22 +45,35 @@ def add_passages(page: Page, recording: Recording, bundle: Bundle | None) -> Non
         page.text(
             "This is one part of a run: objects whose truth came in the part before count as without one.", "note"
         )
-    if confusion.any() and len(bundle.classes) <= draw.CLASSES_MAX:
-        page.figure(
-            draw.confusion(confusion, bundle.classes),
-            f"{int(confusion.sum())} decisions about objects alone, without those that abstained; true class in rows.",
+    if confusion.any() and len(bundle.classes) <= CONFUSION_MAX:
+        caption = (
+            f"{int(confusion.sum())} decisions about objects alone, without those that abstained; true class in rows."
         )
+        page.confusion(confusion, bundle.classes, caption)
     decisions = recording.decisions()
     if len(decisions):
-        panels = {
-            "decisions": _outcomes(decisions),
-            "pulses": _spread(decisions, {k: v for k, v in pulses.items() if k != "asked"}),
-        }
         edges_s = _edges_s(decisions, int(recording.header["config"]["tick_hz"]))
         page.figure(
-            draw.over_time(edges_s, {name: rows for name, rows in panels.items() if rows}),
-            "Decisions by what became of them, and pulses, over the run. A pulse without a refusal counts as made.",
+            _stacked(edges_s, "decisions", _outcomes(decisions)), "Decisions by what became of them, over the run."
         )
+        made = _spread(decisions, {name: numbers for name, numbers in pulses.items() if name != "asked"})
+        if made:
+            caption = "Pulses over the run. A pulse without a refusal counts as made."
+            page.figure(_stacked(edges_s, "pulses", made), caption)
+
+
+def _stacked(edges_s: NDArray[np.float64], what: str, rows: Mapping[str, I64]) -> Chart:
+    """Counts per bin over time, one kind upon the other."""
+    base, bars = np.zeros(len(edges_s) - 1), []
+    for (name, counts), kind in zip(sorted(rows.items(), key=lambda row: -int(row[1].sum()))[:4], "abcd"):
+        bars.append(Bars(edges_s, counts, base.copy(), f"{name} ({int(counts.sum())})", kind))
+        base += counts
+    return Chart(
+        label=f"{what} over the run: " + ", ".join(f"{name} {int(counts.sum())}" for name, counts in rows.items()),
+        x=Axis("time since the first decision", float(edges_s[0]), float(edges_s[-1]), text=seconds),
+        y=Axis(f"{what} per {edges_s[1] - edges_s[0]:.3g} s", 0.0, 1.05 * max(float(base.max()), 1.0)),
+        bars=bars,
+    )
 
 
 def add_late(page: Page, recording: Recording) -> None:
@@ -77,7 +90,7 @@ def add_late(page: Page, recording: Recording) -> None:
         words.append((cause, str(event.get("why", ""))))
     if not late and not lost:
         return
-    page.heading("Late and missing, by cause")
+    page.heading("Late and missing work, by cause")
     rows = [(cause, late[cause], lost[cause]) for cause, _ in (late + lost).most_common()]
     page.table(rows, ("cause", "late decisions", "lost exposures"))
     if late:
@@ -86,7 +99,7 @@ def add_late(page: Page, recording: Recording) -> None:
         if len(decisions):
             edges_s = _edges_s(decisions, int(recording.header["config"]["tick_hz"]))
             page.figure(
-                draw.over_time(edges_s, {"late decisions": _spread(decisions, by_cause)}),
+                _stacked(edges_s, "late decisions", _spread(decisions, by_cause)),
                 "Late decisions over the run, by the cause that the evidence names.",
             )
     shown = dict(reversed(words))  # the first of each cause

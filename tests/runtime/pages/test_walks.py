@@ -12,10 +12,10 @@ from automata import automaton_bundle, random_automaton
 from commands import json_of, page_of, words_of
 
 from pans.runtime.bundle.model import write_bundle
+from pans.runtime.pages.rates import count_rates
+from pans.runtime.pages.walks import _first_states, _reliability, _tree_of
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.sent_plan import recorded_plan
-from pans.runtime.report.page_rates import count_rates
-from pans.runtime.report.page_walks import _first_states, _reliability, _tree_of
 from pans.runtime.wire.messages import DARK_PATTERN, MessageType, decode_clicks, unpack_body
 
 
@@ -62,7 +62,6 @@ def test_the_tree_tells_what_was_shown_and_what_clicked(recording: Recording) ->
 
 
 def test_the_page_has_the_walks(recording: Recording, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="needs the plot extra")
     words = words_of(page_of(recording.path, tmp_path))
     decisions = recording.decisions()
     assert f"{decisions['exposures'].mean():.2f} exposures of 6 at most" in words

@@ -1,0 +1,101 @@
+"""The page's part on what happened during a run: each event as a sentence, the raw records folded away.
+
+Owns the sentences; events are those of the recording, whose kinds stand in docs/reference/formats.md.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from pans.runtime.record import Recording
+
+from .page import Page
+
+SHOWN = 200
+OF_A_KIND = 30
+# kind -> sentence; what stands in braces are the event's own facts
+SENTENCES = {
+    "late": "Decision {decision} was late: {latency_us} us after the end of its exposure.",
+    "link_lost": "The device was lost: {reason}.",
+    "reconnected": "The device was found again after {outage_ms} ms ({attempts} attempts).",
+    "clock_step": "The device's clock jumped by {off_ns} ns at tick {tick}, more than the {allowed_ns} ns that its uncertainty allows.",
+    "beyond_plan": "Exposure {exposure_index} lies beyond the plan and was left out.",
+    "stream_end_unknown": "The stream ended without word of its end: from exposure {first_exposure} on some may be missing.",
+    "gap": "Exposures are missing: {exposures} from number {first_exposure} on.",
+    "fired": "A pulse for decision {decision} was made at tick {tick}. {refusal}",
+    "gate_sent": "A pulse was asked for decision {decision} at tick {tick}.",
+    "gate_refused": "The device refused the pulse for decision {decision}: {text}.",
+    "gate_expired": "The pulse for decision {decision} was not made in time: {text}.",
+    "actuator_lost": "The actuator was lost: {words}.",
+    "calibration_warning": "About the calibration: {words}.",
+    "dark_state": "Dark counts: {words}.",
+    "light_changed": "The light changed: {words}.",
+    "contradiction": "A message contradicts the evidence: {what}, found {found}, expected {expected}.",
+    "part_deleted": "The part {name} was deleted: {why}.",
+    "parts_trouble": "A part of the recording made trouble: {message}.",
+    "show_refused": "The device refused to show a state: {text}.",
+}
+
+
+def sentence_of(event: Mapping[str, Any]) -> str:
+    """Return an event as one sentence; of an unknown kind, or with facts missing, its facts in a row.
+
+    >>> sentence_of({"kind": "reconnected", "attempts": 2, "outage_ms": 812.345})
+    'The device was found again after 812 ms (2 attempts).'
+    """
+    kind = str(event.get("kind", "?"))
+    if kind == "blame":
+        return _blame(event)
+    try:
+        said = SENTENCES[kind].format_map({key: _plain(value) for key, value in event.items()})
+        return said.replace("..", ".").strip()
+    except (KeyError, IndexError, ValueError):
+        facts = ", ".join(f"{key} {_plain(value)}" for key, value in event.items() if key != "kind")
+        return f"{kind.replace('_', ' ')}{': ' if facts else ''}{facts}"
+
+
+def _blame(event: Mapping[str, Any]) -> str:
+    late = event.get("what") == "late"
+    what = f"{event.get('decisions', 1)} late decisions" if late else f"{event.get('exposures', 0)} missing exposures"
+    sure = "" if event.get("sure", True) else ", not surely"
+    return f"The cause of {what} is {event.get('cause', 'unknown')}{sure}: {event.get('why', '')}."
+
+
+def _plain(value: Any) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def add_events(page: Page, recording: Recording) -> None:
+    """Add the events: how many of each kind, the first as sentences, their records folded away."""
+    kinds: Counter[str] = Counter()
+    shown: list[Mapping[str, Any]] = []
+    for event in recording.events():
+        kind = str(event.get("kind", "?"))
+        kinds[kind] += 1
+        if len(shown) < SHOWN and kinds[kind] <= OF_A_KIND and kind != "session":
+            shown.append(event)
+    page.heading("Events")
+    noted = sum(kinds.values()) - kinds["session"]
+    if not noted:
+        page.text("Nothing out of the ordinary was noted.")
+        return
+    page.text(
+        "Noted during the run: " + ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in kinds.most_common()) + "."
+    )
+    sentences = [sentence_of(event) for event in shown]
+    page.sentences(sentences[:20])
+    if len(sentences) > 20:
+        with page.folded(f"{len(sentences) - 20} more"):
+            page.sentences(sentences[20:])
+    if noted > len(shown):
+        page.text(
+            f"{len(shown)} of {noted} are shown, the first {OF_A_KIND} of a kind at most; `pans export` writes them all.",
+            "note",
+        )
+    with page.folded("The records as they were written"):
+        rows = [(str(e.get("kind")), ", ".join(f"{k} {v}" for k, v in e.items() if k != "kind")) for e in shown]
+        page.table(rows, ("event", "what was noted"))

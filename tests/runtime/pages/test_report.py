@@ -1,0 +1,235 @@
+"""Report pages: self-contained, escaped, and every figure on them that of the recording."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from automata import automaton_bundle, random_automaton
+from browser import browser, clipped, console, look, picture, serious
+from commands import fixed_run, page_of, words_of
+
+from pans.runtime.bundle.model import load_bundle, write_bundle
+from pans.runtime.cli import main
+from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.intervals import wilson_interval
+from pans.runtime.pages.charts import Axis
+from pans.runtime.pages.events import sentence_of
+from pans.runtime.pages.page import Page, flat
+from pans.runtime.pages.pixels import heat_png, png
+from pans.runtime.pages.rates import count_rates
+from pans.runtime.pages.results import accuracy_bins
+from pans.runtime.pages.timing import survival
+from pans.runtime.pages.verdict import advice_on
+from pans.runtime.record import read_recording
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.sent_plan import recorded_plan
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    assert main([*fixed_run(200), "--out", str(folder)]) == 0
+    return folder / "run.pansrec"
+
+
+def test_a_recording_s_page(demo: Path, tmp_path: Path) -> None:
+    page = page_of(demo, tmp_path)
+    words = words_of(page)
+    summary = read_recording(demo).summary
+    assert "SIMULATED" in words
+    for text in (f"{100 * summary['accuracy']:.2f} %", *(f"{summary[k]:.3f}" for k in ("clicks_mean", "photons_mean"))):
+        assert text in words
+    error = 1.959964 * summary["accuracy_stderr_objects"]
+    ends = [100 * (summary["accuracy"] + sign * error) for sign in (-1, 1)]
+    assert f"95 % interval {ends[0]:.2f} to {ends[1]:.2f} %" in words
+    assert summary["decisions_sha256"] in words
+    assert "All 200 decisions were made within 16.667 ms, no exposure was lost" in words
+    sections = ("Accuracy over time", "Decisions by class", "Patterns, and what a click on each means", "Latency")
+    for section in (*sections, "Clicks over time", "Dark counts", "Clock", "Events", "What was run"):
+        assert f"<h2>{section}</h2>" in page
+    assert len(page) < 1_000_000
+    outside = re.findall(r'(?:src|href)="(?!data:)[^"]*"|url\(|<script|@import', page)
+    assert outside == []
+
+
+def test_the_confusion_on_the_page_is_that_of_the_decisions(demo: Path, tmp_path: Path) -> None:
+    rows = read_recording(demo).decisions()
+    table = re.search(r'<table class="confusion">.*?</table>', page_of(demo, tmp_path), re.DOTALL)
+    assert table is not None
+    cells = [int(text or 0) for text in re.findall(r"<td[^>]*>(\d*)</td>", table[0])]
+    expected = np.zeros((10, 10), int)
+    for row in rows:
+        expected[row["truth"], row["label"]] += 1
+    assert cells == expected.ravel().tolist()
+
+
+def test_stretches_of_the_accuracy_hold_every_decision_once() -> None:
+    rows = np.zeros(300, DECISION_DTYPE)
+    rows["object"], rows["tick"] = np.arange(300) // 3, 1000 + 10 * np.arange(300)
+    rows["truth"] = np.where(np.arange(300) < 30, -1, 1)
+    rows["label"] = np.where(np.arange(300) < 165, 0, 1)
+    bins = accuracy_bins(rows, 100.0)
+    assert bins.objects.tolist() == [23, 24, 23, 23]
+    assert bins.accuracy[[0, 1, 3]].tolist() == [0.0, 0.0, 1.0]
+    assert bins.low[3] == wilson_interval(23, 23)[0]
+    assert (bins.low <= bins.accuracy).all()
+    assert (bins.accuracy <= bins.high).all()
+    assert 0 < bins.seconds[0] < bins.seconds[-1] < 30.0
+
+
+def test_what_a_click_means_is_counted_by_true_class(demo: Path) -> None:
+    recording = read_recording(demo)
+    plan = recorded_plan(recording)
+    rates, clicks = count_rates(recording, plan, 10), click_list(recording, plan)
+    truth = {int(row["object"]): int(row["truth"]) for row in recording.decisions()}
+    lit = clicks.pattern < plan.n_patterns
+    expected = np.zeros((plan.n_patterns, 10))
+    for pattern, number in zip(clicks.pattern[lit], clicks.object[lit]):
+        expected[pattern, truth[int(number)]] += 1
+    assert rates.class_clicks.tolist() == expected.tolist()
+    assert (rates.class_exposures.sum(axis=1) == recording.n_decisions).all()
+
+
+def test_the_latency_curve_is_the_share_of_longer_ones() -> None:
+    values = np.random.default_rng(1).lognormal(4, 1, 5000)
+    times, share = survival(values)
+    assert share[-1] == 1 / 5000
+    assert times[-1] == values.max()
+    for at, part in zip(times[::40], share[::40]):
+        assert part == pytest.approx((values >= at).mean())
+
+
+def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
+    assert sentence_of({"kind": "late", "decision": 7, "latency_us": 23456.0}) == (
+        "Decision 7 was late: 23,456 us after the end of its exposure."
+    )
+    assert sentence_of({"kind": "gap", "exposures": 3}) == "gap: exposures 3"
+    assert sentence_of({"kind": "strange_thing", "x": "{y}"}) == "strange thing: x {y}"
+    blame = {
+        "kind": "blame",
+        "what": "missing",
+        "exposures": 40,
+        "cause": "device",
+        "sure": False,
+        "why": "it dropped them",
+    }
+    assert sentence_of(blame) == "The cause of 40 missing exposures is device, not surely: it dropped them."
+
+
+def test_every_fault_has_advice() -> None:
+    faults = (
+        "3 decisions later than 2 ms (cause: host 3)",
+        "40 exposures lost in 1 gaps, 40 of them dropped by the device",
+        "the device was lost and found again 2 times",
+        "the link was lost: the device fell silent",
+        "2 messages contradict the evidence: malformed 2",
+        "5 exposures showed another pattern than planned",
+        "6 slots stayed dark because the host named their state too late; the longest turn took 900 us",
+        "4 decisions abstained",
+        "10 of 20 decisions were made; the run ended: time is up",
+    )
+    advice = [advice_on(fault) for fault in faults]
+    assert all(advice)
+    assert len(set(advice)) == len(faults)
+    assert advice_on("something new") == ""
+
+
+def test_ticks_are_round_inside_and_few() -> None:
+    for low, high in ((0.0, 45.5), (-3.2, 3.2), (0.0, 1.0), (0.0, 7e-4), (0.0, 0.0)):
+        for most in (3, 5, 8):
+            ticks = Axis("", low, high).ticks(most)
+            assert 1 <= len(ticks) <= most + 2
+            assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
+    assert Axis("", 0.0, 45.5).ticks(3) == [0.0, 20.0, 40.0]
+    assert Axis("", 1.0, 3e5, log=True).ticks(8) == [1.0, 10.0, 100.0, 1e3, 1e4, 1e5]
+
+
+def test_pictures_are_pngs_with_the_pixels_that_were_given() -> None:
+    image = pytest.importorskip("PIL.Image", reason="needs Pillow")
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    assert np.asarray(image.open(io.BytesIO(png(grey)))).tolist() == grey.tolist()
+    heat = np.asarray(image.open(io.BytesIO(heat_png([[0.0, np.nan, 2.0]], 0.0, 2.0))).convert("RGBA"))
+    assert heat[0, 1, 3] == 0
+    assert heat[0, [0, 2], 3].tolist() == [255, 255]
+    assert heat[0, 0, :3].sum() > heat[0, 2, :3].sum()
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_page_in_a_browser(demo: Path, tmp_path: Path, dark: bool) -> None:
+    place = tmp_path / "page.html"
+    page_of(demo, tmp_path)
+    with browser(tmp_path) as driver:
+        look(driver, 1280, dark=dark)
+        driver.get(place.as_uri())
+        for width, form in ((1280, "wide"), (390, "narrow")):
+            look(driver, width, dark=dark)
+            picture(driver, tmp_path / f"page-{width}.png")
+            assert clipped(driver) == []
+            shown = (
+                "return [...document.querySelectorAll('figure > div')].filter(e => e.offsetWidth).map(e => e.className)"
+            )
+            assert set(driver.execute_script(shown)) == {form, "scroll"}
+            assert serious(driver) == []
+        assert console(driver) == []
+
+
+def test_the_rates_are_those_of_the_clicks(demo: Path) -> None:
+    recording = read_recording(demo)
+    plan = recorded_plan(recording)
+    rates, clicks = count_rates(recording, plan), click_list(recording, plan)
+    assert rates.exposures.sum() + rates.dark_exposures.sum() == clicks.exposures
+    lit = clicks.pattern[clicks.pattern < plan.n_patterns]
+    assert rates.clicks.sum(axis=0).tolist() == np.bincount(lit, minlength=plan.n_patterns).tolist()
+    assert rates.dark_exposures.sum() == plan.dark_slots_per_cycle * recording.n_decisions
+    assert (rates.exposures.sum(axis=0) == recording.n_decisions).all()
+
+
+def test_a_cut_recording_s_page_says_so(demo: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.pansrec").write_bytes(demo.read_bytes()[:-300])
+    assert "INCOMPLETE" in words_of(page_of(tmp_path / "cut.pansrec", tmp_path))
+
+
+def test_a_bundle_s_page(demo: Path, tmp_path: Path) -> None:
+    bundle = read_recording(demo).bundle()
+    digest = write_bundle(bundle, tmp_path / "a.pans")
+    page = page_of(tmp_path / "a.pans", tmp_path)
+    assert digest in words_of(page)
+    assert page.count("data:image/png") == bundle.n_patterns
+    assert load_bundle(tmp_path / "a.pans")[0].name in page
+
+
+def test_a_stranger_s_text_stays_text() -> None:
+    page = Page("<b>\x1b[2J", simulated=False)
+    page.facts({"<script>": "a & b", "inner": {"x": 1.23456789}, "none": None})
+    page.table([("x", '"><img src=http://a>')])
+    text = page.html().decode()
+    assert "<script" not in text
+    assert "<img" not in text
+    assert "\x1b" not in text
+    assert "inner.x" in text
+    assert dict(flat({"a": {"b": [1, 2]}})) == {"a.b": "1, 2"}
+
+
+def test_a_profile_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "ideal", "-o", str(tmp_path / "a.html")]) == 2
+    assert "pans info" in capsys.readouterr().err
+
+
+def test_an_automaton_s_page(tmp_path: Path) -> None:
+    write_bundle(automaton_bundle(random_automaton(2, slots=6, patterns=9)), tmp_path / "a.pans")
+    page = page_of(tmp_path / "a.pans", tmp_path)
+    words = words_of(page)
+    assert "<h2>Automaton</h2>" in page
+    for text in (
+        "exposures_longest",
+        "states_of_most_used_patterns",
+        "Every walk begins in state 0",
+        "leaf_probability_median",
+    ):
+        assert text in words
+    assert "click: " in words
+    assert "no click: " in words
