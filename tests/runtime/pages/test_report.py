@@ -71,7 +71,7 @@ def test_stretches_of_the_accuracy_hold_every_decision_once() -> None:
     rows = np.zeros(300, DECISION_DTYPE)
     rows["object"], rows["tick"] = np.arange(300) // 3, 1000 + 10 * np.arange(300)
     rows["truth"] = np.where(np.arange(300) < 30, -1, 1)
-    rows["label"] = np.where(np.arange(300) < 165, 0, 1)
+    rows["label"] = np.where(np.arange(300) < 166, 0, 1)
     bins = accuracy_bins(rows, 100.0)
     assert bins.objects.tolist() == [23, 24, 23, 23]
     assert bins.accuracy[[0, 1, 3]].tolist() == [0.0, 0.0, 1.0]
