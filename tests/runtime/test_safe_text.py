@@ -17,7 +17,7 @@ from nasty import NASTY
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import cli, safe_text
 from pans.runtime.errors import UsageError
-from pans.runtime.report.page import Page
+from pans.runtime.pages.page import Page
 
 nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
 
