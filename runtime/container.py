@@ -124,12 +124,12 @@ def open_regular(path: str | Path) -> BinaryIO:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (OSError, ValueError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else error
-        raise UsageError(f"{path}: cannot be read: {reason}") from error
+        raise UsageError(f"{path}: cannot be read: {reason}", remedy="check the path and its permissions") from error
     mode = os.fstat(handle).st_mode
     if not stat.S_ISREG(mode):
         os.close(handle)
         kind = next((words for test, words in _NO_FILES.items() if test(mode)), "no file")
-        raise UsageError(f"{path}: cannot be read: it is {kind}, allowed: a regular file")
+        raise UsageError(f"{path}: cannot be read: it is {kind}, allowed: a regular file", remedy="name a file")
     return os.fdopen(handle, "rb")
 
 
@@ -151,7 +151,7 @@ def read_file(path: str | Path, max_bytes: int = FILE_MAX_BYTES) -> bytes:
                 raise DamagedFileError(f"{path}: {size} bytes, allowed at most {max_bytes}")
             data = file.read(max_bytes + 1)  # the file may grow meanwhile
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy="check the disk") from error
     if len(data) > max_bytes:
         raise DamagedFileError(f"{path}: more than {max_bytes} bytes")
     return data

@@ -38,7 +38,7 @@ class PansError(Exception):
 class UsageError(PansError):
     """A command or an argument that makes no sense."""
 
-    usual_remedy = "`pans help COMMAND` lists what is allowed"
+    usual_remedy = "`pans help COMMAND` explains the options"
 
 
 class ConfigError(PansError):

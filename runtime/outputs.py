@@ -76,7 +76,8 @@ def file_identity(path: str | Path) -> tuple[object, ...]:
             found = folder.stat()
             return found.st_dev, found.st_ino, *real.relative_to(folder).parts
     except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links that point at each other
-        raise UsageError(f"{path}: not a usable path: {getattr(error, 'strerror', None) or error}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"{path}: not a usable path: {reason}", remedy="choose another name") from error
 
 
 def refuse_existing(path: Path) -> UsageError:
@@ -112,7 +113,10 @@ def _check_writable(folder: Path) -> None:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         os.unlink(probe)
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be written to: {error.strerror or error}") from error
+        raise UsageError(
+            f"{folder}: cannot be written to: {error.strerror or error}",
+            remedy="choose a folder that can be written to",
+        ) from error
 
 
 # ---- creating ----
@@ -158,7 +162,10 @@ def whole_file(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     except FileExistsError as error:
         raise refuse_existing(target) from error
     except OSError as error:
-        raise UsageError(f"{target}: cannot be written: {error.strerror or error}") from error
+        raise UsageError(
+            f"{target}: cannot be written: {error.strerror or error}",
+            remedy="make room on that disk, or choose another place",
+        ) from error
     sync_folder(target.parent)
 
 
@@ -190,7 +197,10 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{folder}: the folder cannot be made: {error.strerror or error}") from error
+        raise UsageError(
+            f"{folder}: the folder cannot be made: {error.strerror or error}",
+            remedy="choose a place that can be written to",
+        ) from error
     for one in reversed(made):
         sync_folder(one.parent)
 

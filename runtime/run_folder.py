@@ -39,7 +39,9 @@ def new_run_folder(name: str, root: Path = RUNS) -> Path:
             number += 1
             folder = first.with_name(f"{first.name}-{number}")
         except OSError as error:
-            raise UsageError(f"{folder}: the folder cannot be made: {error.strerror or error}") from error
+            raise UsageError(
+                f"{folder}: the folder cannot be made: {error.strerror or error}", remedy="choose a place with --out"
+            ) from error
     _point(root / LATEST, folder.name)
     return folder
 
@@ -80,7 +82,9 @@ def locked(path: Path) -> Iterator[None]:
         _sign(path, handle)
     except OSError as error:
         _close(handle)
-        raise UsageError(f"{path}: cannot be locked: {error.strerror or error}") from error
+        raise UsageError(
+            f"{path}: cannot be locked: {error.strerror or error}", remedy="choose another folder with --out"
+        ) from error
     except UsageError:
         _close(handle)
         raise

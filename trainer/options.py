@@ -63,6 +63,7 @@ class Options:
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
 
 
+LIGHT_MAX = 1e9  # photoelectrons, clicks or weights: beyond, nothing can be drawn or trained
 LIMITS = {
     "features": (1, 4096),
     "epochs": (1, 100_000),
@@ -93,10 +94,10 @@ def check_options(options: Options, profile: Profile) -> None:
             raise UsageError(f"{_flag(name)} is {getattr(options, name)!r}, allowed: {', '.join(allowed)}")
     for name in ("alpha", "photons", "clicks", "light", "input_photons"):
         value = getattr(options, name)
-        if value is not None and not (math.isfinite(value) and (value > 0 or (name == "alpha" and value == 0))):
-            raise UsageError(f"{_flag(name)} is {value}, allowed: finite and above 0")
-    if options.dark is not None and not 0 <= options.dark < math.inf:
-        raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
+        if value is not None and not (value <= LIGHT_MAX and (value > 0 or (name == "alpha" and value == 0))):
+            raise UsageError(f"{_flag(name)} is {value:g}, allowed: above 0, at most {LIGHT_MAX:g}")
+    if options.dark is not None and not 0 <= options.dark <= LIGHT_MAX:
+        raise UsageError(f"--dark is {options.dark:g}, allowed: 0 to {LIGHT_MAX:g}")
     _check_together(options)
     _check_fits(options, profile)
 

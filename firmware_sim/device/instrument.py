@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.light import Table
-from pans.firmware_sim.scene.moving import SceneFile
+from pans.firmware_sim.scene.moving import SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.link.scene_fit import scene_facts
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.automata import Extension, announcement, unpack_masks, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
@@ -251,6 +252,7 @@ class Instrument:
         return (
             passive
             | automata
+            | _scene_facts(scene)
             | {
                 "firmware": FIRMWARE,
                 "serial": f"SIM-{self.view.seed & U32:08X}",
@@ -386,3 +388,13 @@ class Instrument:
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)
+
+
+def _scene_facts(scene: SceneFile) -> dict[str, Any]:
+    """Return what WELCOME says of the scene's images; a target has any size, and what moves has its own."""
+    if isinstance(scene.what, Tape):
+        return {}
+    if not isinstance(scene.what, Scene):
+        return scene_facts(None, scene.what.objects.classes)
+    height, width = scene.what.images.shape[1:]
+    return scene_facts(None if (height, width) == (1, 1) else (height, width), scene.what.classes)

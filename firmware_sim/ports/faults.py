@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pans.runtime.container import open_regular
 from pans.runtime.errors import ConfigError, UsageError
 
 MAX_FILE_BYTES = 1 << 16
@@ -147,7 +148,7 @@ def _nanoseconds(name: str, word: str, where: str) -> int:
 
 def _file_pairs(path: Path) -> list[tuple[str, str]]:
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             data = file.read(MAX_FILE_BYTES + 1)
         table = tomllib.loads(data.decode("utf-8")) if len(data) <= MAX_FILE_BYTES else None
     except OSError as error:

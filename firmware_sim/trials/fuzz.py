@@ -30,6 +30,7 @@ from pans.firmware_sim.testing import following_profile, small_setup
 from pans.runtime.cli import say
 from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError
+from pans.runtime.ranges import Range
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
@@ -307,14 +308,32 @@ def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:
 class Settings:
     """How much to send, divided over how many seeds."""
 
-    bytes: int = option(100_000_000, "random bytes (default 100 million)")
-    frames: int = option(1_000_000, "structured frames (default one million)")
-    files: int = option(0, "instead of those: changed files with right checksums, verified and used")
-    fields: int = option(0, "instead of those: whole sessions in which a field says something else")
+    bytes: int = option(
+        100_000_000, type=Range(0, 10**15, whole=True).option, help="random bytes (default 100 million)"
+    )
+    frames: int = option(
+        1_000_000, type=Range(0, 10**12, whole=True).option, help="structured frames (default one million)"
+    )
+    files: int = option(
+        0,
+        type=Range(0, 10**9, whole=True).option,
+        help="instead of those: changed files with right checksums, verified and used",
+    )
+    fields: int = option(
+        0,
+        type=Range(0, 10**9, whole=True).option,
+        help="instead of those: whole sessions in which a field says something else",
+    )
     over: str = option("virtual", "the link of --fields: virtual, or tcp in real time", choices=("virtual", "tcp"))
-    jobs: int = option(1, "processes that run sessions of --fields side by side (default 1)")
-    seed: int = option(1, "the first seed (default 1)")
-    parts: int = option(20, "seeds that the work is divided over (default 20)")
+    jobs: int = option(
+        1,
+        type=Range(1, 256, whole=True).option,
+        help="processes that run sessions of --fields side by side (default 1)",
+    )
+    seed: int = option(1, type=Range(0, (1 << 63) - 1, whole=True).option, help="the first seed (default 1)")
+    parts: int = option(
+        20, type=Range(1, 10**6, whole=True).option, help="seeds that the work is divided over (default 20)"
+    )
 
 
 def run(settings: Settings) -> Report:

@@ -28,6 +28,7 @@ class _Voice:
     as_json: bool = False
     said: bool = False  # anything at all
     answered: bool = False  # on stdout
+    command: str = ""
 
 
 _voice = _Voice()
@@ -39,6 +40,7 @@ def begin(words: list[str]) -> None:
     _voice.verbose = bool({"-v", "--verbose"} & {*words})
     _voice.as_json = "--json" in words
     _voice.said = _voice.answered = False
+    _voice.command = next((word for word in words if not word.startswith("-")), "")
 
 
 def has_said() -> bool:
@@ -80,7 +82,7 @@ def emit(args: argparse.Namespace, payload: Mapping[str, Any], text: str = "") -
 
 def fail(error: PansError, exit_code: int) -> int:
     """Print an error on stderr, with `--json` also as one object on stdout unless the answer is there; return `exit_code`."""
-    advice = error.remedy or error.usual_remedy
+    advice = error.remedy or error.usual_remedy.replace("COMMAND", one_line(_voice.command, 20) or "COMMAND")
     remedy = f"\n  remedy: {one_line(advice)}" if advice else ""
     # no line of a message can pass for one of ours
     _print_error(f"pans: {error.message}".replace("\n", "\n    ") + remedy, logging.ERROR)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
+from pans.runtime.errors import UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
@@ -53,6 +54,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bench.rows import BenchOptions, machine_facts, table_text, write_plot
 
+    _check_used(args)
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.frames, args.load, args.quick)
     if args.plot is not None:
         check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)
@@ -71,6 +73,19 @@ def _run(args: argparse.Namespace) -> int:
     text = "\n".join(f"{key:<16} {value}" for key, value in machine.items())
     emit(args, {"machine": machine, "rows": rows}, f"{text}\n\n{table_text(rows)}")
     return EXIT_FINE
+
+
+def _check_used(args: argparse.Namespace) -> None:
+    """Refuse options that the chosen benchmark would not use."""
+    uses = {"bundle": "decide", "inputs": "decide", "load": "loop", "frames": "ingest"}
+    for option, of in uses.items():
+        if getattr(args, option) and args.what not in (of, "all"):
+            raise UsageError(f"--{option} has no effect on `pans bench {args.what}`", remedy=f"it belongs to {of}")
+    if args.inputs and len(args.inputs) != len(args.bundle):
+        raise UsageError(
+            f"{len(args.inputs)} times --inputs and {len(args.bundle)} times --bundle",
+            remedy="give one --inputs for each --bundle",
+        )
 
 
 def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:

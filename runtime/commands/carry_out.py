@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.link.base import open_link
-from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, Stop, stop_signals
+from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
 
 from .job import Job, recording_header, what_was_run
 from .run_files import check_run_files, claimed
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.link.base import Link
-    from pans.runtime.live import LiveCore, Recovery, RunConfig, RunResult
+    from pans.runtime.live import LiveCore, LiveRun, Recovery, RunConfig, RunResult
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
@@ -250,7 +250,7 @@ def _watched(
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
-    from pans.runtime.live import LiveRun, Observers, run_live
+    from pans.runtime.live import Observers, run_live
     from pans.runtime.watch import Attendants
 
     dark, monitor = ready.dark, beside.monitor
@@ -259,6 +259,7 @@ def _watched(
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
+            _name_scene(run, job.device)
             seen.prepared(run)
             monitor.prepared(run)
             if ready.flow_run is not None:
@@ -289,6 +290,14 @@ def _facts(job: Job, ready: _Prepared, link: Link) -> dict[str, Any]:
         trials=job.trials,
         illumination=bundle.illumination() * job.shots * (1 if job.flow is None else job.flow.pool),
     )
+
+
+def _name_scene(run: LiveRun, device: str) -> None:
+    from pans.runtime.link.scene_fit import scene_words
+
+    welcome = run.connection.session.welcome
+    if welcome is not None and (words := scene_words(welcome.facts, device)):
+        say(f"pans: {words}")
 
 
 def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
@@ -346,7 +355,7 @@ def _exit_code(summary: Summary) -> int:
         return EXIT_INTERRUPTED
     if summary.ended == DISK_NEARLY_FULL:
         return EXIT_ALERT
-    if summary.link_lost:
+    if summary.link_lost or summary.ended.startswith(REFUSED):
         return EXIT_DEVICE
     if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions:
         return EXIT_TIMING

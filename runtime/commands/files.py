@@ -68,6 +68,10 @@ def _verdict_lines(verdict: FileVerdict) -> Iterator[str]:
     yield f"{word:<8}  {verdict.kind:<9}  {verdict.path}"
     yield from (f"          violation: {text}" for text in verdict.violations)
     yield from (f"          alert: {text}" for text in verdict.alerts)
+    if verdict.damaged:
+        yield f"          remedy: {DamagedFileError.usual_remedy}"
+    elif verdict.violations:
+        yield "          remedy: do not rely on this file; make it again with the present version"
 
 
 # ---- info ----

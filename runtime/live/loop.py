@@ -22,19 +22,20 @@ from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
-from pans.runtime.errors import LinkError, RecordingError
+from pans.runtime.errors import DeviceError, LinkError, RecordingError
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection, check_device
+from pans.runtime.link.scene_fit import check_scene
 from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 
 from .config import RunConfig, RunResult
-from .continuous import INTERRUPTED, Stop
-from .reconnect import Recovery, reconnect_run
+from .continuous import INTERRUPTED, REFUSED, Stop
+from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 
 NS_PER_S = 1_000_000_000
@@ -115,6 +116,7 @@ def open_session(
     try:
         facts = connection.handshake().facts
         check_device(facts, plan, bundle, tick_hz)
+        check_scene(facts, bundle)
         connection.upload(plan, bundle)
         connection.synchronise()
         connection.decoder.use_kernels()
@@ -128,7 +130,7 @@ def open_session(
 def _until_ended(
     run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], observers: Observers
 ) -> None:
-    stop = observers.stop or Stop()
+    stop, refusals = observers.stop or Stop(), Refusals()
     while not run.ended:
         try:
             stop.polled = True
@@ -137,7 +139,9 @@ def _until_ended(
             stop.polled = False
         except LinkError as error:
             stop.polled = False
-            if recovery is None:
+            if isinstance(error, DeviceError) and refusals.again(run, error):
+                run.ended = f"{REFUSED}{error.message}"
+            elif recovery is None:
                 run.lose_link(error)
             else:
                 reconnect_run(run, error, recovery, prepare)

@@ -7,6 +7,7 @@ which is the core's. `reconnect` returns a connection that has been prepared ane
 from __future__ import annotations
 
 import gc
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -80,6 +81,20 @@ def reconnect(
             error = failure
     link.close()
     raise LinkError(f"{error.message} ({attempts} attempts in {recovery.give_up_s:g} s)", remedy=error.remedy)
+
+
+class Refusals:
+    """What the device refused last. The same refusal without progress in between ends a run: asking again would change nothing."""
+
+    def __init__(self) -> None:
+        self._latest: tuple[str | int, ...] = ()
+
+    def again(self, run: LiveRun, error: DeviceError) -> bool:
+        """Whether the device has refused the same since the run last made progress."""
+        words = re.sub(r"command \d+", "command", error.message)
+        now = (words, run.core.tracker.counters.exposures, run.tally.decisions)
+        again, self._latest = now == self._latest, now
+        return again
 
 
 def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Callable[[Link], Connection]) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pans.trainer.baselines.common import Report
     from pans.trainer.tasks.registry import Task
 
+DARK_MAX = 1e9  # as many as light; beyond, Poisson numbers cannot be drawn
 DEFAULT_PHOTONS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0)
 
 
@@ -126,8 +127,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(
             "--information is allowed with --method bayes, --detector counting and --brightness source only"
         )
-    if not 0 <= args.dark < math.inf:
-        raise UsageError(f"--dark is {args.dark:g}, allowed: finite and at least 0")
+    if not 0 <= args.dark <= DARK_MAX:
+        raise UsageError(f"--dark is {args.dark:g}, allowed: 0 to {DARK_MAX:g}")
 
 
 def _options(args: argparse.Namespace) -> BaselineOptions:

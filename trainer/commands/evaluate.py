@@ -78,6 +78,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
     if args.shots < 1 or args.seed < 0:
         raise UsageError(f"--shots is {args.shots}, --seed is {args.seed}, allowed: from 1, from 0")
+    if args.data_seed is not None and args.data_seed < 0:
+        raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
     if args.pictures is not None:
         outputs = [args.pictures / name for name in PICTURE_FILES]
         check_outputs(outputs, inputs=[args.bundle, args.task, args.profile], force=args.force, makes_folders=True)

@@ -20,6 +20,7 @@ from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 PAGES = (*paper.PAGES, *frontier.NAMES)
 SEEDS_MAX = 100
+THREADS_MAX = 1024
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
@@ -48,6 +49,10 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if not 1 <= args.threads <= THREADS_MAX:
+        raise UsageError(f"--threads is {args.threads}, allowed: 1 to {THREADS_MAX}")
+    if args.data_seed < 0:
+        raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
     if args.name == "list":
         emit(args, {"rows": list(PAGES)}, "\n".join(PAGES))
         return EXIT_FINE
@@ -115,6 +120,8 @@ def _check(name: str, args: argparse.Namespace) -> None:
         if args.rows is not None and not {*known} & {*args.rows}:
             raise UsageError(f"--rows {args.rows}", remedy=f"{name} has {', '.join(map(str, known))}")
     if name not in PASSIVE and name not in UNPRINTED:
+        if args.dark is not None and args.name != "all":
+            raise UsageError(f"--dark has no effect on {name}", remedy="leave it out")
         return
     from pans.trainer.paper.passive_recipes import TASKS
     from pans.trainer.tasks.generators import GENERATORS

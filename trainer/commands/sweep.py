@@ -16,11 +16,12 @@ from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, emit, say
 from pans.runtime.errors import UsageError
-from pans.runtime.outputs import check_outputs
+from pans.runtime.outputs import check_outputs, file_identity
 from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
 
 from .arguments import add_data_dir, add_threads, needing, torch_with
 
+TRIALS_MAX = 1_000_000
 JOURNAL_LINE_MAX_BYTES = 1 << 20
 
 
@@ -46,6 +47,8 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if not 1 <= args.trials <= TRIALS_MAX:
+        raise UsageError(f"--trials is {args.trials}, allowed: 1 to {TRIALS_MAX}")
     with needing("a sweep", "train,sweep"):
         import optuna
     torch_with(args.threads, "a sweep")
@@ -115,6 +118,7 @@ def open_storage(where: str) -> Any:
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
     path = Path(where)
+    file_identity(path)  # UsageError for what is no path
     if not path.resolve().parent.is_dir():
         raise UsageError(f"{path.parent} is not a folder", remedy="make it first")
     _check_journal(path)

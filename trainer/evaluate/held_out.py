@@ -98,7 +98,7 @@ def held_out_of(
     if bundle.picture_shape is None and found.classes != bundle.classes:
         raise ValueError(
             f"{bundle.name} decides among {len(bundle.classes)} classes ({', '.join(bundle.classes[:3])}, ...), the task "
-            f"{found.name} has {len(found.classes)} ({', '.join(found.classes[:3])}, ...)"
+            f"{found.name} has {len(found.classes)} ({', '.join(found.classes[:3])}, ...), allowed: the same classes in that order"
         )
     whole = found.split_here and told.get("data_sha256") != found.sha256
     profile = load_profile(conditions.profile or str(told.get("profile", DEFAULT_PROFILE)))

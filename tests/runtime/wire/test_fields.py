@@ -42,6 +42,8 @@ FACTS_OF_A_DEVICE = {
         "automaton_schema": AUTOMATON_SCHEMA,
         "automaton_states": 0,
         "dwell_steps": 1,
+        "scene_height_px": 1,
+        "scene_width_px": 1,
     },
 }
 

@@ -1,0 +1,190 @@
+"""Bad inputs of every command, made from the parsers: numbers, paths and kinds of files that cannot be right.
+
+Owns the table of command lines that would work, and how each option of one is made bad. A case is made once per option and kind of
+fault; which value it takes goes round, so that all values meet some option.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pans.runtime.cli.finding import find_commands, load_command
+from pans.runtime.cli.parser import parser_of
+from pans.runtime.errors import UsageError
+
+FAST = "sim:oled-qcmos?pace=fast"
+# a command line of each command that would work, with its required arguments; {} stands for nothing
+GOOD = {
+    "demo": "--pace fast --seconds 0.01 --out new",
+    "run": f"b.pans --device {FAST} --decisions 1 --out new",
+    "replay": "r.pansrec",
+    "verify": "b.pans",
+    "info": "b.pans",
+    "report": "b.pans -o new.html",
+    "export": "r.pansrec --format csv -o new",
+    "bundle": "--patterns p.npy --table t.npy --classes a,b -o new.pans",
+    "simulate": "--profile oled-qcmos --scene uniform --listen tcp:127.0.0.1:0",
+    "bench": "decide --quick",
+    "trials": "clock --seconds 0.1",
+    "fuzz": "--bytes 1 --frames 1",
+    "devices": "--no-usb",
+    "doctor": "--udev",
+    "calibrate": f"--device {FAST}&scene=uniform --seconds 0.5 -o new.json",
+    "train": "s.npz --features 2 --epochs 1 -o new.pans",
+    "evaluate": "b.pans --task s.npz --objects 2",
+    "data": "scene cells -o new.npz --objects 2",
+    "baseline": "direct --task s.npz --photons 5",
+    "reproduce": "alpha --collect --cache cache -o new",
+    "sweep": "s.npz --features 2 --storage new.log --trials 1",
+    "completion": "bash",
+}
+NUMBERS = ("nan", "inf", "-inf", "1e999", "9" * 40, "", "three", "0x10", "1,5")
+TOO_LOW = "-1"
+MAY_BE_NEGATIVE = {"--offset", "--drift-ppm", "--seed", "--rows", "--seeds"}  # some of them: not judged here
+MISSING, EMPTY, NOISE, LATIN, FOLDER, FIFO, BROKEN, LOOP, LONG, NUL, NOWHERE, BELOW, ENDLESS = (
+    *("missing.{}", "empty.{}", "noise.{}", "latin.{}", "folder.{}", "fifo.{}", "broken.{}", "loop.{}"),
+    *("x" * 300, "nul\0.{}", "", "b.pans/x.{}", "/dev/zero"),
+)
+INPUTS = (MISSING, EMPTY, NOISE, LATIN, FOLDER, FIFO, BROKEN, LOOP, LONG, NUL, NOWHERE, BELOW, ENDLESS)
+OUTPUTS = (
+    "there.{}",
+    "no/such/new.{}",
+    "/proc/new.{}",
+    FOLDER,
+    FIFO,
+    BROKEN,
+    LOOP,
+    LONG,
+    NUL,
+    NOWHERE,
+    BELOW,
+    "b.pans",
+)
+KINDS = {"pans": "b.pans", "pansrec": "r.pansrec", "npz": "s.npz", "toml": "f.toml", "json": "c.json", "npy": "p.npy"}
+# what an option that names a file wants, by command and option ("" for all commands); the rest is found by its type
+READS = {
+    "bundle": "pans", "--bundle": "pans", "recording": "pansrec", "path": "pans", "paths": "pans", "--profile": "toml",
+    "--act-profile": "toml", "--flow": "toml", "--calibration": "json", "--truth": "npz", "--inputs": "npz", "--task": "npz",
+    "task": "npz", "--scene": "npz", "--optics": "pans", "--patterns": "npy", "--table": "npy", "--head": "onnx", "--faults": "toml",
+}  # fmt: skip
+WRITES = {
+    "--out": "", "--record": "pansrec", "--trace": "txt", "--state": "json", "--pictures": "npz", "--plot": "png", "--storage": "log",
+}  # fmt: skip
+FOLDERS = {("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("evaluate", "--pictures")}
+SUFFIXES = {"report": "html", "bundle": "pans", "calibrate": "json", "train": "pans", "data": "npz"}
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One command line that must be refused: its words, and the exit codes that are right."""
+
+    words: tuple[str, ...]
+    codes: frozenset[int] = frozenset({2})
+    needs: tuple[str, ...] = field(default=())
+
+    @property
+    def name(self) -> str:
+        return ascii(" ".join(self.words))[1:-1].replace("x" * 300, "xxx...")[:120]
+
+
+def write_inputs(folder: Path, recording: Path, bundle: Path) -> None:
+    """Write the good files and the bad ones of every kind into `folder`."""
+    (folder / "b.pans").write_bytes(bundle.read_bytes())
+    (folder / "r.pansrec").write_bytes(recording.read_bytes())
+    np.save(folder / "p.npy", np.ones((2, 784)))
+    np.save(folder / "t.npy", np.zeros((4, 2)))
+    images = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8)
+    classes = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
+    np.savez(folder / "s.npz", images=images, labels=np.arange(200) % 10, classes=np.array(classes))
+    (folder / "f.toml").write_text("kind = 1\n")
+    (folder / "c.json").write_text("{}\n")
+    (folder / "nothing.html").write_text("<html></html>\n")
+    for suffix in (*KINDS, "onnx", "txt", "png", "html", "log", "csv"):
+        (folder / f"empty.{suffix}").touch()
+        (folder / f"noise.{suffix}").write_bytes(np.random.default_rng(1).bytes(3000))
+        (folder / f"latin.{suffix}").write_bytes("name = 'Käse'\n".encode("latin-1"))
+        (folder / f"there.{suffix}").write_bytes(b"precious")
+        (folder / f"folder.{suffix}").mkdir()
+        os.mkfifo(folder / f"fifo.{suffix}")
+        (folder / f"broken.{suffix}").symlink_to("nowhere")
+        (folder / f"loop.{suffix}").symlink_to(f"loop.{suffix}")
+        if suffix in KINDS:
+            whole = (folder / KINDS[suffix]).read_bytes()
+            (folder / f"half.{suffix}").write_bytes(whole[: len(whole) // 2])
+
+
+def cases() -> list[Case]:
+    """All of them, in the order of the commands."""
+    return [case for name in GOOD for case in _cases_of(name)]
+
+
+def _cases_of(name: str) -> Iterator[Case]:
+    try:
+        parser = parser_of(name, load_command(find_commands()[name]))
+    except UsageError:
+        return  # its extra is not installed
+    good = GOOD[name].split()
+    numbers, inputs, outputs = (itertools.cycle(values) for values in (NUMBERS, INPUTS, OUTPUTS))
+    turn = sum(map(ord, name))  # each command begins at another value
+    for values, many in ((numbers, NUMBERS), (inputs, INPUTS), (outputs, OUTPUTS)):
+        for _ in range(turn % len(many)):
+            next(values)
+    for action in parser._actions:
+        flag = max(action.option_strings, key=len, default="")
+        if action.nargs == 0:
+            continue
+        key = flag or action.dest
+        if action.choices and name != "trials":
+            yield Case(_with(name, good, parser, action, "nonsense"))
+        elif action.type in (int, float) or getattr(action.type, "__name__", "") == "option":
+            for value in (next(numbers), next(numbers), *(() if flag in MAY_BE_NEGATIVE else (TOO_LOW,))):
+                yield Case(_with(name, good, parser, action, value))
+        elif key in READS and not (name == "bundle" and flag == "--task"):
+            suffix = READS[key]
+            wrong = next(iter({"pans": "s.npz", "npz": "b.pans"}.get(kind, "b.pans") for kind in [suffix]))
+            for value in (next(inputs), next(inputs), next(inputs), "half.{}", wrong):
+                if value != "half.{}" or suffix in KINDS:
+                    yield Case(_with(name, good, parser, action, value.format(suffix)))
+        elif key in WRITES:
+            suffix = SUFFIXES.get(name) or WRITES[key] or "txt"
+            for value in (next(outputs), next(outputs), next(outputs), next(outputs)):
+                if key in ("--trace", "--record") and value == "no/such/new.{}":
+                    continue  # their folders are made
+                if (name, key) in FOLDERS and value in (FOLDER, NOWHERE, "no/such/new.{}"):
+                    continue  # a folder, or one that is made
+                yield Case(_with(name, good, parser, action, value.format(suffix)))
+
+
+def _with(
+    name: str, good: list[str], parser: argparse.ArgumentParser, action: argparse.Action, value: str
+) -> tuple[str, ...]:
+    """The good command line with `value` for one argument."""
+    words = list(good)
+    if action.option_strings:
+        for flag in action.option_strings:
+            if flag in words:
+                at = words.index(flag)
+                del words[at : at + 2]
+        flag = max(action.option_strings, key=len)
+        return (name, *words, f"{flag}={value}")
+    places = [one for one in parser._actions if not one.option_strings]
+    words[places.index(action)] = value
+    return (name, *words)
+
+
+def said_nothing_of(text: str) -> bool:
+    """Whether an error lacks its remedy."""
+    return "remedy: " not in text
+
+
+if __name__ == "__main__":  # the list itself
+    for case in cases():
+        sys.stdout.write(f"pans {case.name}\n")
