@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DamagedFileError, UsageError
+from .container import open_regular
+from .errors import DamagedFileError, PansError, UsageError
 
 FULL_SCALE_16 = 65535
+FAULTS_SHOWN = 20  # of a folder; the rest is counted
+PILLOW_REMEDY = "pip install pillow"
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
 PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
 
@@ -33,45 +36,80 @@ class LabelledPictures(NamedTuple):
 def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
     """Return the pictures of `folder`: one folder per class, pictures of one size inside.
 
-    What systems leave behind (names that begin with a dot, Thumbs.db, desktop.ini, __MACOSX) is passed over. UsageError for a class
-    without pictures, folders within a class, pictures beside the class folders, pictures of different sizes, or for more than
-    `pixels_max` pixels in all; else as `read_grey`.
+    What systems leave behind (names that begin with a dot, Thumbs.db, desktop.ini, __MACOSX) is passed over. UsageError, which lists
+    all faults at once: a class without pictures, folders within a class, pictures beside the class folders, pictures of different sizes,
+    files that are no pictures (see `read_grey`), or more than `pixels_max` pixels in all.
     """
     entries = _entries(folder)
     classes = [entry.name for entry in entries if entry.is_dir()]
+    found = _Found(pixels_max)
     beside = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in PICTURE_SUFFIXES]
-    if beside and classes:
-        raise UsageError(f"{beside[0]}: a picture beside the class folders", remedy="move it into its class's folder")
-    images: list[NDArray[np.uint8]] = []
-    labels: list[int] = []
-    digest = hashlib.sha256()
-    n_pixels = 0
+    if classes:
+        remedy = "move it into its class's folder"
+        found.faults += [UsageError(f"{one}: a picture beside the class folders", remedy=remedy) for one in beside]
     for label, name in enumerate(classes):
-        inside = _entries(folder / name)
-        if nested := [entry for entry in inside if entry.is_dir()]:
-            raise UsageError(
-                f"{nested[0]}: a folder within the class folder {name!r}",
-                remedy="one folder per class, the pictures directly inside: flatten it, or name the folder above the classes",
-            )
-        if not inside:
-            raise UsageError(
-                f"{folder / name}: a class folder without pictures", remedy="remove it, or put the class's pictures in"
-            )
-        for path in inside:
-            image = read_grey(path, pixels_max - n_pixels)
-            n_pixels += image.size
-            if images and image.shape != images[0].shape:
-                raise UsageError(
-                    f"{path}: {image.shape[1]} x {image.shape[0]} pixels, the first image has "
-                    f"{images[0].shape[1]} x {images[0].shape[0]}",
-                    remedy="all images of a task have one size: resize them",
-                )
-            digest.update(image.tobytes())
-            images.append(image)
-            labels.append(label)
-    if not images:
+        found.take_class(folder / name, label)
+    if not found.images and not found.faults:
         raise UsageError(f"{folder}: no images in class folders", remedy="put the images of each class into a folder")
-    return LabelledPictures(np.stack(images), np.array(labels), tuple(classes), digest.hexdigest())
+    if found.faults:
+        raise _all_of(folder, found.faults)
+    return LabelledPictures(np.stack(found.images), np.array(found.labels), tuple(classes), found.digest.hexdigest())
+
+
+class _Found:
+    """The pictures of a folder as they are read, and what is wrong with it."""
+
+    def __init__(self, pixels_max: int) -> None:
+        self.images: list[NDArray[np.uint8]] = []
+        self.labels: list[int] = []
+        self.faults: list[PansError] = []
+        self.digest = hashlib.sha256()
+        self._pixels_left = pixels_max
+        self._first = ""  # the picture whose size all others must have
+
+    def take_class(self, folder: Path, label: int) -> None:
+        """Read the pictures of one class."""
+        inside = _entries(folder)
+        remedy = "one folder per class, the pictures directly inside: flatten it, or name the folder above the classes"
+        nested = [entry for entry in inside if entry.is_dir()]
+        self.faults += [
+            UsageError(f"{one}: a folder within the class folder {folder.name!r}", remedy=remedy) for one in nested
+        ]
+        if not inside:
+            remedy = "remove it, or put the class's pictures in"
+            self.faults.append(UsageError(f"{folder}: a class folder without pictures", remedy=remedy))
+        for path in inside:
+            if not path.is_dir():
+                self._take(path, label)
+
+    def _take(self, path: Path, label: int) -> None:
+        try:
+            image = read_grey(path, self._pixels_left)
+        except PansError as error:
+            if error.remedy == PILLOW_REMEDY:  # it holds for all of them
+                raise
+            self.faults.append(error)
+            return
+        self._pixels_left -= image.size
+        if self.images and image.shape != self.images[0].shape:
+            size, first = (f"{one.shape[1]} x {one.shape[0]}" for one in (image, self.images[0]))
+            words = f"{path}: {size} pixels, the first image ({self._first}) has {first}"
+            self.faults.append(UsageError(words, remedy="all images of a task have one size: resize them"))
+            return
+        self._first = self._first or path.name
+        self.digest.update(image.tobytes())
+        self.images.append(image)
+        self.labels.append(label)
+
+
+def _all_of(folder: Path, faults: list[PansError]) -> PansError:
+    """Return one error that lists the faults, the first FAULTS_SHOWN of them in full."""
+    if len(faults) == 1:
+        return faults[0]
+    remedies = "; ".join(dict.fromkeys(fault.remedy for fault in faults if fault.remedy))
+    more = len(faults) - FAULTS_SHOWN
+    shown = [fault.message for fault in faults[:FAULTS_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
+    return UsageError("\n".join([f"{folder}: {len(faults)} faults", *shown]), remedy=remedies)
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -88,12 +126,13 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
-        raise UsageError(f"{path}: pictures need the package pillow", remedy="pip install pillow") from error
+        raise UsageError(f"{path}: pictures need the package pillow", remedy=PILLOW_REMEDY) from error
     try:
-        with Image.open(path) as picture:
+        with open_regular(path) as file, Image.open(file) as picture:
             if picture.width * picture.height > pixels_max:
                 raise UsageError(
-                    f"{path}: {picture.width} x {picture.height} pixels, more than the {pixels_max} allowed"
+                    f"{path}: {picture.width} x {picture.height} pixels, more than the {pixels_max} allowed",
+                    remedy="make the images smaller, or fewer",
                 )
             frames = getattr(picture, "n_frames", 1)
             if frames != 1:
@@ -102,7 +141,7 @@ def read_grey(path: Path, pixels_max: int) -> NDArray[np.uint8]:
                 return to_8_bits(path, np.asarray(picture), 1.0 if picture.mode == "F" else float(FULL_SCALE_16))
             return np.asarray(picture.convert("L"), dtype=np.uint8)
     except Image.DecompressionBombError as error:
-        raise UsageError(f"{path}: {error}") from error
+        raise UsageError(f"{path}: {error}", remedy="make the image smaller") from error
     except (OSError, SyntaxError, ValueError) as error:  # what damaged files make the decoders raise
         raise DamagedFileError(
             f"{path}: not an image that can be read: {error}", remedy="repair it, or move it elsewhere"

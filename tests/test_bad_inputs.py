@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -58,14 +59,29 @@ def limited() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
+@pytest.fixture(scope="module")
+def busy() -> Iterator[str]:
+    """The address of a port that somebody else has."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        yield f"tcp:127.0.0.1:{taken.getsockname()[1]}"
+
+
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_a_bad_input_is_refused(
-    case: Case, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], limited: None
+    case: Case,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    limited: None,
+    busy: str,
 ) -> None:
     monkeypatch.chdir(folder)
     before = contents(folder)
+    words = [
+        word.replace("BUSY", busy if case.words[0] == "simulate" else busy.removeprefix("tcp:")) for word in case.words
+    ]
     try:
-        code = main(list(case.words))
+        code = main(words)
     except SystemExit as end:
         code = int(end.code or 0)
     out, err = capfd.readouterr()

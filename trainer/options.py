@@ -63,6 +63,7 @@ class Options:
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
 
 
+SLOPE_MAX = 1e6  # times the light that is meant: far beyond what annealing needs
 LIGHT_MAX = 1e9  # photoelectrons, clicks or weights: beyond, nothing can be drawn or trained
 LIMITS = {
     "features": (1, 4096),
@@ -96,6 +97,10 @@ def check_options(options: Options, profile: Profile) -> None:
         value = getattr(options, name)
         if value is not None and not (value <= LIGHT_MAX and (value > 0 or (name == "alpha" and value == 0))):
             raise UsageError(f"{_flag(name)} is {value:g}, allowed: above 0, at most {LIGHT_MAX:g}")
+    if not 0 < options.slope <= SLOPE_MAX or not options.clamp > 0:
+        raise UsageError(
+            f"--slope is {options.slope:g}, --clamp is {options.clamp:g}, allowed: above 0 (slope to {SLOPE_MAX:g})"
+        )
     if options.dark is not None and not 0 <= options.dark <= LIGHT_MAX:
         raise UsageError(f"--dark is {options.dark:g}, allowed: 0 to {LIGHT_MAX:g}")
     _check_together(options)

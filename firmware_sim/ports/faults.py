@@ -116,7 +116,10 @@ def _probability(name: str, word: str, where: str) -> float:
     except ValueError:
         value = -1.0
     if not 0.0 <= value <= 1.0:
-        raise UsageError(f"{where}: {name} is a probability from 0 to 1, found {word!r}")
+        raise UsageError(
+            f"{where}: {name} is a probability, allowed: 0 to 1, found {word!r}",
+            remedy=f"write {name}:0.01, for example",
+        )
     return value
 
 

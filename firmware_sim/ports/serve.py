@@ -67,6 +67,8 @@ def parse_sim_url(url: str) -> SimOptions:
     for key, text in pairs:
         if key not in known:
             raise UsageError(f"{url!r}: unknown key {key!r}", remedy=f"known keys: {', '.join(known)}")
+        if not text and key == "scene":
+            raise UsageError(f"{url!r}: scene is empty", remedy="name a scene, or leave scene= out")
         options = replace(options, **{key: _value(url, key, text, str(known[key]))})
     return check_options(options)
 

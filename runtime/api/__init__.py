@@ -17,7 +17,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pans.runtime import SHIPPED
 from pans.runtime import __version__ as __version__
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.lazy_names import lazy_names
@@ -78,7 +77,7 @@ def load_bundle(path: str | Path) -> Bundle:
     """
     from pans.runtime.bundle.model import load_bundle
 
-    return load_bundle(_file_of(path))[0]
+    return load_bundle(path)[0]
 
 
 def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = "auto") -> Verdicts:
@@ -134,6 +133,7 @@ def run(
     """
     from tempfile import TemporaryDirectory
 
+    from pans.runtime.bundle.model import bundle_path
     from pans.runtime.commands.carry_out import run_job
     from pans.runtime.commands.job import Job
     from pans.runtime.commands.run import profile_of
@@ -141,7 +141,7 @@ def run(
 
     loaded = profile if isinstance(profile, Profile) else load_profile(profile or profile_of(device))
     with TemporaryDirectory() as folder:
-        path = _file_of(bundle) if isinstance(bundle, (str, Path)) else _written(bundle, Path(folder))
+        path = bundle_path(bundle) if isinstance(bundle, (str, Path)) else _written(bundle, Path(folder))
         job = Job(
             bundle_path=path,
             device=device,
@@ -158,11 +158,6 @@ def run(
             force=force,
         )
         return run_job(job)
-
-
-def _file_of(name: str | Path) -> Path:
-    shipped = SHIPPED / f"{name}.pans"
-    return shipped if shipped.exists() and not Path(name).exists() else Path(name)
 
 
 def _written(bundle: Bundle, folder: Path) -> Path:

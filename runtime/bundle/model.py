@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pans.runtime import SHIPPED
 from pans.runtime.container import canonical_json, open_regular, parse_json_object
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.outputs import write_file
@@ -252,8 +253,30 @@ def write_bundle(bundle: Bundle, path: str | Path, *, force: bool = False) -> st
     return hashlib.sha256(data).hexdigest()
 
 
-def load_bundle(path: str | Path) -> tuple[Bundle, str]:
-    """Return the bundle in `path` and the file's SHA-256 as hex; UsageError without a file, else DamagedFileError."""
+def shipped_bundles() -> tuple[str, ...]:
+    """Names of the bundles that come with the package, sorted."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.pans")))
+
+
+def bundle_path(name_or_path: str | Path) -> Path:
+    """Return the file of a bundle: that file where there is one, else the shipped bundle of that name, else the path as it is."""
+    path = Path(name_or_path)
+    if not os.path.lexists(path) and str(name_or_path) in shipped_bundles():
+        return SHIPPED / f"{name_or_path}.pans"
+    return path
+
+
+def load_bundle(name_or_path: str | Path) -> tuple[Bundle, str]:
+    """Return the bundle in a file, or the shipped one of that name, and the file's SHA-256 as hex.
+
+    UsageError without a file, else DamagedFileError.
+    """
+    path = bundle_path(name_or_path)
+    if not os.path.lexists(path):
+        shipped = ", ".join(shipped_bundles())
+        raise UsageError(
+            f"{path}: there is no such bundle", remedy=f"name a .pans file, or a shipped bundle: {shipped}"
+        )
     try:
         with open_regular(path) as file:
             return read_bundle(file, os.fstat(file.fileno()).st_size, str(path))

@@ -14,7 +14,7 @@ from typing import Any
 
 from .talk import has_said, say
 
-FIRST_AFTER_S = 0.25
+FIRST_AFTER_S = 0.35
 LOOK_EVERY_S = 0.05
 LOOK_FOR_S = 60.0  # a command that has not loaded numba by then does not wait for it
 COMPILING = "compiling kernels: once per machine, about 30 s"

@@ -22,7 +22,7 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
 
 from .job import Job, recording_header, what_was_run
-from .run_files import check_run_files, claimed
+from .run_files import check_run_files, claimed, gone_if_refused
 
 if TYPE_CHECKING:
     import numpy as np
@@ -228,7 +228,10 @@ def _recorded(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcom
         result = _watched(job, ready, link, None, recovery, beside)
         return _conclude(job, ready, result, _summary(job, ready, result))
     limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
-    with open_recorder(job.recording, header, _same_bundle(job, ready), limits, force=job.force) as recorder:
+    with ExitStack() as opened:
+        opened.enter_context(gone_if_refused(job))
+        same = _same_bundle(job, ready)
+        recorder = opened.enter_context(open_recorder(job.recording, header, same, limits, force=job.force))
         result = _watched(job, ready, link, recorder, recovery, beside)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))

@@ -6,8 +6,10 @@ Owns how these are spelled and what cannot be meant; never loads what a run need
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pans.runtime.cli import warn
 from pans.runtime.errors import UsageError
@@ -31,8 +33,8 @@ RANGES = {
     "gate_delay_us": Range(0, 1e6),
     "pool": Range(1, 64, whole=True),
     "calibration_max_age_h": Range(1e-9, 1e6),
-    "rotate_mb": Range(0, 1e6),
-    "keep_mb": Range(0, 1e9),
+    "rotate_mb": Range(1e-6, 1e6),
+    "keep_mb": Range(1e-6, 1e9),
     "disk_reserve_mb": Range(0, 1e9),
     "confidence": Range(0.0, 1.0),
     "seed": Range(0, (1 << 63) - 1, whole=True),
@@ -89,9 +91,28 @@ def add_flow_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+OF_FLOW = {
+    "gate_class": [],
+    "gate_delay_us": None,
+    "act": "device",
+    "act_profile": None,
+    "pool": None,
+}  # and their defaults
+
+
+def _refuse_without(args: argparse.Namespace, needed: str, defaults: Mapping[str, Any]) -> None:
+    """Refuse options that have no effect without the option `needed`."""
+    for name, default in defaults.items():
+        if getattr(args, name, default) != default:
+            raise UsageError(
+                f"--{name.replace('_', '-')} has no effect without {needed}", remedy=f"add {needed}, or leave it out"
+            )
+
+
 def flow_of(args: argparse.Namespace) -> FlowSettings | None:
     """Return the settings that the command line asks for, None without --flow."""
     if getattr(args, "flow", None) is None:
+        _refuse_without(args, "--flow", OF_FLOW)
         return None
     classes = tuple(name for part in args.gate_class for name in part.split(",") if name)
     settings = with_gate(read_flow(args.flow), classes, args.gate_delay_us)
@@ -125,17 +146,23 @@ def dark_of(args: argparse.Namespace) -> DarkSettings:
     """Return what the command line asks for; `pans demo` has no instrument to calibrate, and asks for nothing."""
     if not hasattr(args, "calibration"):
         return DarkSettings()
+    if args.calibration is None:
+        _refuse_without(args, "--calibration", {"calibration_max_age_h": MAX_AGE_H})
     return DarkSettings(args.calibration, args.calibration_max_age_h, args.on_dark, warns=True)
 
 
 def add_continuous_options(parser: argparse.ArgumentParser) -> None:
     """Add the options to `pans run`."""
     group = parser.add_argument_group("running for days")
-    group.add_argument("--rotate-mb", type=float, default=0.0, metavar="N", help="record in parts of about N MiB")
+    group.add_argument(
+        "--rotate-mb",
+        type=RANGES["rotate_mb"].option,
+        metavar="N",
+        help="record in parts of about N MiB (default: one file)",
+    )
     group.add_argument(
         "--keep-mb",
-        type=float,
-        default=0.0,
+        type=RANGES["keep_mb"].option,
         metavar="N",
         help="delete the oldest parts above N MiB (default: keep all)",
     )
@@ -176,9 +203,7 @@ def serve_of(args: argparse.Namespace) -> str:
 
 def continuous_of(args: argparse.Namespace) -> Continuous:
     """Return what the options ask for; UsageError for what cannot be meant. Commands without the options ask for nothing."""
-    rotate_mb, keep_mb = getattr(args, "rotate_mb", 0.0), getattr(args, "keep_mb", 0.0)
-    if min(rotate_mb, keep_mb) < 0:
-        raise UsageError("--rotate-mb and --keep-mb must not be negative")
+    rotate_mb, keep_mb = getattr(args, "rotate_mb", None) or 0.0, getattr(args, "keep_mb", None) or 0.0
     if keep_mb and not rotate_mb:
         raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
     if rotate_mb and getattr(args, "on_dark", "warn") != "warn":
@@ -201,6 +226,8 @@ def _metrics_of(args: argparse.Namespace) -> str:
 def _address_of(address: str, public: bool, option: str) -> str:
     """Return the address, checked; one that others can reach is said aloud."""
     if not address:
+        if public:
+            raise UsageError(f"{option}-public has no effect without {option}", remedy=f"add {option}, or leave it out")
         return ""
     from pans.runtime.watch.metrics import check_address, is_public
 

@@ -122,8 +122,10 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from pans.runtime.bundle.model import bundle_path
+
     profile = args.profile or profile_of(args.device)
-    job = _job(args, args.bundle, args.device, profile, args.decisions, args.record)
+    job = _job(args, bundle_path(args.bundle), args.device, profile, args.decisions, args.record)
     if args.write_config is None:
         return carry_out(args, job)
     path = write_options(args)

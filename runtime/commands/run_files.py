@@ -14,7 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qsl
 
-from pans.runtime.errors import UsageError
+from pans.runtime.cli import EXIT_USAGE
+from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.outputs import check_outputs, make_folder, refuse_existing
 from pans.runtime.record.part_keeper import files_of_parts, index_path
 from pans.runtime.run_folder import locked, new_run_folder
@@ -85,6 +86,26 @@ def claimed(job: Job) -> Iterator[Job]:
         for folder in reversed(made):
             with suppress(OSError):  # it holds something
                 folder.rmdir()
+
+
+@contextmanager
+def gone_if_refused(job: Job) -> Iterator[None]:
+    """Remove the recording that was begun within the block when the run is refused before it measures anything."""
+    before = _recorded_files(job)
+    try:
+        yield
+    except PansError as error:
+        if error.exit_code == EXIT_USAGE and not isinstance(error, RecordingError):
+            for path in _recorded_files(job) - before:
+                with suppress(OSError):
+                    path.unlink()
+        raise
+
+
+def _recorded_files(job: Job) -> set[Path]:
+    if job.recording is None:
+        return set()
+    return {path for path in (job.recording, *files_of_parts(job.recording)) if os.path.lexists(path)}
 
 
 def missing_folders(folder: Path) -> list[Path]:

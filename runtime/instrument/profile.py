@@ -136,9 +136,23 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
     Raises ConfigError if there is neither, or if the file is not a valid profile (then it starts with file:line:col).
     """
-    if isinstance(name_or_path, str) and name_or_path in shipped_profiles():
+    return parse_profile(profile_text(name_or_path), _where(name_or_path))
+
+
+def _where(name_or_path: str | Path) -> str:
+    """Return how messages name a profile: by its file."""
+    return f"{name_or_path}.toml" if _is_shipped(name_or_path) else str(name_or_path)
+
+
+def _is_shipped(name_or_path: str | Path) -> bool:
+    return isinstance(name_or_path, str) and name_or_path in shipped_profiles()
+
+
+def profile_text(name_or_path: str | Path) -> str:
+    """Return the TOML text of the shipped profile of that name, or of the file at that path; ConfigError as of `load_profile`."""
+    if _is_shipped(name_or_path):
         shipped = resources.files("pans.hw_profiles").joinpath(f"{name_or_path}.toml")
-        return parse_profile(_decoded(shipped.read_bytes(), shipped.name), shipped.name)
+        return _decoded(shipped.read_bytes(), shipped.name)
     path = Path(name_or_path)
     if not path.is_file():
         known = ", ".join(shipped_profiles())
@@ -151,8 +165,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
         with path.open("rb") as file:
             data = file.read(MAX_PROFILE_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    return parse_profile(_decoded(data, str(path)), str(path))
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}", remedy="check its permissions") from error
+    return _decoded(data, str(path))
 
 
 def shipped_profiles() -> tuple[str, ...]:

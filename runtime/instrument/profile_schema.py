@@ -21,7 +21,7 @@ MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the 
 
 
 _PROBABILITY = Key("number", 0, 1, required=False)
-_SCHEMA: dict[str, dict[str, Key]] = {
+SCHEMA: dict[str, dict[str, Key]] = {
     "profile": {
         "name": Key("text"),
         "description": Key("text", required=False),
@@ -84,7 +84,7 @@ class ProfileCheck:
     def facts(self) -> dict[str, dict[str, Any]]:
         """Return every section's checked values, with [sources] and, in [profile], `measure` (both empty where the file has none)."""
         self._sections()
-        values = {name: self._section(name) for name in _SCHEMA if name in self.tables}
+        values = {name: self._section(name) for name in SCHEMA if name in self.tables}
         sources, measure = self._sources(values), self._measure(values)
         for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease):
             check(values, self.fault)
@@ -96,21 +96,21 @@ class ProfileCheck:
         return ConfigError(f"{self.where}:{line}:{column}: {message}", remedy=remedy)
 
     def _sections(self) -> None:
-        known = [*_SCHEMA, "sources"]
+        known = [*SCHEMA, "sources"]
         for name, table in self.tables.items():
             if name not in known:
-                owners = [section for section, keys in _SCHEMA.items() if name in keys]
+                owners = [section for section, keys in SCHEMA.items() if name in keys]
                 hint = f"[{owners[0]}] has a key of that name" if owners else near(name, known, "[{}]")
                 raise self.fault((name,), f"{name} is not a section of a profile; allowed: {_listed(known)}", hint)
             if not isinstance(table, dict):
                 raise self.fault((name,), f"{name} must be a section, found {found(table)}", f"write [{name}]")
         for name in known:
             if name not in self.tables and name not in _OPTIONAL_SECTIONS:
-                keys = ", ".join(key for key, rule in _SCHEMA[name].items() if rule.required)
+                keys = ", ".join(key for key, rule in SCHEMA[name].items() if rule.required)
                 raise self.fault((), f"section [{name}] is missing", f"add [{name}] with {keys}")
 
     def _section(self, section: str) -> dict[str, Any]:
-        rules = _SCHEMA[section]
+        rules = SCHEMA[section]
         table = {key: value for key, value in self.tables[section].items() if (section, key) != ("profile", "measure")}
         for key in table:
             if key not in rules:
@@ -140,7 +140,7 @@ class ProfileCheck:
         return name
 
     def _unknown(self, section: str, key: str) -> ConfigError:
-        rules = _SCHEMA[section]
+        rules = SCHEMA[section]
         stem = _UNIT.sub("", key)
         other = next((name for name in rules if name != key and _UNIT.sub("", name) == stem), None)
         if other is not None:
@@ -150,7 +150,7 @@ class ProfileCheck:
                 f"{section}.{key} is not a key: the unit is part of the name, and this one is {other}",
                 f"convert the value to {unit} and name it {other}" if unit else f"name it {other}",
             )
-        owner = next((name for name, keys in _SCHEMA.items() if key in keys), None)
+        owner = next((name for name, keys in SCHEMA.items() if key in keys), None)
         hint = f"{key} belongs in [{owner}]" if owner else near(key, list(rules), "{}")
         return self.fault((section, key), f"{section}.{key} is not a key; [{section}] takes {', '.join(rules)}", hint)
 

@@ -73,7 +73,11 @@ class LiveRun:
     ) -> None:
         self.connection, self.plan, self.core, self.config = connection, plan, core, config
         self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
-        self.tally = RunTally(n_classes, config.shots)
+        welcome = connection.session.welcome
+        shown = (
+            0 if welcome is None else int(welcome.facts.get("objects", 0))
+        )  # of a simulator: they come again in turn
+        self.tally = RunTally(n_classes, config.shots, shown)
         self.journal = Journal(recorder)
         self.gates = GateQueue(recorder, self.journal)
         if plan.drive == "host" and plan.automaton is not None and isinstance(core, Core):

@@ -35,11 +35,15 @@ class TallyFigures:
 
 
 class RunTally:
-    """Sums over decisions; memory is bounded by classes^2 and MAX_OBJECTS."""
+    """Sums over decisions; memory is bounded by classes^2 and MAX_OBJECTS.
 
-    def __init__(self, n_classes: int, shots: int) -> None:
+    `distinct` is after how many objects the first one is shown again, 0: never, or unknown. A standard error counts each object once.
+    """
+
+    def __init__(self, n_classes: int, shots: int, distinct: int = 0) -> None:
         self.confusion: npt.NDArray[np.int64] = np.zeros((n_classes, n_classes), np.int64)  # truth x decision
         self.shots = shots
+        self.distinct = distinct
         self.decisions = 0
         self.abstained = 0
         self.unsure = 0  # of them because no class was as sure as was asked for
@@ -70,9 +74,13 @@ class RunTally:
         if decision.label != NO_LABEL:
             self.confusion[decision.truth, decision.label] += 1
         trial = decision.shot // self.shots
-        for sums in (self._trials.setdefault(trial, [0, 0]), self._object_sums(decision.object)):
+        for sums in (self._trials.setdefault(trial, [0, 0]), self._object_sums(self._which(decision))):
             sums[0] += 1
             sums[1] += right
+
+    def _which(self, decision: Decision) -> int:
+        """Return which object a decision is about: one that is shown again keeps its number."""
+        return decision.object % self.distinct if self.distinct else decision.object
 
     def _object_sums(self, index: int) -> list[int]:
         sums = self._objects.get(index)

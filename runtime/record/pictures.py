@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +99,24 @@ class PictureLog:
         }
 
 
-def _images(path: Path) -> NDArray[np.uint8]:
+def shipped_scene(name: str) -> Path | None:
+    """Return the file of the simulator's scene of that name, None where there is none."""
+    try:
+        found = resources.files("pans.firmware_sim") / "scenes" / f"{name}.npz"  # its files, not its code
+    except ModuleNotFoundError:
+        return None
+    return Path(str(found)) if "/" not in name and found.is_file() else None
+
+
+def _images(name: Path) -> NDArray[np.uint8]:
+    path = name if name.exists() else shipped_scene(str(name)) or name
     try:
         images = read_arrays(path, ("images",), TRUTH_MAX_BYTES).get("images", np.zeros(0))
     except ValueError as error:
-        raise UsageError(f"{path}: no scene with an array `images`: {error}") from error
+        raise UsageError(
+            f"{path}: no scene with an array `images`: {error}",
+            remedy="name a shipped scene or a .npz file with images",
+        ) from error
     if images.dtype != np.uint8 or images.ndim != 3 or not images.size:
         raise UsageError(f"{path}: images are {images.dtype} {images.shape}, allowed: uint8 (n, height, width)")
     return np.asarray(images)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.facts import GOLDEN_WORK_MAX
 from pans.runtime.bundle.format import MAGIC as BUNDLE_MAGIC
-from pans.runtime.bundle.model import Bundle, golden_violation, load_bundle, word_means
+from pans.runtime.bundle.model import Bundle, bundle_path, golden_violation, load_bundle, word_means
 from pans.runtime.container import open_regular
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.decide.backends import make_decider
@@ -60,7 +60,7 @@ def file_kind(path: str | Path) -> str:
     """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
-    with open_regular(path) as file:
+    with open_regular(bundle_path(path)) as file:
         start = file.read(len(BUNDLE_MAGIC))
     suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
     by_magic = {BUNDLE_MAGIC: "bundle", RECORDING_MAGIC: "recording"}

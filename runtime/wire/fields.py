@@ -233,6 +233,7 @@ FACTS: Mapping[str, Fact] = {
     "serial": Fact(str),
     "simulated": Fact(bool),
     "optics_sha256": Fact(str),
+    "objects": Fact(int, False, 0, U32_MAX),
     "scene_height_px": Fact(int, False, 1, U16_MAX),
     "scene_width_px": Fact(int, False, 1, U16_MAX),
     "scene_classes": Fact(str),

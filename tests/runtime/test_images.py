@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.images import read_grey
+from pans.runtime.images import read_class_folder, read_grey
 from pans.trainer.tasks.registry import load_task
 
 Image = pytest.importorskip("PIL.Image")
@@ -71,3 +71,27 @@ def test_a_folder_passes_over_hidden_names(tmp_path):
     assert task.classes == ("cat", "dog")
     assert len(task.everything()) == 12
     assert np.array_equal(task.train.images[0], RAMP)
+
+
+def test_all_faults_of_a_folder_are_listed_at_once(tmp_path):
+    for name in ("cats", "dogs", "empty"):
+        (tmp_path / name).mkdir()
+    picture = Image.fromarray(RAMP)
+    for name in ("cats/a.png", "cats/b.png", "dogs/a.png", "stray.png"):
+        picture.save(tmp_path / name)
+    Image.fromarray(RAMP[:, :3]).save(tmp_path / "dogs/small.png")
+    (tmp_path / "dogs/notes.txt").write_text("not a picture")
+    (tmp_path / "cats/more").mkdir()
+    with pytest.raises(UsageError) as caught:
+        read_class_folder(tmp_path, 10_000)
+    lines = caught.value.message.split("\n")
+    assert lines[0] == f"{tmp_path}: 5 faults"
+    for name, fault in (
+        ("stray.png", "a picture beside the class folders"),
+        ("more", "a folder within the class folder 'cats'"),
+        ("small.png", "3 x 4 pixels, the first image (a.png) has 16 x 4"),
+        ("notes.txt", "not an image that can be read"),
+        ("empty", "a class folder without pictures"),
+    ):
+        assert any(name in line and fault in line for line in lines[1:]), name
+    assert caught.value.remedy.count(";") == 4  # five remedies

@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ GOOD = {
     "replay": "r.pansrec",
     "verify": "b.pans",
     "info": "b.pans",
+    "profile": "check oled-qcmos",
     "report": "b.pans -o new.html",
     "export": "r.pansrec --format csv -o new",
     "bundle": "--patterns p.npy --table t.npy --classes a,b -o new.pans",
@@ -104,6 +106,8 @@ def write_inputs(folder: Path, recording: Path, bundle: Path) -> None:
     images = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8)
     classes = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
     np.savez(folder / "s.npz", images=images, labels=np.arange(200) % 10, classes=np.array(classes))
+    np.savez(folder / "small.npz", images=images[:, :14, :14], labels=np.arange(200) % 10, classes=np.array(classes))
+    np.savez(folder / "letters.npz", images=images, labels=np.arange(200) % 10, classes=np.array([*"abcdefghij"]))
     (folder / "f.toml").write_text("kind = 1\n")
     (folder / "c.json").write_text("{}\n")
     (folder / "nothing.html").write_text("<html></html>\n")
@@ -121,9 +125,60 @@ def write_inputs(folder: Path, recording: Path, bundle: Path) -> None:
             (folder / f"half.{suffix}").write_bytes(whole[: len(whole) // 2])
 
 
+RUN = f"run b.pans --decisions 1 --out new --device {FAST}"
+# what no parser knows of: ports, addresses, options without effect, files that do not belong together
+BY_HAND = {
+    "run b.pans --out new --profile oled-qcmos --decisions 1 --device": {
+        **{f"serial:{port}": 3 for port in ("/dev/nope", "folder.pans", "b.pans", "/dev/null", "socket://127.0.0.1:1")},
+        **{url: 3 for url in ("usb:ffff:ffff", "serial:ffff:ffff", "serial:socket://nowhere.invalid:1", "serial:socket://127.0.0.1:99999")},
+        **{url: 2 for url in ("nonsense", "nonsense:x", "sim:", "sim:nonsense", "usb:")},
+        **{f"{FAST}&{more}": 2 for more in ("seed=x", "seed=-1", "pace=slow", "colour=red", "scene=none", "scene=folder.npz")},
+        **{f"{FAST}&{more}": 2 for more in ("scene=noise.npz", "scene=fifo.npz", "faults=nonsense", "faults=loss:2", "offset=-1")},
+        **{f"{FAST}&{more}": 2 for more in ("changes=x", "optics=b.pans", "drift_ppm=1e9", "buffer=0", "scene=small.npz")},
+        **{f"{FAST}&{more}": 2 for more in ("scene=letters.npz", "scene=fashion200&scene")},
+    },
+    RUN: {
+        **{more: 2 for more in ("--gate-class Bag", "--gate-delay-us 5", "--act tcp:127.0.0.1:1", "--act-profile ideal", "--pool 2")},
+        **{more: 2 for more in ("--metrics-public", "--calibration-max-age-h 3", "--rotate-mb 0", "--keep-mb 1", "--drive host")},
+        **{more: 2 for more in ("--confidence 0.9", "--flow nonsense", "--profile dmd-spad", "--state no/such/x.json")},
+        **{more: 2 for more in ("--metrics nowhere", "--metrics 127.0.0.1:99999", "--metrics 0.0.0.0:9464", "--metrics BUSY")},
+        **{more: 2 for more in ("--record new.pansrec --trace new.pansrec", "--record b.pans --force", "--trace b.pans --force")},
+        **{more: 2 for more in ("--flow cells --decisions 3", "--rotate-mb 1 --on-dark mask", "--backend automaton", "--core 9999")},
+    },
+    "simulate --profile oled-qcmos --scene uniform --listen": {
+        **{port: 2 for port in ("nonsense", "tcp:", "tcp:127.0.0.1", "tcp:127.0.0.1:99999", "tcp:127.0.0.1:x")},
+        **{port: 3 for port in ("BUSY", "tcp:nowhere.invalid:0")},
+    },
+    "bundle --patterns p.npy --table t.npy -o new.pans": {
+        **{more: 2 for more in ("--classes a", "--classes a,a", "--classes a,b,c", "--classes a,b --image-shape 3x3")},
+        **{more: 2 for more in ("--classes a,b --levels 1", "--classes a,b --levels 70000", "--classes a,b --image-shape x")},
+    },
+    "evaluate b.pans": {"--task small.npz": 2, "--task letters.npz": 2, "--task nonsense": 2, "--exact --trials 3": 2},
+    "profile": {
+        **{more: 2 for more in ("new", "new a.txt", "new b.toml --from nonsense", "new oled-qcmos.toml", "new there.toml")},
+        **{more: 2 for more in ("new no/such/x.toml", "new ..toml", "list x", "show", "check", "check f.toml", "check latin.toml")},
+        "check --from x": 2,
+    },
+    "data": {"scene": 2, "fetch nonsense": 2, "scene cells -o new.txt": 2, "scene nonsense -o new.npz": 2, "scene a b -o new.npz": 2},
+    "verify": {"": 2, "no-such-name": 2, "b.pans missing.pans": 2},
+    "help": {"nonsense": 2},
+    "": {"nonsense": 2, "--nonsense": 2, "rnu": 2},
+}  # fmt: skip
+TRAINS = {"evaluate", "data"}
+
+
 def cases() -> list[Case]:
     """All of them, in the order of the commands."""
-    return [case for name in GOOD for case in _cases_of(name)]
+    return [*(case for name in GOOD for case in _cases_of(name)), *_by_hand()]
+
+
+def _by_hand() -> Iterator[Case]:
+    for words, ways in BY_HAND.items():
+        name = words.split(" ")[0]
+        if name in TRAINS and not find_spec("torch"):
+            continue
+        for more, code in ways.items():
+            yield Case((*words.split(), *more.split()), frozenset({code}))
 
 
 def _cases_of(name: str) -> Iterator[Case]:

@@ -46,7 +46,7 @@ def _scene(args: argparse.Namespace) -> int:
             "a scene is made of one task and written to one file", remedy="pans data scene TASK -o FILE.npz"
         )
     if args.out.suffix != ".npz":
-        raise UsageError(f"{args.out}: a scene's name ends in .npz")
+        raise UsageError(f"{args.out}: a scene's name ends in .npz", remedy=f"-o {args.out.with_suffix('.npz')}")
     if args.objects is not None and args.objects < 1:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
     check_outputs([args.out], inputs=args.names, force=args.force)

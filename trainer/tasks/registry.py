@@ -113,6 +113,8 @@ def load_task(name_or_path: str, data_dir: str | Path | None = None, *, data_see
     tasks, and says nothing to others. UsageError says what
     is missing or unfit, DamagedFileError which file is not the pinned one.
     """
+    if data_seed < 0:
+        raise UsageError(f"--data-seed is {data_seed}, allowed: 0 or more")
     if name_or_path in PUBLIC_SETS:
         return _load_public(name_or_path, data_folder(data_dir))
     if name_or_path in FIBRE_TASKS:

@@ -67,3 +67,14 @@ def test_any_number_of_objects_fits_and_changes_no_figure(monkeypatch: pytest.Mo
     assert summed.objects == 500
     assert summed.accuracy_stderr_objects == pytest.approx(whole.accuracy_stderr_objects, rel=1e-12)
     assert replace(summed, accuracy_stderr_objects=whole.accuracy_stderr_objects) == whole
+
+
+def test_an_object_that_is_shown_again_is_the_same_object() -> None:
+    rng = np.random.default_rng(2)
+    right = rng.random((4, 10)) < 0.7  # four showings of each of ten objects
+    tally = RunTally(2, 1, distinct=10)
+    for number, value in enumerate(right.ravel()):
+        tally.add(decision(number, 0, int(value), 1), 1.0)
+    summary = tally.figures()
+    assert (summary.objects, summary.decisions) == (10, 40)
+    assert summary.accuracy_stderr_objects == pytest.approx(right.mean(axis=0).std(ddof=1) / np.sqrt(10))

@@ -42,6 +42,7 @@ FACTS_OF_A_DEVICE = {
         "automaton_schema": AUTOMATON_SCHEMA,
         "automaton_states": 0,
         "dwell_steps": 1,
+        "objects": 0,
         "scene_height_px": 1,
         "scene_width_px": 1,
     },
