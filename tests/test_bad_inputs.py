@@ -94,4 +94,4 @@ def test_a_bad_input_is_refused(
 
 def test_there_are_200_and_every_command_is_among_them() -> None:
     assert len({case.words for case in CASES}) == len(CASES) >= 200
-    assert {*GOOD} == {*find_commands()}
+    assert {*GOOD} <= {*find_commands()} <= {case.words[0] for case in CASES if case.words}

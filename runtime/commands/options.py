@@ -91,7 +91,7 @@ def add_flow_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-OF_FLOW = {
+OF_FLOW: Mapping[str, Any] = {
     "gate_class": [],
     "gate_delay_us": None,
     "act": "device",

@@ -33,7 +33,8 @@ def check_scene(facts: Mapping[str, Any], bundle: Bundle) -> None:
     height, width = facts.get("scene_height_px"), facts.get("scene_width_px")
     ours = bundle.image_shape
     fits = height is None or width is None or (int(height), int(width)) == tuple(ours)
-    fits = fits or (ours[0] == 1 and ours[1] == int(height) * int(width))  # made of patterns without a shape
+    if height is not None and width is not None and ours[0] == 1:  # made of patterns without a shape
+        fits = ours[1] == int(height) * int(width)
     named = facts.get("scene_classes_sha256")
     same = named is None or not bundle.classes or named == _digest(bundle.classes)
     if fits and same:
