@@ -8,16 +8,19 @@ floating-point ones 1.0; colours become luminance (ITU-R 601) and transparency i
 from __future__ import annotations
 
 import hashlib
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .container import open_regular
+from .container import MIB, open_regular
 from .errors import DamagedFileError, PansError, UsageError
+from .npz_file import read_arrays
 
 FULL_SCALE_16 = 65535
+LABELLED_MAX_BYTES = 1024 * MIB
 FAULTS_SHOWN = 20  # of a folder; the rest is counted
 PILLOW_REMEDY = "pip install pillow"
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
@@ -157,3 +160,41 @@ def to_8_bits(where: Path, values: NDArray[Any], full_scale: float) -> NDArray[n
             remedy="scale them, or save 8 bits",
         )
     return np.asarray(np.rint(values.astype(np.float64) * (255 / full_scale)), dtype=np.uint8)
+
+
+def shipped_scene(name: str) -> Path | None:
+    """Return the file of the simulator's scene of that name, None where there is none."""
+    try:
+        found = resources.files("pans.firmware_sim") / "scenes" / f"{name}.npz"  # its files, not its code
+    except ModuleNotFoundError:
+        return None
+    return Path(str(found)) if "/" not in name and found.is_file() else None
+
+
+def read_labelled(name: str) -> LabelledPictures:
+    """Return images uint8 (n, h, w), labels int64 (n,) and class names ("" for unnamed ones); UsageError says what is wrong."""
+    path = Path(name)
+    if path.is_dir():
+        return read_class_folder(path, LABELLED_MAX_BYTES)
+    path = path if path.exists() else shipped_scene(name) or path
+    try:
+        arrays = read_arrays(path, ("images", "labels", "classes"), LABELLED_MAX_BYTES)
+    except ValueError as error:
+        raise UsageError(
+            f"{path}: no file of labelled images: {error}",
+            remedy="name a .npz file with images and labels, a folder of class folders, or a shipped scene",
+        ) from error
+    images, labels = arrays.get("images", np.zeros(0)), arrays.get("labels", np.zeros(0))
+    if images.dtype != np.uint8 or images.ndim != 3 or not images.size or labels.shape != images.shape[:1]:
+        raise UsageError(
+            f"{path}: images {images.dtype} {images.shape}, labels {labels.dtype} {labels.shape}, "
+            "allowed: uint8 (n, height, width), integers (n,)",
+            remedy="save them with numpy.savez(FILE, images=, labels=)",
+        )
+    if labels.dtype.kind not in "iu":
+        raise UsageError(f"{path}: labels are {labels.dtype}, allowed: integers")
+    return LabelledPictures(images, labels.astype(np.int64), _names(arrays.get("classes")), "")
+
+
+def _names(classes: NDArray[np.str_] | None) -> tuple[str, ...]:
+    return () if classes is None else tuple(str(name) for name in classes.ravel())

@@ -97,7 +97,7 @@ def check_options(options: Options, profile: Profile) -> None:
         value = getattr(options, name)
         if value is not None and not (value <= LIGHT_MAX and (value > 0 or (name == "alpha" and value == 0))):
             raise UsageError(f"{_flag(name)} is {value:g}, allowed: above 0, at most {LIGHT_MAX:g}")
-    if not 0 < options.slope <= SLOPE_MAX or not options.clamp > 0:
+    if not 0 < options.slope <= SLOPE_MAX or not (0 < options.clamp <= LIGHT_MAX or options.clamp == math.inf):
         raise UsageError(
             f"--slope is {options.slope:g}, --clamp is {options.clamp:g}, allowed: above 0 (slope to {SLOPE_MAX:g})"
         )

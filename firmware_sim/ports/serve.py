@@ -61,7 +61,10 @@ def parse_sim_url(url: str) -> SimOptions:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=16)
     except ValueError as error:
-        raise UsageError(f"{url!r}: the part after ? is no list of key=value: {error}") from error
+        raise UsageError(
+            f"{url!r}: the part after ? is no list of key=value: {error}",
+            remedy="for example sim:ideal?scene=uniform&seed=1",
+        ) from error
     known = {field.name: field.type for field in fields(SimOptions) if field.name != "profile"}
     options = SimOptions(profile)
     for key, text in pairs:

@@ -22,6 +22,7 @@ from pans.runtime.safe_text import one_line
 if TYPE_CHECKING:  # the help of a command must not load what it works with
     from numpy.typing import NDArray
 
+    from pans.runtime.bundle.model import Bundle
     from pans.runtime.bundle.quantise import QuantisedPatterns
     from pans.runtime.instrument.profile import Profile
     from pans.runtime.report.verify import FileVerdict
@@ -148,6 +149,11 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--image-shape", metavar="HxW", help="rows x columns of a pattern (default: square, else one row)"
     )
+    parser.add_argument(
+        "--data",
+        metavar="SCENE",
+        help="say what rounding to the levels costs in accuracy on these labelled images: .npz, class folders or a shipped scene",
+    )
     parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.pans", help="the file to write")
@@ -183,8 +189,9 @@ def _bundle(args: argparse.Namespace) -> int:
         provenance={**provenance, "quantisation": _quantisation_facts(quantised)},
     )
     exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}
+    cost = _cost(args, patterns, bundle, exposure.get("exposure_us", 0.0), profile) if args.data else {}
     sha256 = write_bundle(bundle, args.out, force=args.force)
-    facts = {**_quantisation_facts(quantised), **exposure, "levels": levels, "patterns": bundle.n_features}
+    facts = {**_quantisation_facts(quantised), **exposure, **cost, "levels": levels, "patterns": bundle.n_features}
     emit(args, {"bundle": str(args.out), "sha256": sha256, **facts}, "\n".join(_bundle_lines(args.out, sha256, facts)))
     return EXIT_FINE
 
@@ -204,6 +211,30 @@ def _inputs(args: argparse.Namespace, profile: Profile | None) -> tuple[NDArray[
     }
     made_by = {"made_by": "pans bundle", "pans_version": __version__, "inputs": sources}
     return patterns, made_by | ({"profile": {"name": profile.name, "sha256": profile.sha256}} if profile else {})
+
+
+def _cost(
+    args: argparse.Namespace, patterns: NDArray[Any], bundle: Bundle, exposure_us: float, profile: Profile | None
+) -> dict[str, Any]:
+    """What rounding costs on the objects of --data, with the profile's detector, or one that counts every photon."""
+    from pans.runtime.decide.quantisation_cost import quantisation_cost
+    from pans.runtime.images import read_labelled
+
+    data = read_labelled(args.data)
+    if data.classes and data.classes != bundle.classes:
+        raise UsageError(
+            f"{args.data} has the classes {', '.join(data.classes[:5])}, allowed with --classes: {', '.join(bundle.classes[:5])}"
+        )
+    with as_usage_error():
+        cost = quantisation_cost(patterns, bundle, data.images, data.labels, exposure_us, profile)
+    return {
+        "accuracy_given": cost.accuracy_given,
+        "accuracy_shown": cost.accuracy_shown,
+        "accuracy_difference_se": cost.difference_se,
+        "objects": cost.objects,
+        "trials": cost.trials,
+        "simulated": True,
+    }
 
 
 def _quantisation_facts(quantised: QuantisedPatterns) -> dict[str, Any]:
@@ -227,6 +258,12 @@ def _bundle_lines(out: Path, sha256: str, facts: Mapping[str, Any]) -> Iterator[
         f"  illumination {facts['illumination']:.6g} photons ({facts['illumination_error_relative']:+.2%} by rounding); "
         f"{facts['pixels_lost']} lit pixels became dark"
     )
+    if "accuracy_given" in facts:
+        change = facts["accuracy_shown"] - facts["accuracy_given"]
+        yield (
+            f"  SIMULATED accuracy {facts['accuracy_given']:.2%} with the patterns as given, {facts['accuracy_shown']:.2%} rounded: "
+            f"{100 * change:+.2f} ± {100 * facts['accuracy_difference_se']:.2f} points on {facts['objects']} objects"
+        )
     if "exposure_us" in facts:
         yield f"  exposure {facts['exposure_us']:.6g} us"
 

@@ -24,7 +24,11 @@ def scene_facts(shape: tuple[int, int] | None, classes: Sequence[str]) -> dict[s
     if shape is not None:
         facts |= {"scene_height_px": shape[0], "scene_width_px": shape[1]}
     if classes:
-        facts |= {"scene_classes": _names(classes), "scene_classes_sha256": _digest(classes)}
+        facts |= {
+            "scene_n_classes": len(classes),
+            "scene_classes": _names(classes),
+            "scene_classes_sha256": _digest(classes),
+        }
     return facts
 
 
@@ -35,9 +39,7 @@ def check_scene(facts: Mapping[str, Any], bundle: Bundle) -> None:
     fits = height is None or width is None or (int(height), int(width)) == tuple(ours)
     if height is not None and width is not None and ours[0] == 1:  # made of patterns without a shape
         fits = ours[1] == int(height) * int(width)
-    named = facts.get("scene_classes_sha256")
-    same = named is None or not bundle.classes or named == _digest(bundle.classes)
-    if fits and same:
+    if fits and _same_classes(facts, bundle.classes):
         return
     size = f"{height} x {width} pixels" if height is not None else "any size"
     raise UsageError(
@@ -46,6 +48,15 @@ def check_scene(facts: Mapping[str, Any], bundle: Bundle) -> None:
         f"the bundle has {ours[0]} x {ours[1]} pixels and the classes {_names(bundle.classes) or 'unknown'}",
         remedy="name a scene of the bundle's task: scene=NAME in the device URL, or --scene of `pans simulate`",
     )
+
+
+def _same_classes(facts: Mapping[str, Any], classes: Sequence[str]) -> bool:
+    """Whether scene and bundle mean the same classes; numbers 0, 1, 2, ... are no names, and stand for as many of any name."""
+    named, count = facts.get("scene_classes_sha256"), len(classes)
+    if named is None or not classes or named == _digest(classes):
+        return True
+    numbers = [str(number) for number in range(count)]
+    return facts.get("scene_n_classes") == count and (list(classes) == numbers or named == _digest(numbers))
 
 
 def scene_words(facts: Mapping[str, Any], device: str) -> str:

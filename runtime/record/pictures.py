@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.errors import UsageError
 from pans.runtime.image_quality import likeness
+from pans.runtime.images import shipped_scene
 from pans.runtime.npz_file import read_arrays
 from pans.runtime.outputs import write_file
 
@@ -97,15 +97,6 @@ class PictureLog:
             "mse_mean": float(alike.mse.mean()) if known else None,
             "pictures": len(objects),
         }
-
-
-def shipped_scene(name: str) -> Path | None:
-    """Return the file of the simulator's scene of that name, None where there is none."""
-    try:
-        found = resources.files("pans.firmware_sim") / "scenes" / f"{name}.npz"  # its files, not its code
-    except ModuleNotFoundError:
-        return None
-    return Path(str(found)) if "/" not in name and found.is_file() else None
 
 
 def _images(name: Path) -> NDArray[np.uint8]:

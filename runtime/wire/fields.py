@@ -236,6 +236,7 @@ FACTS: Mapping[str, Fact] = {
     "objects": Fact(int, False, 0, U32_MAX),
     "scene_height_px": Fact(int, False, 1, U16_MAX),
     "scene_width_px": Fact(int, False, 1, U16_MAX),
+    "scene_n_classes": Fact(int, False, 1, U16_MAX),
     "scene_classes": Fact(str),
     "scene_classes_sha256": Fact(str),
     "automaton_schema": Fact(int, False, 0, U32_MAX),

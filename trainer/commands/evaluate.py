@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.automaton import CONFIDENCE_RANGE
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
@@ -32,7 +32,7 @@ PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png", "r
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bundle", metavar="BUNDLE", help="a .pans file")
+    parser.add_argument("bundle", metavar="BUNDLE", help="a .pans file, or the name of a shipped bundle")
     parser.add_argument("--task", metavar="T", help="as of `pans train` (default: what the bundle was trained on)")
     parser.add_argument("--profile", metavar="P", help="default: what the bundle was trained for")
     parser.add_argument("--shots", type=int, default=1, metavar="K", help="exposures of every pattern (default 1)")
@@ -70,9 +70,10 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.bundle.model import bundle_path, load_bundle
     from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, measure, walks_on
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
+    from pans.trainer.tasks.remembered import remembered_task
 
     if args.objects is not None and args.objects < 1:
         raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
@@ -92,7 +93,11 @@ def _evaluate(args: argparse.Namespace) -> int:
         trials = default_trials(bundle)
     more: dict[str, Any] = {}
     with usage_errors():
-        held_out = held_out_of(bundle, args.task, args.objects, args.data_dir, conditions)
+        task = args.task or remembered_task(bundle.provenance, bundle.task, bundle_path(args.bundle))
+        held_out = held_out_of(bundle, task, args.objects, args.data_dir, conditions)
+        _check_data_seed(args, held_out)
+        assumed = not args.profile and "profile" not in bundle.provenance
+        note(f"evaluating {bundle.name} on {held_out.task.name}")
         started = time.perf_counter()
         if bundle.automaton is None:
             measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
@@ -109,6 +114,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         **more,
         "task": held_out.task.name,
         "profile": held_out.profile.name,
+        "profile_assumed": assumed,
         "sha256": digest,
         "seconds": time.perf_counter() - started,
         "simulated": True,
@@ -116,8 +122,28 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.pictures:
         payload["pictures"] = _draw(args, bundle, held_out, conditions)
     differences = more.get("expected_differences") or []
-    emit(args, payload, "\n".join([words_of(measured, more), *differences]))
+    emit(args, payload, "\n".join([words_of(measured, more), _profile_words(bundle, held_out, args), *differences]))
     return EXIT_ALERT if differences else EXIT_FINE
+
+
+def _check_data_seed(args: argparse.Namespace, held_out: HeldOut) -> None:
+    from pans.trainer.tasks.public_sets import PUBLIC_SETS
+
+    name = held_out.task.name
+    if args.data_seed is not None and (held_out.task.split_here or name in PUBLIC_SETS):
+        raise UsageError(
+            f"--data-seed has no effect on the task {name}", remedy="leave it out: it belongs to drawn tasks"
+        )
+
+
+def _profile_words(bundle: Bundle, held_out: HeldOut, args: argparse.Namespace) -> str:
+    """Which profile the figures are for, and whether anybody said so."""
+    name = held_out.profile.name
+    if args.profile:
+        return f"  profile {name}"
+    if "profile" in bundle.provenance:
+        return f"  profile {name}, which the bundle was trained for"
+    return f"  profile {name}, assumed: the bundle names none, and another one gives other figures (--profile)"
 
 
 def _compared(bundle: Bundle, measured: MeasuredWalks, held_out: HeldOut, args: argparse.Namespace) -> dict[str, Any]:

@@ -66,6 +66,8 @@ def _run(args: argparse.Namespace) -> int:
         check_outputs(files, force=args.force, ours=is_page_file, makes_folders=True)
     if args.from_json:
         return _rewrite(names, args)
+    for name in names:
+        _check(name, args)
     torch.set_num_threads(args.threads)
     args.cache = args.cache.expanduser()
     make_folder(args.cache)
@@ -104,7 +106,6 @@ def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
 
 
 def _measured(name: str, args: argparse.Namespace) -> tuple[Page, Made]:
-    _check(name, args)
     rows, dark = (None if wanted is None else tuple(wanted) for wanted in (args.rows, args.dark))
     asked = Asked(name, args.cache, rows, args.data_dir, args.collect, say, dark, args.data_seed, args.seeds, args.out)
     page = page_of(name)

@@ -281,9 +281,11 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
 def _export(args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float) -> Exported:
     from pans.trainer.export.writer import export_trained
     from pans.trainer.tasks.registry import task_names
+    from pans.trainer.tasks.remembered import path_from
 
     provenance = {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,
+        "data_path": path_from(args.out, args.task),
         "data_seed": args.data_seed,
         "options": plain_options(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),

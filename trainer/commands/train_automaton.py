@@ -99,9 +99,11 @@ def _export(
 ) -> ExportedAutomaton:
     from pans.trainer.export.automaton import export_automaton
     from pans.trainer.tasks.registry import task_names
+    from pans.trainer.tasks.remembered import path_from
 
     provenance = {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,
+        "data_path": path_from(args.out, args.task),
         "data_seed": args.data_seed,
         "options": asdict(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),

@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.registry import Objects, Task, load_task
+from pans.trainer.tasks.remembered import remembered_task
 
 from .accuracy import (
     EXACT_OUTCOMES_MAX,
@@ -67,6 +68,8 @@ def evaluate(
     ValueError where the outcomes are too many to enumerate or an argument is out of range.
     """
     model = bundle if isinstance(bundle, Bundle) else load_bundle(bundle)[0]
+    if task is None and not isinstance(bundle, Bundle):
+        task = remembered_task(model.provenance, model.task, bundle_path(bundle))
     held_out = held_out_of(model, task, objects, data_dir, conditions)
     exact = exact or model.automaton is not None
     if trials is None and (not exact or model.picture_shape is not None):

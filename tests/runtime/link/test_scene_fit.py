@@ -23,6 +23,7 @@ def test_what_belongs_together_is_taken() -> None:
         scene_facts((28, 28), ()),
         scene_facts(None, FASHION.classes),
         scene_facts((28, 28), FASHION.classes),
+        scene_facts((28, 28), [str(number) for number in range(10)]),  # as many without names
     ):
         check_scene(facts, FASHION)
 
@@ -32,6 +33,7 @@ def test_what_belongs_together_is_taken() -> None:
     [
         ((14, 14), FASHION.classes, "14 x 14 pixels"),
         ((28, 28), ("cat", "dog"), "cat, dog"),
+        ((28, 28), ("0", "1"), "0, 1"),
         ((28, 28), FASHION.classes[::-1], "Ankle boot, Bag, Sneaker"),
         ((784, 1), (), "784 x 1 pixels and the classes unknown"),
     ],

@@ -45,6 +45,7 @@ FACTS_OF_A_DEVICE = {
         "objects": 0,
         "scene_height_px": 1,
         "scene_width_px": 1,
+        "scene_n_classes": 1,
     },
 }
 
