@@ -33,7 +33,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }
 WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "fuzz", "completion"}
-CHECKED_ELSEWHERE = {"demo", "sweep"}  # tests/runtime/commands/test_run_files.py, and below
+CHECKED_ELSEWHERE = {"demo", "sweep", "service"}  # tests/runtime/commands/test_run_files.py, and below
 
 
 @pytest.fixture

@@ -38,7 +38,6 @@ def check_run_files(job: Job) -> None:
             raise refuse_existing(parts[0])
     if job.out_root is not None:
         outputs.append(job.out_root / ".new" / "run")
-    _check_disk(job)
     state = job.continuous.state
     if state is not None:
         check_outputs([state], inputs=inputs, force=job.force, ours=is_state_file)  # its folder must be there
@@ -50,6 +49,7 @@ def check_run_files(job: Job) -> None:
         ours=lambda path: path == state and is_state_file(path),
         makes_folders=True,
     )
+    _check_disk(job)
 
 
 def _check_disk(job: Job) -> None:
