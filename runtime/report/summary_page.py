@@ -17,7 +17,7 @@ from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown
 
 from .summary import Summary
-from .words import flow_rows, walk_rows
+from .words import flow_rows, is_unresolved, walk_rows
 
 
 def write_markdown(
@@ -90,9 +90,14 @@ def _timing(summary: Summary) -> list[str]:
         "",
     ]
     table = ["| stage | p50 | p99 | p99.9 | max |", "| --- | --- | --- | --- | --- |"]
-    stages = {"**exposure end to decision**": summary.latency_us, **summary.stage_latency_us}
+    whole = "**exposure end to decision**"
+    stages = {whole: summary.latency_us, **summary.stage_latency_us}
+    uncertainty_us = summary.clock["worst_uncertainty_us"]
     for name, row in stages.items():
-        table.append(f"| {name} | {row['p50']:.0f} | {row['p99']:.0f} | {row['p999']:.0f} | {row['max']:.0f} |")
+        # the host's own stages are of its clock alone
+        doubt_us = uncertainty_us if name in (whole, "link") else 0.0
+        cells = (row[key] for key in ("p50", "p99", "p999", "max"))
+        table.append(f"| {name} | {' | '.join('not resolved' if is_unresolved(us, doubt_us) else f'{us:.0f}' for us in cells)} |")
     granted = (
         ", ".join(f"{what}: {markdown(answer)}" for what, answer in summary.realtime.items())
         or "virtual time: nothing asked for"

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 
 from pans.runtime.safe_text import one_line
 
+UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host takes
+
+
 if TYPE_CHECKING:
     from pans.runtime.flow.matching import PassageFigures, Share
     from pans.runtime.live.flow_run import FlowFigures
@@ -23,12 +26,11 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     accuracy = "unknown" if summary.accuracy is None else f"{summary.accuracy:.2%}"
     clicks = summary.clicks_mean or 0.0
     photons = "unknown" if summary.photons_mean is None else f"{summary.photons_mean:.2f}"
-    latency, tally = summary.latency_us, summary.tally
+    tally = summary.tally
     lines = [
         f"{banner}{summary.verdict}: {tally.decisions} decisions ({tally.objects} objects × {tally.trials} trials)",
         f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary.illumination:.1f} each",
-        f"  latency       p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, p99.9 {latency['p999']:.0f} us, "
-        f"max {latency['max']:.0f} us; late {summary.late}, lost {summary.lost}",
+        f"  latency       {latency_words(summary)}; late {summary.late}, lost {summary.lost}",
         *([] if summary.flow is None else flow_words(summary.flow)),
         *([] if summary.walks is None else walk_words(summary.walks)),
         *(f"  fault         {one_line(fault)}" for fault in summary.faults),
@@ -36,6 +38,22 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
         f"  report        {one_line(report)}",
     ]
     return "\n".join(lines)
+
+
+def latency_words(summary: Summary) -> str:
+    """Return the quantiles of the time from exposure to decision; what the clock cannot resolve is said, not shown as 0."""
+    names = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
+    values = {name: summary.latency_us[key] for name, key in names.items()}
+    uncertainty_us = summary.clock["worst_uncertainty_us"]
+    if not is_unresolved(values["p50"], uncertainty_us):
+        return ", ".join(f"{name} {value:.0f} us" for name, value in values.items())
+    seen = [f"{name} {value:.0f} us" for name, value in values.items() if not is_unresolved(value, uncertainty_us)]
+    return f"{', '.join([*seen, 'else'] if seen else [])} not resolved (clock uncertainty {uncertainty_us / 1000:.1f} ms)".strip()
+
+
+def is_unresolved(latency_us: float, uncertainty_us: float) -> bool:
+    """Whether a latency of (nearly) 0 says nothing, because the device's clock was not known to a millisecond."""
+    return latency_us < 0.5 and uncertainty_us >= UNRESOLVED_US
 
 
 def walk_rows(walks: WalkFigures) -> list[tuple[str, str]]:
