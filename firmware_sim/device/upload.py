@@ -37,7 +37,7 @@ class Refused(Exception):
 
 @dataclass(slots=True)
 class _Pattern:
-    levels: NDArray[np.uint16]
+    levels: NDArray[np.unsignedinteger]
     filled: int = 0
 
 
@@ -91,14 +91,12 @@ class PatternMemory:
         wanted = self.held_bytes + 2 * chunk.n_pixels - (0 if before is None else 2 * len(before.levels))
         _require(wanted <= MAX_UPLOAD_BYTES, lambda: f"patterns of {wanted} bytes: memory has {MAX_UPLOAD_BYTES}")
         self.held_bytes = wanted
-        dtype = (
-            np.uint8 if self.levels <= 256 else np.uint16
-        )  # until they are stacked: tens of thousands are tens of MiB
+        dtype = np.uint8 if self.levels <= 256 else np.uint16  # tens of thousands are tens of MiB
         pattern = self._patterns[chunk.pattern] = _Pattern(np.zeros(chunk.n_pixels, dtype))
         return pattern
 
-    def stack(self, n_patterns: int) -> NDArray[np.uint16]:
-        """Return patterns 0..n-1 as uint16 (n, pixels); `Refused` when one is missing, incomplete or of another size."""
+    def stack(self, n_patterns: int) -> NDArray[np.unsignedinteger]:
+        """Return patterns 0..n-1 (n, pixels), in one byte where levels fit; `Refused` if one is missing, incomplete or of another size."""
         chosen = [self._patterns.get(index) for index in range(n_patterns)]
         complete = [one for one in chosen if one is not None and one.filled == len(one.levels)]
         if len(complete) < n_patterns:
@@ -108,7 +106,7 @@ class PatternMemory:
         sizes = sorted({len(one.levels) for one in complete})
         if len(sizes) > 1:
             raise Refused(AckStatus.OUT_OF_RANGE, f"patterns have different sizes: {sizes[0]} and {sizes[-1]} pixels")
-        stacked = np.empty((n_patterns, sizes[0]), np.uint16)
+        stacked = np.empty((n_patterns, sizes[0]), complete[0].levels.dtype)
         for row, one in zip(stacked, complete):
             row[:] = one.levels
             one.levels = row  # what is in the memory already does not stand there twice

@@ -26,8 +26,9 @@ from .walks import check_expected, greatest_light, log_scores, walk_difference
 
 ENCODERS = ("active", "coherent", "incoherent", "automaton")  # coherent and incoherent are passive: nothing is shown
 PATTERNS_MAX = 65_535  # of an automaton
-# Patterns times pixels of an automaton: single bits in the file, two bytes each in the host, and again in the simulated instrument.
-PATTERN_CELLS_MAX = 30_000_000
+# Patterns times pixels of an automaton: single bits in the file, two bytes each in the host, one more (two while they are put together)
+# in the simulated instrument. 96 levels of 512 states of 28 x 28 pixels are 38 million; a run with as many takes less than 400 MiB.
+PATTERN_CELLS_MAX = 40_000_000
 FEATURES_MAX = 4096
 PIXELS_MAX = 1 << 22
 LEVELS_MAX = 65536

@@ -97,7 +97,9 @@ def _timing(summary: Summary) -> list[str]:
         # the host's own stages are of its clock alone
         doubt_us = uncertainty_us if name in (whole, "link") else 0.0
         cells = (row[key] for key in ("p50", "p99", "p999", "max"))
-        table.append(f"| {name} | {' | '.join('not resolved' if is_unresolved(us, doubt_us) else f'{us:.0f}' for us in cells)} |")
+        table.append(
+            f"| {name} | {' | '.join('not resolved' if is_unresolved(us, doubt_us) else f'{us:.0f}' for us in cells)} |"
+        )
     granted = (
         ", ".join(f"{what}: {markdown(answer)}" for what, answer in summary.realtime.items())
         or "virtual time: nothing asked for"

@@ -82,7 +82,7 @@ def _patterns(levels: int, parts: dict[str, NDArray[Any]], pixels: int) -> NDArr
     others = {"state_pattern", "state_dwell", "successors", "posteriors"}
     demand(set(parts) == {name, *others, "golden_words", "golden_walks", "golden_posteriors"}, "the parts")
     stored = parts[name]
-    demand(1 <= len(stored) <= 65_535 and len(stored) * pixels <= 30_000_000, "patterns")
+    demand(1 <= len(stored) <= 65_535 and len(stored) * pixels <= 40_000_000, "patterns")
     patterns = np.array([bits_of(row, pixels) for row in stored]) if levels == 2 else stored
     demand(patterns.shape[1] == pixels and int(patterns.max()) < levels, "pixels and levels")
     return patterns

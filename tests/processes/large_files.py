@@ -70,12 +70,12 @@ def large_matrix() -> Bundle:
 
 def large_automaton() -> Bundle:
     """As many pixels of 1-bit patterns as there may be: the file has one byte for sixteen of memory."""
-    return _layered(slots=2, width=37, shape=(768, 1024), levels=2)
+    return _layered(slots=2, width=49, shape=(768, 1024), levels=2)
 
 
 def many_states() -> Bundle:
-    """As many patterns of 28 x 28 pixels as there may be, each shown by one state."""
-    return _layered(slots=598, width=64, shape=(28, 28), levels=2)
+    """As many patterns of 28 x 28 pixels as `dmd-spad` holds, each shown by one state."""
+    return _layered(slots=683, width=64, shape=(28, 28), levels=2)
 
 
 def _layered(slots: int, width: int, shape: tuple[int, int], levels: int) -> Bundle:

@@ -176,8 +176,8 @@ def test_a_version_that_says_too_little_is_refused() -> None:
 def test_bits_that_would_fill_the_memory_are_refused_before() -> None:
     header, arrays = taken_apart(bundle_bytes(automaton_bundle(levels=2)))
     header["image_shape"] = [1024, 2048]
-    arrays["pattern_bits"] = np.zeros((15, 1 << 18), np.uint8)
-    with pytest.raises(DamagedFileError, match="15 patterns of 2097152 pixels, allowed: 30000000 in all"):
+    arrays["pattern_bits"] = np.zeros((20, 1 << 18), np.uint8)
+    with pytest.raises(DamagedFileError, match="20 patterns of 2097152 pixels, allowed: 40000000 in all"):
         parse_bundle(put_together(header, arrays), "here")
 
 
