@@ -19,6 +19,12 @@ COMMANDS = {  # words, what is there already, what else is read
     "bundle": ("bundle --patterns p.npy --table t.npy --classes a,b -o OUT", "OUT", "t.npy"),
     "export csv": ("export r.pansrec --format csv -o DIR", "DIR/clicks.csv", None),
     "export hdf5": ("export r.pansrec --format photon-hdf5 -o OUT", "OUT", "r.pansrec"),
+    "export parquet": ("export r.pansrec --format parquet -o OUT", "OUT", "r.pansrec"),
+    "export onnx": ("export b.pans --format onnx -o OUT", "OUT", "b.pans"),
+    "export npy": ("export b.pans --format npy -o DIR", "DIR/about.json", None),
+    "run config": ("run b.pans --device sim:oled-qcmos?pace=fast --write-config OUT", "OUT", None),
+    "batch": ("batch info b.pans -o OUT.jsonl", "OUT.jsonl", None),
+    "monitoring": ("service monitoring -o DIR", "DIR/grafana-dashboard.json", None),
     "report": ("report b.pans -o OUT", "OUT", "b.pans"),
     "replay": ("replay r.pansrec --pictures OUT", "OUT", "r.pansrec"),
     "bench": ("bench ingest --quick --plot OUT", "OUT", None),
@@ -32,8 +38,8 @@ COMMANDS = {  # words, what is there already, what else is read
     "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
     "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }
-WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "fuzz", "completion"}
-CHECKED_ELSEWHERE = {"demo", "sweep", "service"}  # tests/runtime/commands/test_run_files.py, and below
+WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "fuzz", "completion", "runs"}
+CHECKED_ELSEWHERE = {"demo", "sweep"}  # tests/runtime/commands/test_run_files.py, and below
 
 
 @pytest.fixture

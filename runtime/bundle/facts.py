@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.grey_png import levels_png
+from pans.runtime.html_card import html_card
 from pans.runtime.ranges import Range, demand
 
 from .automaton import Automaton
@@ -24,6 +26,7 @@ from .onnx_check import check_head
 from .optics import LIGHT_RANGE, Analyser, check_analyser
 from .walks import check_expected, greatest_light, log_scores, walk_difference
 
+SHOWN_MAX, SHOWN_PIXELS_MAX = 10, 1 << 14  # patterns and their size in a notebook
 ENCODERS = ("active", "coherent", "incoherent", "automaton")  # coherent and incoherent are passive: nothing is shown
 PATTERNS_MAX = 65_535  # of an automaton
 # Patterns times pixels of an automaton: single bits in the file, two bytes each in the host, one more (two while they are put together)
@@ -120,6 +123,22 @@ class Bundle:
         if self.automaton is None:
             raise ValueError(f"{self.name} has no automaton")
         return self.light_of(self.automaton)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: facts and the first patterns."""
+        parts = {"table": self.table, "head": self.head_onnx, "automaton": self.automaton, "int8 head": self.int8_head}
+        rows = {
+            "task": self.task,
+            "classes": self.classes,
+            "encoder": self.encoder,
+            "patterns": f"{self.n_patterns} of {self.image_shape[0]} x {self.image_shape[1]}, {self.levels} levels",
+            "decides by": tuple(name for name, part in parts.items() if part is not None),
+            "illumination per shot (photons)": self.illumination(),
+            **{f"expected {name}": value for name, value in (self.expected or {}).items()},
+        }
+        shown = self.pattern_levels[:SHOWN_MAX] if 0 < self.n_pixels <= SHOWN_PIXELS_MAX else ()
+        pictures = [levels_png(levels.reshape(self.image_shape), self.levels) for levels in shown]
+        return html_card(f"Bundle {self.name}", rows, [(f"pattern {at}", one) for at, one in enumerate(pictures)])
 
     def light_of(self, automaton: Automaton) -> NDArray[np.float64]:
         """Return what each state of an `automaton` over these patterns shows, as `state_light`."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
 from pans.runtime.errors import DamagedFileError, PansError
+from pans.runtime.html_card import html_card
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
 
@@ -75,6 +76,19 @@ class Outcome:
     confusion: NDArray[np.int64]
     recording: Path | None
     report: Path | None
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the figures of the summary, and the files."""
+        found = self.summary.as_json()
+        names = ("verdict", "faults", "ended", "decisions", "accuracy", "clicks_mean", "photons_mean", "illumination")
+        latency = found.get("latency_us") or {}
+        rows = {
+            "clicks are": "SIMULATED" if found.get("simulated") else "",
+            **{name: found.get(name) for name in (*names, "late", "lost")},
+            "latency p99 (us)": latency.get("p99"),
+            "recording": self.recording,
+        }
+        return html_card("Run", rows)
 
 
 def carry_out(args: argparse.Namespace, job: Job) -> int:

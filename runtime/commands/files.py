@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime import __version__
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, add_force, emit
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
+from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
 
 if TYPE_CHECKING:  # the help of a command must not load what it works with
@@ -29,6 +30,7 @@ if TYPE_CHECKING:  # the help of a command must not load what it works with
 
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
+PHOTONS_AT_WHITE = Range(1e-9, 1e9)
 
 
 # ---- verify ----
@@ -128,7 +130,19 @@ def _show_table(rows: list[tuple[str, str]]) -> None:
 
 
 def _configure_bundle(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--patterns", required=True, type=Path, metavar="P.npy", help="floats (d_f, pixels) in photons")
+    parser.add_argument(
+        "--patterns",
+        required=True,
+        type=Path,
+        metavar="P.npy",
+        help="floats (d_f, pixels) in photons, or a folder of grey PNG pictures in the order of their names",
+    )
+    parser.add_argument(
+        "--photons-at-white",
+        type=PHOTONS_AT_WHITE.option,
+        metavar="N",
+        help="of PNG pictures: photons per exposure through a white pixel and a clear object",
+    )
     parser.add_argument(
         "--head", type=Path, metavar="H.onnx", help="click means (n, d_f) -> scores (n, classes), float32"
     )
@@ -200,16 +214,14 @@ def _inputs(args: argparse.Namespace, profile: Profile | None) -> tuple[NDArray[
     """Return the patterns, and where everything came from; no time of day, so that the same inputs give the same bytes."""
     from pans.runtime.container import read_file
 
-    patterns = _load_array(args.patterns)
-    if patterns.ndim != 2:
-        raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
-    files = {"patterns": args.patterns, "head": args.head, "table": args.table}
+    patterns, pictures = _patterns(args)
+    files = {"patterns": None if pictures else args.patterns, "head": args.head, "table": args.table}
     sources = {
         role: {"file": path.name, "sha256": hashlib.sha256(read_file(path)).hexdigest()}
         for role, path in files.items()
         if path is not None
     }
-    made_by = {"made_by": "pans bundle", "pans_version": __version__, "inputs": sources}
+    made_by = {"made_by": "pans bundle", "pans_version": __version__, "inputs": {**pictures, **sources}}
     return patterns, made_by | ({"profile": {"name": profile.name, "sha256": profile.sha256}} if profile else {})
 
 
@@ -235,6 +247,33 @@ def _cost(
         "trials": cost.trials,
         "simulated": True,
     }
+
+
+def _patterns(args: argparse.Namespace) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return the patterns in photons (d_f, pixels), and of a folder of pictures what it was; its pictures have the shape too."""
+    if not args.patterns.is_dir():
+        if args.photons_at_white is not None:
+            raise UsageError(
+                "--photons-at-white has no effect on an array", remedy="leave it out: arrays are in photons"
+            )
+        patterns = _load_array(args.patterns)
+        if patterns.ndim != 2:
+            raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
+        return patterns, {}
+    from pans.runtime.bundle.pattern_files import read_pattern_pngs
+
+    if args.photons_at_white is None:
+        raise UsageError("pictures do not say how much light white is", remedy="say it with --photons-at-white")
+    grey, (height, width) = read_pattern_pngs(args.patterns)
+    args.image_shape = args.image_shape or f"{height}x{width}"
+    digest = hashlib.sha256(grey.tobytes()).hexdigest()
+    facts = {
+        "folder": args.patterns.name,
+        "pictures": len(grey),
+        "photons_at_white": args.photons_at_white,
+        "sha256": digest,
+    }
+    return grey * args.photons_at_white, {"patterns": facts}
 
 
 def _quantisation_facts(quantised: QuantisedPatterns) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 
 from pans.runtime.errors import ConfigError
+from pans.runtime.html_card import html_card
 
 from .checked_toml import read_toml
 from .profile_schema import ProfileCheck
@@ -121,6 +122,23 @@ class Profile:
     def sha256(self) -> str:
         """Hex digest of the file's text: what a recording stores beside its figures."""
         return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the figures that matter most, with their units."""
+        shows, clicks = self.projector, self.detector
+        rows = {
+            "what": self.description,
+            "mode": self.mode,
+            "projector": f"{shows.kind}, {shows.width_px} x {shows.height_px} px, {shows.levels} levels",
+            "patterns per second at most": shows.pattern_rate_max_hz,
+            "detector": f"{clicks.kind}, {clicks.channels} channels, efficiency {clicks.efficiency:g}",
+            "dark rate (Hz)": clicks.dark_rate_hz,
+            "dead time (ns)": clicks.dead_time_ns,
+            "exposure (us)": f"{self.exposure.min_us:g} to {self.exposure.max_us:g}, readout {self.exposure.readout_us:g}",
+            "decision deadline (us)": self.timing.decision_deadline_us,
+            "to be measured": self.measure,
+        }
+        return html_card(f"Profile {self.name}", rows)
 
     @property
     def min_transmission(self) -> float:

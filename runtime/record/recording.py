@@ -28,6 +28,7 @@ from pans.runtime.container import (
 )
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.html_card import html_card
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
@@ -60,6 +61,25 @@ class Recording:
     def simulated(self) -> bool:
         """Whether the clicks are simulated, as the link said at the start or the device by the end."""
         return bool(self.header.get("simulated") or self.summary.get("simulated"))
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: what was run, and how it ended."""
+        summary = self.summary
+        rows = {
+            "clicks are": "SIMULATED" if self.simulated else "",
+            "recorded": str(self.header.get("created_utc", ""))[:19],
+            "command": self.header.get("command"),
+            "device": self.header.get("device_url"),
+            "decisions": self.n_decisions,
+            "complete": "yes" if self.complete else "no: cut off",
+            **{
+                name: summary.get(name)
+                for name in ("verdict", "accuracy", "clicks_mean", "photons_mean", "late", "lost")
+            },
+            "bytes": self.size,
+            "damage": self.damage,
+        }
+        return html_card(f"Recording {self.path.name}", rows)
 
     def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
         """Yield the whole blocks of these kinds (all without any), checked again; memory holds one block."""

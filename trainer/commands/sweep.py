@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from .arguments import add_data_dir, add_threads, needing, torch_with
 
 TRIALS_MAX = 1_000_000
 JOURNAL_LINE_MAX_BYTES = 1 << 20
+HEARTBEAT_S = 60  # a trial without a sign of life for twice that time is closed as failed
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
         if sum(trial.state == finished for trial in study.trials) < args.trials:
             study.optimize(objective, callbacks=[optuna.study.MaxTrialsCallback(args.trials, states=(finished,))])
     except KeyboardInterrupt:
-        say(f"interrupted; finished trials are in {args.storage}\n  go on: the same command")
+        say(f"interrupted; finished trials are in {shown_storage(args.storage)}\n  go on: the same command")
         return EXIT_INTERRUPTED
     done = [trial for trial in study.trials if trial.state == finished]
     payload = {
@@ -111,9 +113,9 @@ def suggest(trial: Any, base: Options) -> Options:
 
 
 def open_storage(where: str) -> Any:
-    """Return the storage: a URL (`sqlite:///...`, `postgresql://...`) as it is, any other text as a journal file."""
+    """Return the storage: a database for a URL (`sqlite:///...`, `postgresql://...`), for any other text a journal file."""
     if "://" in where:
-        return where
+        return _database(where)
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
@@ -123,6 +125,33 @@ def open_storage(where: str) -> Any:
         raise UsageError(f"{path.parent} is not a folder", remedy="make it first")
     _check_journal(path)
     return JournalStorage(JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path))))
+
+
+def _database(url: str) -> Any:
+    """Return the database; its workers send signs of life, so that the trial of one that was killed is closed by the others."""
+    from optuna.storages import RDBStorage
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True}, heartbeat_interval=HEARTBEAT_S)
+    except ImportError as error:
+        remedy = "pip install 'pans-runtime[postgres]', or the driver of your database"
+        raise UsageError(f"--storage {shown_storage(url)}: its driver is not installed", remedy=remedy) from error
+    except (SQLAlchemyError, ValueError) as error:
+        reason = str(getattr(error, "orig", None) or error).strip().split("\n", 1)[0]
+        raise UsageError(
+            f"--storage {shown_storage(url)}: cannot be opened: {reason}",
+            remedy="write sqlite:///FILE or postgresql://USER:PASSWORD@HOST/DATABASE, and check that the server runs",
+        ) from error
+
+
+def shown_storage(where: str) -> str:
+    """Return a storage's name without its password.
+
+    >>> shown_storage("postgresql://lab:secret@db.example/pans")
+    'postgresql://lab:***@db.example/pans'
+    """
+    return re.sub(r"(?<=://)([^:/@]*):[^/]*@", r"\1:***@", where)
 
 
 def _check_journal(path: Path) -> None:

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from databases import postgres_server
 
 pytest.importorskip("torch", reason="needs the train extra")
 optuna = pytest.importorskip("optuna", reason="needs the sweep extra")
@@ -13,14 +14,24 @@ optuna = pytest.importorskip("optuna", reason="needs the sweep extra")
 from pans.runtime.cli import main  # noqa: E402
 
 
+@pytest.fixture(params=["journal", "postgresql"])
+def storage(request, tmp_path):
+    """A journal file, or a database of a server that is started for the test."""
+    if request.param == "journal":
+        yield str(tmp_path / "study.journal")
+        return
+    pytest.importorskip("psycopg", reason="needs the postgres extra")
+    with postgres_server() as url:
+        yield url
+
+
 @pytest.fixture
-def words(tmp_path):
+def words(tmp_path, storage):
     rng = np.random.default_rng(0)
     labels = rng.integers(0, 2, 60)
     images = rng.integers(0, 50, (60, 3, 3), dtype=np.uint8)
     images[labels == 1, :, 1] = 250
     np.savez(tmp_path / "bars.npz", images=images, labels=labels)
-    storage = str(tmp_path / "study.journal")
     shared = ["sweep", str(tmp_path / "bars.npz"), "--features", "2", "--epochs", "2", "--hidden", "4"]
     return [*shared, "--storage", storage, "--json"]
 
@@ -62,3 +73,16 @@ def test_two_workers_share_a_study_and_a_killed_one_costs_its_trial_alone(words,
     assert other.returncode == 0
     assert mine["trials"] >= 6
     assert theirs["trials"] >= 6
+
+
+@pytest.mark.parametrize(
+    "url", ["nonsense://x/y", "postgresql://lab:secret@127.0.0.1:1/none", "sqlite:////nowhere/at/all.db"]
+)
+def test_databases_that_cannot_be_opened_are_told_without_their_password(url):
+    from pans.runtime.errors import UsageError
+    from pans.trainer.commands.sweep import open_storage
+
+    with pytest.raises(UsageError, match="--storage") as caught:
+        open_storage(url)
+    assert "secret" not in str(caught.value)
+    assert caught.value.remedy

@@ -1,0 +1,218 @@
+"""`pans batch`: items and their words, a journal that goes on where it was, and two Dask workers of which one is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import json_of
+
+from pans.firmware_sim.testing import small_setup
+from pans.runtime.bundle.model import write_bundle
+from pans.runtime.cli import main
+from pans.runtime.errors import UsageError
+from pans.runtime.operate import batch_command
+from pans.runtime.operate.batch import FORMAT, Journal, flat_rows, items_of, run_item
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with three bundles to work on."""
+    monkeypatch.chdir(tmp_path)
+    bundle = small_setup("sequential")[1]
+    for name in ("a", "b", "c"):
+        Path(name).mkdir()
+        write_bundle(bundle, Path(name) / "grid.pans")
+    return tmp_path
+
+
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
+    """Let items answer at once, without processes; return the words of those that ran."""
+    ran: list[tuple[str, ...]] = []
+
+    def answer(words: tuple[str, ...], folder: str) -> dict[str, Any]:
+        ran.append(tuple(words))
+        bad = "b/" in words[1]
+        row = {"exit": 1 if bad else 0, "seconds": 0.1, "host": "here", "error": None}
+        return row | {"answer": {"accuracy": 0.5, "latency_us": {"p50": 2.0}, "rows": [1, 2], "exit": 9}}
+
+    monkeypatch.setattr("pans.runtime.operate.workers.run_item", answer)
+    return ran
+
+
+def test_items_are_inputs_times_values(lab: Path) -> None:
+    items = items_of("evaluate", ["*/grid.pans", "a/grid.pans"], ["seed=0-2", "--eta=0.5,1"], "", files=True)
+    assert len(items) == len({item.key for item in items}) == 3 * 3 * 2
+    assert items[1].words == ("evaluate", "a/grid.pans", "--seed", "0", "--eta", "1")
+    item, *_ = items_of("report", ["b/grid.pans"], ["seed=7"], "-o '{folder}/my {stem}-{seed}.html'", files=True)
+    assert item.words == ("report", "b/grid.pans", "-o", "b/my grid-7.html")
+    assert items_of("reproduce", ["alpha", "eta"], [], "", files=False)[1].words == ("reproduce", "eta")
+    Path("b/grid.pans").write_bytes(b"changed")
+    assert (
+        items_of("report", ["b/grid.pans"], ["seed=7"], "-o '{folder}/my {stem}-{seed}.html'", files=True)[0].key
+        != item.key
+    )
+
+
+@pytest.mark.parametrize("vary", ["seed", "=1", "seed=", "seed=0-99999999", "--=3"])
+def test_values_that_are_none(vary: str, lab: Path) -> None:
+    with pytest.raises(UsageError, match="--vary"):
+        items_of("evaluate", ["a/grid.pans"], [vary], "", files=True)
+
+
+def test_a_batch_goes_on_where_it_was(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ran = in_this_process(monkeypatch)
+    words = ["batch info", "*/grid.pans", "-o", "r.jsonl"]
+    found = json_of(capsys, *words, code=1)
+    assert (found["items"], found["run"]) == (3, 3)
+    assert [row["item"] for row in found["failed"]] == ["b/grid.pans"]
+    lines = Path("r.jsonl").read_text().splitlines()
+    Path("r.jsonl").write_text("\n".join([*lines[:2], lines[2][:-5]]))  # cut within the last line
+    ran.clear()
+    assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 2  # never replaced
+    assert "--resume" in capsys.readouterr().err
+    assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
+    assert ran == [("info", "c/grid.pans")]
+    assert [json.loads(line)["item"] for line in Path("r.jsonl").read_text().splitlines()] == [
+        f"{name}/grid.pans" for name in "abc"
+    ]
+    os.utime("a/grid.pans", (1, 1))  # a changed input is done again
+    assert json_of(capsys, *words, "--resume", code=1)["run"] == 1
+    assert json_of(capsys, *words, "--force", code=1)["run"] == 3
+
+
+def test_an_interrupted_batch_keeps_what_is_done(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_this_process(monkeypatch)
+    results = batch_command.results_here
+
+    def interrupted(items: Any, folder: str) -> Any:
+        yield next(results(items, folder))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch_command, "results_here", interrupted)
+    assert main(["batch", "info", "*/grid.pans", "-o", "r.jsonl"]) == 130
+    assert "--resume" in capsys.readouterr().err
+    assert len(Path("r.jsonl").read_text().splitlines()) == 1
+
+
+def test_results_as_parquet(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the parquet extra")
+    in_this_process(monkeypatch)
+    words = ["batch evaluate", "a/grid.pans", "--vary", "seed=3,4", "-o", "r.parquet"]
+    monkeypatch.setattr(batch_command, "_check_words", lambda command, item: None)
+    json_of(capsys, *words)
+    table = parquet.read_table("r.parquet").to_pydict()
+    assert table["seed"] == ["3", "4"]
+    assert (table["accuracy"], table["latency_us.p50"], table["exit"]) == ([0.5, 0.5], [2.0, 2.0], [0, 0])
+    assert table["rows"] == ["[1, 2]", "[1, 2]"]
+    assert table["answer.exit"] == [9, 9]
+    assert json_of(capsys, *words, "--resume")["run"] == 0
+
+
+def test_foreign_files_are_no_journals(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text in (
+        "precious\n",
+        '{"a": 1}\n',
+        f'{{"format": "{FORMAT}", "key": "k", "item": "i", "exit": 0}}\nprecious\nmore\n',
+    ):
+        Path("r.jsonl").write_text(text)
+        assert main(["batch", "info", "a/grid.pans", "-o", "r.jsonl", "--resume"]) == 2
+        assert "not the journal" in capsys.readouterr().err
+        assert Path("r.jsonl").read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["info", "none*", "-o", "r.jsonl"], "no such file"),
+        (["info", "a/grid.pans", "-o", "r.csv"], "allowed are .parquet and .jsonl"),
+        (["info", "a/grid.pans", "-o", "a/grid.pans/r.jsonl"], "not a folder"),
+        (["refit", "a/grid.pans", "-o", "r.jsonl"], "no `pans refit`"),
+    ],
+)
+def test_what_cannot_be_meant(lab: Path, words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if words[0] == "refit" and "refit" in batch_command.find_commands():
+        pytest.skip("pans refit is there")
+    assert main(["batch", *words]) == 2
+    said = capsys.readouterr().err
+    assert wrong in said
+    assert "remedy: " in said
+    assert not Path("r.jsonl").exists()
+
+
+def test_a_wrong_option_is_found_before_anything_runs(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["batch", "info", "a/grid.pans", "-o", "r.jsonl", "--with", "--colour red"])
+    assert ended.value.code == 2
+    assert "--colour" in capsys.readouterr().err
+    assert not Path("r.jsonl").exists()
+
+
+def test_an_item_is_a_process_with_an_answer_or_an_error(lab: Path) -> None:
+    good, bad = run_item(("info", "a/grid.pans"), str(lab)), run_item(("info", "none"), str(lab))
+    assert (good["exit"], good["error"]) == (0, None)
+    assert good["answer"]["classes"]
+    assert (bad["exit"], bad["answer"]) == (2, None)
+    assert "none" in bad["error"]
+
+
+def test_the_journal_is_flat_in_a_table() -> None:
+    rows = flat_rows([{"format": FORMAT, "key": "k", "item": "i", "exit": 2, "answer": None, "error": "e"}])
+    assert rows == [{"item": "i", "exit": 2, "error": "e"}]
+    assert Journal(Path("x")).rows == {}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills a process")
+def test_two_workers_share_a_batch_and_a_killed_one_costs_no_result(lab: Path) -> None:
+    pytest.importorskip("distributed", reason="needs the dask extra")
+    for number in range(4):
+        (lab / f"more{number}").mkdir()
+        (lab / f"more{number}" / "grid.pans").write_bytes((lab / "a" / "grid.pans").read_bytes())
+    pans = [sys.executable, "-m", "pans"]
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "distributed.cli"]
+    place = ["--scheduler-file", "place.json"]
+    alone = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    started = [
+        subprocess.Popen([*dask[:2], f"{dask[2]}.dask_scheduler", "--port", "0", "--no-dashboard", *place], **quiet)
+    ]
+    try:
+        address = _wait_for(lambda: json.loads(Path("place.json").read_text())["address"])
+        workers = [subprocess.Popen([*dask[:2], f"{dask[2]}.dask_worker", *place, *alone], **quiet) for _ in range(2)]
+        started += workers
+        words = ["batch", "info", "*/grid.pans", "--dask", address, "-o", "r.jsonl", "--json"]
+        batch = subprocess.Popen([*pans, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        started.append(batch)
+        _wait_for(lambda: batch.poll() is not None or Path("r.jsonl").read_text().splitlines()[0])
+        assert batch.poll() is None
+        workers[0].kill()  # in the middle of its next item
+        found = json.loads(batch.communicate(timeout=300)[0])
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert (batch.returncode, found["items"], found["failed"]) == (0, 7, [])
+    rows = [json.loads(line) for line in Path("r.jsonl").read_text().splitlines()]
+    assert len(rows) == len({row["item"] for row in rows}) == 7
+    assert all(row["answer"]["classes"] for row in rows)
+
+
+def _wait_for(look: Any) -> Any:
+    for _ in range(1500):
+        try:
+            if found := look():
+                return found
+        except (OSError, ValueError, IndexError, KeyError):
+            pass
+        time.sleep(0.1)
+    raise AssertionError("it never came")

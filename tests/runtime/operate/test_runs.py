@@ -1,0 +1,146 @@
+"""`pans runs`: what lies in a folder, and what prune may delete: nothing foreign, nothing that is going on, nothing without --yes."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import fixed_run, json_of
+
+from pans.runtime.cli import main
+from pans.runtime.operate.inventory import Run, prunable, run_of
+from pans.runtime.operate.runs import duration_s, size_bytes
+from pans.runtime.run_folder import locked
+
+NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two runs: one whole, one in parts."""
+    root = tmp_path_factory.mktemp("pans-runs")
+    assert main([*fixed_run(20), "--out", str(root / "whole")]) in (0, 1)
+    assert main([*fixed_run(60), "--out", str(root / "parts"), "--rotate-mb", "0.1"]) in (0, 1)
+    return root
+
+
+@pytest.fixture
+def root(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "pans-runs", symlinks=True))
+
+
+def listed(capsys: pytest.CaptureFixture[str], *words: Any, code: int = 0) -> dict[str, Any]:
+    return json_of(capsys, "runs", *words, code=code)
+
+
+def test_the_list_says_what_the_summary_says(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (root / "notes").mkdir()
+    (root / "notes" / "a.txt").write_text("no run")
+    found = {Path(run["folder"]).name: run for run in listed(capsys, root)["runs"]}
+    assert found.keys() == {"whole", "parts"}
+    for name, decisions in (("whole", 20), ("parts", 60)):
+        run = found[name]
+        summary = (root / name / "summary.md").read_text()
+        assert (run["decisions"], run["bundle"], run["simulated"], run["locked"]) == (
+            decisions,
+            "fashion10",
+            True,
+            False,
+        )
+        assert run["verdict"] in ("PASS", "FAIL")
+        assert run["verdict"] in summary
+        assert run["bytes"] == sum(path.stat().st_size for path in (root / name).iterdir())
+        started = datetime.fromisoformat(run["started"])
+        assert abs((datetime.now(UTC) - started).total_seconds()) < 3600
+    assert main(["runs", str(root)]) == 0
+    assert "2 runs" in capsys.readouterr().out
+
+
+def test_a_cut_run_and_one_that_goes_on(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = root / "whole" / "run.pansrec"
+    path.write_bytes(path.read_bytes()[:-3000])
+    (root / "parts" / "run-0001.pansrec").write_bytes(b"damaged")
+    with locked(root / "parts" / ".pans-run.lock"):
+        found = {Path(run["folder"]).name: run for run in listed(capsys, root)["runs"]}
+    assert (found["whole"]["verdict"], found["whole"]["decisions"]) == ("cut", None)
+    assert (found["parts"]["verdict"], found["parts"]["locked"]) == ("running", True)
+
+
+def test_prune_lists_first_and_deletes_only_what_is_ours(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (root / "whole" / "notes.txt").write_text("precious")
+    (root / "latest").symlink_to("parts")
+    before = sorted(root.rglob("*"))
+    found = listed(capsys, "prune", root, "--larger-than", "1B")
+    assert (len(found["runs"]), found["deleted"]) == (2, False)
+    assert sorted(root.rglob("*")) == before
+    found = listed(capsys, "prune", root, "--larger-than", "1B", "--yes", code=1)
+    assert "notes.txt" in found["left"][0]
+    assert sorted(path.name for path in root.rglob("*")) == ["notes.txt", "whole"]
+
+
+def test_a_run_that_goes_on_stays(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with locked(root / "whole" / ".pans-run.lock"):
+        found = listed(capsys, "prune", root, "--keep", "0", "--yes")
+        assert [Path(run["folder"]).name for run in found["runs"]] == ["parts"]
+    assert (root / "whole" / "run.pansrec").exists()
+    assert not (root / "parts").exists()
+
+
+def made(name: str, days: float, size: int, *, is_locked: bool = False) -> Run:
+    started = NOW - timedelta(days=days)
+    return Run(Path(name), started, "b", "PASS", 1, None, size, True, is_locked, (), ())
+
+
+def test_all_conditions_hold_and_the_newest_are_kept() -> None:
+    runs = [made("a", 1, 9), made("b", 40, 9), made("c", 50, 1), made("d", 60, 9), made("e", 70, 9, is_locked=True)]
+
+    def names(**rule: Any) -> str:
+        facts = {"older_s": None, "larger": None, "keep": 0} | rule
+        return "".join(str(run.folder) for run in prunable(runs, now=NOW.timestamp(), **facts))
+
+    assert names() == "abcd"
+    assert names(older_s=30 * 86400.0) == "bcd"
+    assert names(older_s=30 * 86400.0, larger=5) == "bd"
+    assert names(older_s=30 * 86400.0, larger=5, keep=2) == "d"
+    assert names(keep=5) == ""
+    assert names(larger=9) == ""
+
+
+def test_links_are_not_followed(root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.pansrec"
+    (root / "whole" / "run.pansrec").rename(outside)
+    (root / "whole" / "run.pansrec").symlink_to(outside)
+    assert run_of(root / "whole") is None
+
+
+def test_times_and_sizes() -> None:
+    assert (duration_s("30d"), duration_s("1.5 h"), duration_s("2w")) == (2_592_000, 5400, 1_209_600)
+    assert (size_bytes("5GB"), size_bytes("200 MiB")) == (5 * 10**9, 200 << 20)
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["prune", "."], "which runs may go"),
+        (["none"], "cannot be read"),
+        ([".", "--yes"], "no effect on a list"),
+        (["a", "b"], "allowed: one"),
+    ],
+)
+def test_what_cannot_be_meant(words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["runs", *words]) == 2
+    said = capsys.readouterr().err
+    assert wrong in said
+    assert "remedy: " in said
+
+
+@pytest.mark.parametrize(
+    "words", [["--older-than", "30"], ["--older-than", "x d"], ["--larger-than", "5 gb"], ["--keep", "-1"]]
+)
+def test_quantities_that_are_none(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["runs", "prune", ".", *words])
+    assert words[0] in capsys.readouterr().err
