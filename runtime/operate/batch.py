@@ -122,9 +122,9 @@ def run_item(words: Sequence[str], folder: str) -> dict[str, Any]:
     except OSError as error:
         return row | {"seconds": 0.0, "error": f"cannot be started in {folder}: {error.strerror or error}"}
     answer = _answer(done.stdout)
-    error = answer.get("error") if isinstance(answer, dict) else None
-    if isinstance(error, dict):
-        row["error"], answer = str(error.get("message")), None
+    fault = answer.get("error") if isinstance(answer, dict) else None
+    if isinstance(fault, dict):
+        row["error"], answer = str(fault.get("message")), None
     elif answer is None:
         row["error"] = done.stderr[-STDERR_CHARACTERS:].strip() or "no answer"
     return row | {"exit": done.returncode, "seconds": round(time.monotonic() - began_s, 3), "answer": answer}

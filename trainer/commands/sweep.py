@@ -11,6 +11,7 @@ import argparse
 import json
 import re
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -129,11 +130,14 @@ def open_storage(where: str) -> Any:
 
 def _database(url: str) -> Any:
     """Return the database; its workers send signs of life, so that the trial of one that was killed is closed by the others."""
+    from optuna.exceptions import ExperimentalWarning
     from optuna.storages import RDBStorage
     from sqlalchemy.exc import SQLAlchemyError
 
     try:
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True}, heartbeat_interval=HEARTBEAT_S)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)  # of heartbeat_interval
+            return RDBStorage(url, engine_kwargs={"pool_pre_ping": True}, heartbeat_interval=HEARTBEAT_S)
     except ImportError as error:
         remedy = "pip install 'pans-runtime[postgres]', or the driver of your database"
         raise UsageError(f"--storage {shown_storage(url)}: its driver is not installed", remedy=remedy) from error
