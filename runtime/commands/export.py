@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.bundle.pattern_files import about, array_parts, head_with_facts, pattern_pngs
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.operate.parquet import need_pyarrow, write_decisions
+from pans.runtime.operate.pattern_files import about, array_parts, head_with_facts, pattern_pngs
 from pans.runtime.outputs import check_outputs, make_folder, write_file
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list

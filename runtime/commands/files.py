@@ -260,7 +260,7 @@ def _patterns(args: argparse.Namespace) -> tuple[NDArray[Any], dict[str, Any]]:
         if patterns.ndim != 2:
             raise UsageError(f"{args.patterns}: shape {patterns.shape}, allowed: (d_f, pixels)")
         return patterns, {}
-    from pans.runtime.bundle.pattern_files import read_pattern_pngs
+    from pans.runtime.operate.pattern_files import read_pattern_pngs
 
     if args.photons_at_white is None:
         raise UsageError("pictures do not say how much light white is", remedy="say it with --photons-at-white")

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import read_file
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.grey_png import levels_png, read_grey_png
-
-from .facts import Bundle
 
 PICTURES_MAX = 65_535
 METADATA = 14  # ModelProto.metadata_props (onnx.proto)
