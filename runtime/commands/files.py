@@ -164,6 +164,12 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
         "--image-shape", metavar="HxW", help="rows x columns of a pattern (default: square, else one row)"
     )
     parser.add_argument(
+        "--dither",
+        choices=("auto", "on", "off"),
+        default="auto",
+        help="error diffusion instead of rounding (default auto: up to 8 levels)",
+    )
+    parser.add_argument(
         "--data",
         metavar="SCENE",
         help="say what rounding to the levels costs in accuracy on these labelled images: .npz, class folders or a shipped scene",
@@ -176,7 +182,7 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
 
 def _bundle(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import BackEnd, Shown, make_bundle, write_bundle
-    from pans.runtime.bundle.quantise import quantise_patterns
+    from pans.runtime.bundle.quantise import DITHER_LEVELS_MAX, quantise_patterns
     from pans.runtime.container import read_file
     from pans.runtime.core.plan import exposure_us
     from pans.runtime.instrument.profile import load_profile
@@ -188,24 +194,27 @@ def _bundle(args: argparse.Namespace) -> int:
     profile = load_profile(args.profile) if args.profile else None
     levels = profile.projector.levels if profile else DEFAULT_LEVELS if args.levels is None else args.levels
     patterns, provenance = _inputs(args, profile)
+    shape = _image_shape(args.image_shape, patterns.shape[1])
+    dithered = args.dither == "on" or (args.dither == "auto" and levels <= DITHER_LEVELS_MAX)
     with as_usage_error():
-        quantised = quantise_patterns(patterns, levels)
+        quantised = quantise_patterns(patterns, levels, dither=shape if dithered else None)
     bundle = make_bundle(
         name=args.name or args.out.stem,
         task=args.task,
         classes=[name.strip() for name in args.classes.split(",")],
-        image_shape=_image_shape(args.image_shape, patterns.shape[1]),
+        image_shape=shape,
         optics=Shown(levels, quantised.pattern_levels, quantised.photons_per_level),
         back_end=BackEnd(
             head_onnx=read_file(args.head) if args.head else None,
             table=_load_array(args.table) if args.table else None,
         ),
-        provenance={**provenance, "quantisation": _quantisation_facts(quantised)},
+        provenance={**provenance, "quantisation": {**_quantisation_facts(quantised), "dithered": dithered}},
     )
     exposure = {"exposure_us": exposure_us(profile, bundle)} if profile else {}
     cost = _cost(args, patterns, bundle, exposure.get("exposure_us", 0.0), profile) if args.data else {}
     sha256 = write_bundle(bundle, args.out, force=args.force)
-    facts = {**_quantisation_facts(quantised), **exposure, **cost, "levels": levels, "patterns": bundle.n_features}
+    facts = {**_quantisation_facts(quantised), "dithered": dithered, **exposure, **cost, "levels": levels}
+    facts["patterns"] = bundle.n_features
     emit(args, {"bundle": str(args.out), "sha256": sha256, **facts}, "\n".join(_bundle_lines(args.out, sha256, facts)))
     return EXIT_FINE
 
@@ -288,13 +297,14 @@ def _quantisation_facts(quantised: QuantisedPatterns) -> dict[str, Any]:
 
 
 def _bundle_lines(out: Path, sha256: str, facts: Mapping[str, Any]) -> Iterator[str]:
+    how = "error diffusion" if facts["dithered"] else "rounding"
     yield f"{out}  SHA-256 {sha256}"
     yield (
         f"  {facts['patterns']} patterns on {facts['levels']} levels of {facts['photons_per_level']:.6g} photons; "
-        f"rounding is off by at most {facts['quantisation_error_max_photons']:.3g} photons per pixel"
+        f"{how} is off by at most {facts['quantisation_error_max_photons']:.3g} photons per pixel"
     )
     yield (
-        f"  illumination {facts['illumination']:.6g} photons ({facts['illumination_error_relative']:+.2%} by rounding); "
+        f"  illumination {facts['illumination']:.6g} photons ({facts['illumination_error_relative']:+.2%} by it); "
         f"{facts['pixels_lost']} lit pixels became dark"
     )
     if "accuracy_given" in facts:

@@ -7,7 +7,6 @@ when the command runs, not before. All accuracies here are SIMULATED through the
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,7 +31,9 @@ from pans.trainer.options import (
 )
 
 from .arguments import add_data_dir, add_threads, needing, torch_with, usage_errors
+from .course import shown_course
 from .evaluate import words_of
+from .train_own import Chosen, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 
 DEFAULT_PROFILE = "oled-qcmos"
 AUTOMATON = "automaton"
-HISTORY_FILES = ("history.json", "curves.png", "evolution.png")
 # options that are numbers, with the defaults of Options: name, metavar, help
 NUMBERS = (
     ("input_photons", "N", "mean photoelectrons that reach a passive encoder in one exposure"),
@@ -152,18 +152,26 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="go on from OUT.pans.checkpoint")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
     add_data_dir(parser)
+    parser.add_argument(
+        "--as-is",
+        action="store_true",
+        help="of your own images: choose nothing from them, take the options and defaults as they are",
+    )
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
     add_force(parser)
 
 
 def _train(args: argparse.Namespace) -> int:
-    checkpoint = args.out.with_name(args.out.name + ".checkpoint")
-    if args.encoder == AUTOMATON:
-        from .train_automaton import train_automaton_command
+    from .train_automaton import FOREIGN, train_automaton_command
 
+    checkpoint = args.out.with_name(args.out.name + ".checkpoint")
+    own = is_own(args)
+    if own:
+        set_encoder(args, FOREIGN)
+    if args.encoder == AUTOMATON:
         check_files(args, checkpoint)
-        return train_automaton_command(args, checkpoint)
-    if args.features is None:
+        return train_automaton_command(args, checkpoint, own)
+    if args.features is None and not own:
         raise UsageError("--features is missing: the number of patterns", remedy="--features 10, say")
     for name in OF_AUTOMATA:
         if getattr(args, name) not in (None, False):
@@ -179,10 +187,11 @@ def _train(args: argparse.Namespace) -> int:
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
+    chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args, task)
     check_options(options, profile)
     started = time.perf_counter()
-    history = _history(args, options, checkpoint, task)
+    history = _history(args, options, checkpoint, chosen.task)
     try:
         with usage_errors(), _progress(options) as show, computing_on(args.device):
 
@@ -191,11 +200,11 @@ def _train(args: argparse.Namespace) -> int:
                 if history is not None:
                     history.take(epoch)
 
-            trained = train(task, profile, options, checkpoint=checkpoint, resume=args.resume, report=report)
+            trained = train(chosen.task, profile, options, checkpoint=checkpoint, resume=args.resume, report=report)
     except KeyboardInterrupt:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
-    exported = _export(args, task, profile, trained, time.perf_counter() - started)
+    exported = _export(args, task, profile, trained, time.perf_counter() - started, chosen.facts)
     answer, words = _figures(exported, trained, task, profile)
     checkpoint.unlink(missing_ok=True)
     if history is not None:
@@ -204,6 +213,9 @@ def _train(args: argparse.Namespace) -> int:
             say(f"wrote {path}")
     seconds = time.perf_counter() - started
     payload = {"bundle": str(args.out), **answer, "seconds": seconds, "simulated": True}
+    if own and task.target == "class":
+        after = finish(args, task, profile, answer)
+        payload, words = payload | after.payload, f"{words}\n{after.words}"
     emit(args, payload, f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s\n{words}")
     return EXIT_FINE
 
@@ -219,6 +231,8 @@ def check_files(args: argparse.Namespace, checkpoint: Path) -> None:
     check_outputs([args.out], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:
+        from .course import HISTORY_FILES
+
         outputs = [args.history / name for name in HISTORY_FILES]
         check_outputs(outputs, inputs=inputs, force=args.force, makes_folders=True)
 
@@ -278,7 +292,9 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
 
 
-def _export(args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float) -> Exported:
+def _export(
+    args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float, chosen: dict[str, Any]
+) -> Exported:
     from pans.trainer.export.writer import export_trained
     from pans.trainer.tasks.registry import task_names
     from pans.trainer.tasks.remembered import path_from
@@ -289,6 +305,7 @@ def _export(args: argparse.Namespace, task: Task, profile: Profile, trained: Tra
         "data_seed": args.data_seed,
         "options": plain_options(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),
+        **chosen,
     }
     return export_trained(
         args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance, force=args.force
@@ -297,23 +314,15 @@ def _export(args: argparse.Namespace, task: Task, profile: Profile, trained: Tra
 
 @contextmanager
 def _progress(options: Options) -> Iterator[Callable[[EpochReport], None]]:
-    """A bar on a terminal, else a line per tenth of the epochs; both on stderr."""
-    if not sys.stderr.isatty():
-        step = max(1, options.epochs // 10)
-        yield lambda epoch: say(_epoch_line(epoch, options)) if epoch.epoch % step == 0 else None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
+    """A bar and the loss so far on a terminal, else a line per tenth of the epochs; both on stderr."""
+    step, steps = max(1, options.epochs // 10), options.epochs * options.restarts
+    with shown_course("loss") as show:
 
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task("training", total=options.epochs * options.restarts)
-
-        def show(epoch: EpochReport) -> None:
+        def told(epoch: EpochReport) -> None:
             done = epoch.restart * options.epochs + epoch.epoch
-            said = f"{epoch.stage}: loss {epoch.loss:.3f}, {epoch.clicks:.1f} clicks, {epoch.photons:.0f} photons"
-            bar.update(task, completed=done, description=said)
+            show(_epoch_line(epoch, options), epoch.loss, done, steps, epoch.epoch % step == 0)
 
-        yield show
+        yield told
 
 
 def _epoch_line(epoch: EpochReport, options: Options) -> str:

@@ -7,7 +7,6 @@ are exact expectations, SIMULATED through the profile.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, emit, say
 from pans.runtime.errors import UsageError
 
-from .arguments import torch_with, usage_errors
+from .arguments import needing, torch_with, usage_errors
+from .course import shown_course
+from .train_own import After, Chosen, choose, finish
 
 if TYPE_CHECKING:
     from pans.trainer.adaptive.options import AutomatonOptions
@@ -45,12 +46,12 @@ TAKEN = (
     "dark",
 )
 FOREIGN = (
-    *("features", "estimator", "head", "alpha", "budget", "history", "input_photons", "restarts", "starts", "warm"),
+    *("features", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
     *("polish", "similarity", "mix", "shots", "hidden", "slope", "clamp", "complex_field", "conserving"),
 )
 
 
-def train_automaton_command(args: argparse.Namespace, checkpoint: Path) -> int:
+def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: bool = False) -> int:
     """Train as `args` say, write the bundle, and report what it decides on the held-out objects."""
     _refuse_foreign(args)
     torch_with(args.threads)
@@ -62,21 +63,44 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path) -> int:
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
+    chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args)
     check_automaton_options(options, task, profile)
     keep_freed_memory()
     started = time.perf_counter()
+    course: list[Progress] = []
+    if args.history is not None:
+        with needing("--history", "plot"):
+            import matplotlib  # noqa: F401
     try:
         with usage_errors(), _progress() as show, computing_on(args.device):
+
+            def take(told: Progress) -> None:
+                course.append(told)
+                show(told)
+
             trained = train_automaton(
-                task, profile, options, checkpoint=checkpoint, resume=args.resume, report=show, teacher=args.teacher
+                chosen.task,
+                profile,
+                options,
+                checkpoint=checkpoint,
+                resume=args.resume,
+                report=take,
+                held_back=chosen.task.kept,
+                teacher=args.teacher,
             )
-            exported = _export(args, trained, task, profile, time.perf_counter() - started)
+            exported = _export(args, trained, task, profile, time.perf_counter() - started, chosen.facts)
     except KeyboardInterrupt:
         say(f"interrupted; the last whole step is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
     checkpoint.unlink(missing_ok=True)
-    _answer(args, trained, exported, time.perf_counter() - started)
+    if args.history is not None:
+        from pans.trainer.train.history import write_course
+
+        for path in write_course(args.history, course, force=args.force):
+            say(f"wrote {path}")
+    after = finish(args, task, profile, asdict(exported.measured)) if own else After({}, "")
+    _answer(args, trained, exported, time.perf_counter() - started, after)
     return EXIT_FINE
 
 
@@ -95,7 +119,7 @@ def _options(args: argparse.Namespace) -> AutomatonOptions:
 
 
 def _export(
-    args: argparse.Namespace, trained: TrainedAutomaton, task: Any, profile: Any, seconds: float
+    args: argparse.Namespace, trained: TrainedAutomaton, task: Any, profile: Any, seconds: float, chosen: dict[str, Any]
 ) -> ExportedAutomaton:
     from pans.trainer.export.automaton import export_automaton
     from pans.trainer.tasks.registry import task_names
@@ -107,12 +131,15 @@ def _export(
         "data_seed": args.data_seed,
         "options": asdict(trained.options) | {"threads": args.threads, "device": args.device},
         "training_seconds": round(seconds, 1),
+        **chosen,
     }
     name = args.name or args.out.stem
     return export_automaton(args.out, trained, task, profile, name=name, provenance=provenance, force=args.force)
 
 
-def _answer(args: argparse.Namespace, trained: TrainedAutomaton, exported: ExportedAutomaton, seconds: float) -> None:
+def _answer(
+    args: argparse.Namespace, trained: TrainedAutomaton, exported: ExportedAutomaton, seconds: float, after: After
+) -> None:
     bundle = exported.bundle
     automaton = bundle.automaton
     assert automaton is not None
@@ -128,6 +155,7 @@ def _answer(args: argparse.Namespace, trained: TrainedAutomaton, exported: Expor
         "price": trained.price,
         "seconds": seconds,
         "simulated": True,
+        **after.payload,
     }
     lines = [
         f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s",
@@ -135,7 +163,7 @@ def _answer(args: argparse.Namespace, trained: TrainedAutomaton, exported: Expor
         _words("all held-out objects", exported.measured),
         _words("the first 200", exported.first_200),
     ]
-    emit(args, payload, "\n".join(lines))
+    emit(args, payload, "\n".join([*lines, *([after.words] if after.words else [])]))
 
 
 def _words(which: str, found: WalkFigures) -> str:
@@ -149,20 +177,13 @@ def _words(which: str, found: WalkFigures) -> str:
 
 @contextmanager
 def _progress() -> Iterator[Callable[[Progress], None]]:
-    """A bar on a terminal, else a line per epoch and every eighth level; both on stderr."""
-    if not sys.stderr.isatty():
-        yield lambda told: say(_line(told)) if told.stage != "grow" or told.done % 8 == 0 else None
-        return
-    from rich.console import Console
-    from rich.progress import Progress as Bar
+    """A bar and the accuracy so far on a terminal, else a line per epoch and every eighth level; both on stderr."""
+    with shown_course("accuracy %") as show:
 
-    with Bar(console=Console(stderr=True)) as bar:
-        task = bar.add_task("training", total=None)
+        def told(step: Progress) -> None:
+            show(_line(step), 100 * step.accuracy, step.done, step.steps, step.stage != "grow" or step.done % 8 == 0)
 
-        def show(told: Progress) -> None:
-            bar.update(task, completed=told.done, total=told.steps, description=_line(told))
-
-        yield show
+        yield told
 
 
 def _line(told: Progress) -> str:

@@ -78,12 +78,13 @@ def _distorted(images: NDArray[np.uint8], random: np.random.Generator, strength:
     )
     rows = (1 + along) * turn.cos(), shear - turn.sin(), x, turn.sin(), (1 + across) * turn.cos(), y
     grid = affine_grid(torch.stack(rows, dim=1).unflatten(1, (2, 3)), [n, 1, height, width], align_corners=False)
-    grid = grid + strength**2 * _displacements(random, n, (height, width))
+    grid = grid + strength**2 * displacements(random, n, (height, width), DISPLACEMENT)
     shown = torch.from_numpy(images.astype(np.float32)).unsqueeze(1)
     moved = grid_sample(shown, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
     return moved.round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def _displacements(random: np.random.Generator, n: int, shape: tuple[int, int]) -> Tensor:
-    knots = torch.from_numpy(random.standard_normal((n, 2, KNOTS, KNOTS), dtype=np.float32)) * (2 * DISPLACEMENT)
+def displacements(random: np.random.Generator, n: int, shape: tuple[int, int], size: float) -> Tensor:
+    """Return smooth random displacements for a sampling grid that runs from -1 to 1, (n, height, width, 2); `size` of the side."""
+    knots = torch.from_numpy(random.standard_normal((n, 2, KNOTS, KNOTS), dtype=np.float32)) * (2 * size)
     return interpolate(knots, size=shape, mode="bicubic", align_corners=True).permute(0, 2, 3, 1)

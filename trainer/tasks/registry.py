@@ -4,7 +4,8 @@ Owns the reading of .npz files and class folders, with limits, and the split int
 trains and never shows an image. The public sets are in public_sets.py, the drawn ones in generators.py. `load_task` returns a
 `Task` whose images are uint8 (n, height, width): 0 is black.
 
-A user's file or folder without a test part is split by position: every fifth object is held out.
+A user's file or folder without a test part is split by position: every fifth object is held out. Both parts are then mixed, so that
+any stretch of them holds all classes in their shares: folders are read class by class, and trainings keep the last objects back.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, re
 FILE_MAX_BYTES = 1 << 30
 IMAGES_MAX_BYTES = 1 << 30
 HOLD_OUT_EVERY = 5
+ORDER_SEED = 0x0D3E  # of the mixing
 GROUP = "pans.tasks"  # a lab's own: name -> maker(data_seed) -> Task
 
 
@@ -71,6 +73,7 @@ class Task:
     target: str = "class"  # what is asked for: the class, or the `image`
     source: str = ""  # of drawn images: whose generator, which seed
     imaged: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None  # makes images of what is behind them
+    kept: int = 0  # the last training objects have no varied copies before them, and so can choose; 0: a part that a training chooses
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -84,17 +87,9 @@ class Task:
         return self.split == _SPLIT_BY_POSITION
 
     def everything(self) -> Objects:
-        """All objects, in the order of their file where the split was made here."""
-        if not self.split_here:
-            images = np.concatenate([self.train.images, self.test.images])
-            return Objects(images, np.concatenate([self.train.labels, self.test.labels]))
-        n = len(self.train) + len(self.test)
-        held_out = _held_out(n)
-        images = np.empty((n, *self.image_shape), dtype=np.uint8)
-        labels = np.empty(n, dtype=np.int64)
-        images[~held_out], labels[~held_out] = self.train.images, self.train.labels
-        images[held_out], labels[held_out] = self.test.images, self.test.labels
-        return Objects(images, labels)
+        """All objects: those to train on, then those held out."""
+        images = np.concatenate([self.train.images, self.test.images])
+        return Objects(images, np.concatenate([self.train.labels, self.test.labels]))
 
 
 # what white is, by type of the array: nothing is stretched, so that the same grey means the same light in every file
@@ -269,8 +264,24 @@ def _split(where: Path, objects: Objects) -> tuple[Objects, Objects]:
     if len(objects) < 2 * HOLD_OUT_EVERY:
         raise UsageError(f"{where}: {len(objects)} objects, needed are {2 * HOLD_OUT_EVERY} or more")
     held_out = _held_out(len(objects))
-    train = Objects(objects.images[~held_out], objects.labels[~held_out])
-    return train, Objects(objects.images[held_out], objects.labels[held_out])
+    places = np.arange(len(objects))
+    parts = [places[part][mixed_order(objects.labels[part])] for part in (~held_out, held_out)]
+    train, test = (Objects(objects.images[part], objects.labels[part]) for part in parts)
+    return train, test
+
+
+def mixed_order(labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return an order of objects, int64 (n,), that deals out every class evenly from first to last, at random within it.
+
+    The same for the same labels. Any part of the order holds the classes in the shares that all objects have, but for one object.
+    """
+    order = np.random.default_rng(ORDER_SEED).permutation(len(labels))
+    shuffled = labels[order]
+    place = np.empty(len(labels))
+    for label in np.unique(labels):
+        members = np.flatnonzero(shuffled == label)
+        place[members] = (np.arange(len(members)) + 0.5) / len(members)
+    return order[np.argsort(place, kind="stable")]
 
 
 def _held_out(n: int) -> NDArray[np.bool_]:

@@ -33,7 +33,7 @@ class TrainingData:
 
     def __init__(self, task: Task, profile: Profile, options: Options, basis: Tensor | None = None) -> None:
         self.floor = profile.min_transmission if options.encoder == "active" else 0.0
-        n_validation = max(1, len(task.train) // VALIDATION_PART)
+        n_validation = task.kept or max(1, len(task.train) // VALIDATION_PART)
         objects = with_copies(task.train, n_validation, options.copies, options.seed, task.imaged)
         placed = shifted(objects, options.shift_px, options.offset_px, options.seed)
         self.shown = encoder_input(task, placed, profile, options)

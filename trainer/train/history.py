@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -40,6 +41,21 @@ PATTERNS_SHOWN = 8
 QUANTITIES = (("loss", "loss"), ("clicks", "clicks per decision"), ("photons", "photons per decision"))
 
 
+class Reported(Protocol):
+    """What both kinds of training tell of a step; a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def stage(self) -> str: ...
+    @property
+    def loss(self) -> float: ...
+    @property
+    def clicks(self) -> float: ...
+    @property
+    def photons(self) -> float: ...
+
+
 class History:
     """Takes the report of every epoch; `write` leaves the file and the pictures."""
 
@@ -63,30 +79,33 @@ class History:
         self, folder: Path, last: NDArray[np.floating] | None, image_shape: tuple[int, int], *, force: bool = False
     ) -> list[Path]:
         """Write history.json, curves.png and evolution.png; `last` (d_f, pixels) are the patterns in the end."""
-        make_folder(folder)
         if last is not None:
             self.patterns[self._options.epochs] = np.asarray(last, np.float32)
-        facts = {
-            "simulated": True,
-            "epochs": [asdict(epoch) for epoch in self.epochs],
-            "patterns_at": sorted(self.patterns),
-        }
-        write_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode(), force=force)
-        draw_curves(folder / "curves.png", self.epochs, force=force)
-        written = [folder / "history.json", folder / "curves.png"]
+        written = write_course(folder, self.epochs, {"patterns_at": sorted(self.patterns)}, force=force)
         if self.patterns:
             draw_evolution(folder / "evolution.png", self.patterns, image_shape, force=force)
             written.append(folder / "evolution.png")
         return written
 
 
-def draw_curves(path: Path, reports: list[EpochReport], *, force: bool = False) -> None:
-    """Draw loss, clicks and photons over the epochs, one line per restart."""
+def write_course(
+    folder: Path, reports: Sequence[Reported], more: Mapping[str, Any] = MappingProxyType({}), *, force: bool = False
+) -> list[Path]:
+    """Write history.json (the reports and `more`) and curves.png into `folder`; return both paths."""
+    make_folder(folder)
+    facts = {"simulated": True, "epochs": [asdict(report) for report in reports], **more}
+    write_file(folder / "history.json", (json.dumps(facts, indent=1) + "\n").encode(), force=force)
+    draw_curves(folder / "curves.png", reports, force=force)
+    return [folder / "history.json", folder / "curves.png"]
+
+
+def draw_curves(path: Path, reports: Sequence[Reported], *, force: bool = False) -> None:
+    """Draw loss, clicks and photons over the epochs (of an automaton: levels, then epochs), one line per restart."""
     figure, axes = new_figure(width=12.0, height=3.6, panels=len(QUANTITIES))
     for axis, (name, label) in zip(axes, QUANTITIES):
-        for restart in sorted({report.restart for report in reports}):
+        for restart in sorted({_restart(report) for report in reports}):
             # starts and restarts run through the same epochs again: the order is that of the training
-            values = [getattr(report, name) for report in reports if report.restart == restart]
+            values = [getattr(report, name) for report in reports if _restart(report) == restart]
             axis.plot(range(1, len(values) + 1), values, color="C0", alpha=0.9 if restart == 0 else 0.4)
         axis.set(xlabel="epochs trained", ylabel=label)
         axis.grid(alpha=0.3)
@@ -98,6 +117,10 @@ def draw_curves(path: Path, reports: list[EpochReport], *, force: bool = False) 
         axes[0].annotate(stage, (begin, 1.0), xycoords=("data", "axes fraction"), fontsize=7, rotation=90, va="top")
     figure.suptitle("SIMULATED, training objects", fontsize=9)
     save_figure(figure, path, force=force)
+
+
+def _restart(report: Reported) -> int:
+    return int(getattr(report, "restart", 0))
 
 
 def draw_evolution(

@@ -265,6 +265,8 @@ class Run:
         """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
         quantised, floats = None, None
         if isinstance(self.encoder, ActiveIllumination):
+            if self.encoder.levels is None:  # too few epochs for the stage of whole levels
+                self.encoder.start_quantising(self.profile.projector.levels)
             self.encoder.lower_top()
             with torch.no_grad():
                 floats = (self.encoder.weight**2).cpu().numpy().copy()

@@ -60,3 +60,51 @@ def test_quantising_rounds_to_the_nearest_level() -> None:
     assert found.illumination_wanted == pytest.approx(2.6)
     full = quantise_patterns(np.array([[0.0, 1e-30, 5e-324 + 1e-25]]), 65536)
     assert full.pattern_levels[0, 2] == 65535
+
+
+def floyd_steinberg_by_hand(wanted: np.ndarray, levels: int) -> np.ndarray:
+    """The definition, one pattern and one pixel at a time, on a copy that takes the errors."""
+    rows, columns = wanted.shape
+    left, shown = wanted.copy(), np.zeros_like(wanted)
+    for row in range(rows):
+        step = 1 if row % 2 == 0 else -1
+        for column in range(columns) if step == 1 else reversed(range(columns)):
+            shown[row, column] = min(levels - 1, max(0, round(left[row, column])))
+            error = left[row, column] - shown[row, column]
+            for down, along, share in ((0, step, 7), (1, -step, 3), (1, 0, 5), (1, step, 1)):
+                if row + down < rows and 0 <= column + along < columns:
+                    left[row + down, column + along] += error * share / 16
+    return shown
+
+
+@pytest.mark.parametrize("levels", [2, 3, 4])
+def test_error_diffusion_is_that_of_floyd_and_steinberg(levels: int) -> None:
+    patterns = RNG.uniform(0, 1, (3, 6 * 9))
+    found = quantise_patterns(patterns, levels, dither=(6, 9))
+    scale = patterns.max() / (levels - 1)
+    for pattern, shown in zip(patterns, found.pattern_levels):
+        assert np.array_equal(shown.reshape(6, 9), floyd_steinberg_by_hand(pattern.reshape(6, 9) / scale, levels))
+
+
+def test_error_diffusion_keeps_the_light_of_dim_patterns_that_rounding_loses() -> None:
+    dim = np.full((1, 40 * 40), 0.2)
+    dim[0, 0] = 1.0
+    rounded, spread = quantise_patterns(dim, 2), quantise_patterns(dim, 2, dither=(40, 40))
+    assert rounded.illumination == 1.0
+    assert spread.illumination == pytest.approx(dim.sum(), rel=0.03)
+    parts = spread.patterns().reshape(4, 10, 4, 10).sum(axis=(1, 3))
+    assert np.abs(parts / 20 - 1).max() < 0.3  # everywhere, not only on the whole
+    change = spread.patterns() - dim
+    assert spread.error_bound == pytest.approx([max(change[change > 0].sum(), -change[change < 0].sum())])
+
+
+def test_error_diffusion_leaves_what_is_a_level_already_and_clips_what_is_too_bright() -> None:
+    levels = RNG.integers(0, 4, (2, 30)) / 3
+    levels[0, 0] = 1.0
+    assert np.array_equal(
+        quantise_patterns(levels, 4, dither=(5, 6)).patterns(), quantise_patterns(levels, 4).patterns()
+    )
+    bright = quantise_patterns(np.array([[5.0, 0.0, 0.0, 0.0]]), 2, 1.0, dither=(1, 4))
+    assert bright.pattern_levels.tolist() == [[1, 0, 0, 0]]
+    with pytest.raises(ValueError, match="4 pixels, their shape is given as 2 x 3"):
+        quantise_patterns(np.ones((1, 4)), 2, dither=(2, 3))

@@ -369,6 +369,43 @@ def test_bundle_arguments_that_cannot_be_meant(
     assert not (tmp_path / "o.pans").exists()
 
 
+def dim_patterns(tmp_path: Path, data: dict[str, Any]) -> list[str]:
+    """Two patterns, each lighting one half of 8 x 8 pixels dimly, with one bright pixel: rounded to one bit, the halves are dark."""
+    patterns = np.zeros((2, 8, 8), np.float32)
+    patterns[0, :4], patterns[1, 4:] = 0.3, 0.3
+    patterns[:, 0, 0] = 1.0
+    np.save(tmp_path / "p.npy", patterns.reshape(2, 64))
+    np.save(tmp_path / "t.npy", np.array([[0, 0], [1, 0], [0, 1], [0, 0]], np.float32))
+    np.savez(tmp_path / "d.npz", **data)
+    words = ["bundle", "--patterns", tmp_path / "p.npy", "--table", tmp_path / "t.npy", "--classes", "above,below"]
+    return [*map(str, words), "--levels", "2", "--data", str(tmp_path / "d.npz")]
+
+
+def halves() -> dict[str, Any]:
+    labels = np.arange(60) % 2
+    images = np.zeros((60, 8, 8), np.uint8)
+    images[labels == 0, :4], images[labels == 1, 4:] = 255, 255
+    return {"images": images, "labels": labels}
+
+
+def test_error_diffusion_keeps_the_accuracy_that_rounding_to_one_bit_loses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = dim_patterns(tmp_path, halves())
+    found = {}
+    for dither in ("auto", "off"):
+        assert main([*words, "--dither", dither, "-o", str(tmp_path / f"{dither}.pans"), "--json"]) == 0
+        found[dither] = json.loads(capsys.readouterr().out)
+    assert found["auto"]["dithered"]
+    assert not found["off"]["dithered"]
+    assert found["auto"]["accuracy_given"] > 0.98  # nearly ten photons of the right half, one of the other at most
+    assert found["auto"]["accuracy_shown"] > 0.98
+    assert found["off"]["accuracy_shown"] < 0.6
+    bundle, _ = load_bundle(tmp_path / "auto.pans")
+    assert bundle.provenance["quantisation"]["dithered"]
+    assert bundle.pattern_levels.sum() == pytest.approx(2 * 32 * 0.3, abs=4)
+
+
 @pytest.mark.parametrize("kind", ["pickle", "cut", "integers", "huge", "npz", "text", "empty"])
 def test_arrays_from_strangers(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = make_inputs(tmp_path)

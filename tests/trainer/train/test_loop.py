@@ -279,6 +279,14 @@ def test_more_patterns_than_the_hardware_holds_are_refused():
         check_options(Options(features=too_many, estimator="ste"), parallel)
 
 
+@pytest.mark.parametrize("epochs", [1, 2])
+def test_patterns_of_very_short_trainings_are_whole_levels_with_light(task, epochs):
+    trained = train(task, PROFILE, replace(SMALL, epochs=epochs))
+    wanted = trained.float_patterns
+    assert abs(trained.quantised.patterns() - wanted).max() <= trained.quantised.photons_per_level
+    assert trained.quantised.illumination == pytest.approx(wanted.sum(), rel=0.05)
+
+
 def test_train_and_evaluate_commands_agree(tmp_path, capsys):
     images, labels = bars(400)
     np.savez(tmp_path / "bars.npz", images=images, labels=labels)

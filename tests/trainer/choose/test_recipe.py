@@ -1,0 +1,69 @@
+"""The size of a training follows from the images, and every reason for a warning is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.choose.recipe import BATCH, OBJECTS, choose_encoder, choose_training, warnings_of
+from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.variation import Variation
+
+IDEAL = load_profile("ideal")
+TURNED = Variation(turn_deg=180)
+
+
+def task_of(counts, side=16, held_out=500):
+    labels = np.repeat(np.arange(len(counts)), counts)
+    images = np.zeros((len(labels), side, side), np.uint8)
+    test = Objects(np.zeros((held_out, side, side), np.uint8), np.arange(held_out) % len(counts))
+    return Task(
+        "some", tuple(f"class{i}" for i in range(len(counts))), Objects(images, labels), test, "0" * 64, "drawn"
+    )
+
+
+@pytest.mark.parametrize("n", [240, 960, 2400, 20_000])
+def test_small_sets_are_enlarged_and_take_steps_enough(n):
+    recipe = choose_training(task_of([n // 4] * 4), TURNED, "automaton")
+    assert recipe.objects == max(n, OBJECTS)
+    assert recipe.kept == n // 12
+    assert BATCH[0] <= recipe.batch <= BATCH[1]
+    assert recipe.objects / recipe.batch >= 39
+    assert "turned by up to 180 degrees" in recipe.reasons[0]
+
+
+def test_large_images_are_not_copied_beyond_what_trains_in_minutes():
+    small, large = (choose_training(task_of([100, 100], side), TURNED, "automaton") for side in (32, 128))
+    assert large.objects < small.objects
+    assert choose_training(task_of([100, 100]), Variation(), "automaton").objects == 200  # nothing to vary: no copies
+
+
+def test_fixed_patterns_take_a_number_of_steps_that_hardly_depends_on_the_number_of_images():
+    for n in (200, 1000, 4000):
+        recipe = choose_training(task_of([n // 2] * 2), Variation(), "active")
+        assert 1500 <= recipe.epochs * recipe.objects / recipe.batch <= 6000
+        assert (recipe.features, recipe.exposures) == (10, 0)
+
+
+def test_the_encoder_follows_from_what_the_profile_can_show():
+    assert choose_encoder(IDEAL)[0] == "automaton"
+    encoder, why = choose_encoder(load_profile("wdm-snspd"))
+    assert encoder == "active"
+    assert "parallel" in why
+
+
+def told(task, profile=IDEAL, clicks=None):
+    return list(warnings_of(task, profile, choose_training(task, TURNED, "automaton"), clicks))
+
+
+def test_warnings():
+    assert told(task_of([100, 100])) == []
+    assert "'class1' has 20 training images" in told(task_of([100, 20]))[0]
+    assert "the sensor prefers the larger class" in told(task_of([600, 100]))[0]
+    assert "60 held-out images: the standard error" in told(task_of([100, 100], held_out=60))[0]
+    dark = load_profile("dmd-spad")
+    assert told(task_of([100, 100]), dark) == []
+    assert "dark counts alone" in told(task_of([100, 100]), dark, clicks=0.2)[0]
+    hot = replace(dark, detector=replace(dark.detector, dark_rate_hz=1e4))
+    assert "dark counts alone" in told(task_of([100, 100]), hot)[0]

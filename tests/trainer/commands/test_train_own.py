@@ -1,0 +1,120 @@
+"""`pans train FOLDER`: what is chosen is told and kept, and the commands that it ends with run the bundle."""
+
+import argparse
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the train extra")
+pytest.importorskip("PIL", reason="needs the train extra")
+
+from practice import practice_folder
+from trainings import bars_task
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.cli import main
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.choose import recipe
+from pans.trainer.commands import train_own
+from pans.trainer.commands.course import curve
+
+QUICK = ["--exposures", "4", "--states", "8", "--epochs", "1"]
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    monkeypatch.setattr(recipe, "OBJECTS", 400)
+    monkeypatch.setattr(train_own, "RUN_DECISIONS", 40)
+    monkeypatch.setattr(train_own, "BASELINE_TRIALS", 2)
+
+
+@pytest.fixture
+def letters(tmp_path, monkeypatch):
+    practice_folder(tmp_path / "my letters", "letters", 150)
+    monkeypatch.chdir(tmp_path)
+    return "my letters"
+
+
+def test_a_folder_needs_no_option_and_the_next_commands_work(letters, capsys):
+    assert main(["train", letters, *QUICK, "-o", "letters.pans"]) == 0
+    said = capsys.readouterr()
+    assert "400 training images from 120" in said.err
+    assert "an automaton" in said.err
+    assert "10 photons per decision" in said.err
+    assert "class 'H' has 24 training images" in said.err
+    assert "direct imaging" in said.out
+    following = [shlex.split(line) for line in said.out.partition("next:")[2].split("\n") if line.strip()]
+    assert [words[:2] for words in following] == [["pans", "data"], ["pans", "run"], ["pans", "report"]]
+    for words in following:
+        assert main(words[1:]) == 0, words
+    bundle, _ = load_bundle("letters.pans")
+    assert bundle.automaton is not None
+    assert bundle.provenance["training_objects"] == 3 * 110 + 120
+    assert bundle.provenance["variation"]
+    assert bundle.provenance["options"]["photons"] == 10.0
+    assert bundle.expected["objects"] == 30
+
+
+def test_the_answer_holds_direct_imaging_at_equal_photons(letters, capsys):
+    assert main(["train", letters, *QUICK, "--photons", "5", "-o", "letters.pans", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["direct_imaging"]["photons_mean"] == pytest.approx(answer["photons_mean"], rel=1e-3)
+    assert 0.1 < answer["direct_imaging"]["accuracy_mean"] < 1
+
+
+def test_as_is_chooses_nothing(letters, capsys):
+    assert main(["train", letters, "--as-is", "-o", "letters.pans"]) == 2
+    assert "--features is missing" in capsys.readouterr().err
+    words = ["train", letters, "--as-is", "--encoder", "automaton", "--photons", "5", *QUICK, "-o", "letters.pans"]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert "chosen from the images" not in said.err
+    assert "next:" not in said.out
+    assert "variation" not in load_bundle("letters.pans")[0].provenance
+
+
+def test_an_option_of_fixed_patterns_asks_for_them(letters, capsys, monkeypatch):
+    monkeypatch.setattr(recipe, "FIXED_STEPS", 40)
+    monkeypatch.setattr(recipe, "FIXED_EPOCHS", (8, 8))
+    words = ["--features", "3", "--hidden", "8", "--estimator", "ste", "--profile", "ideal"]
+    assert main(["train", letters, *words, "-o", "letters.pans"]) == 0
+    said = capsys.readouterr()
+    assert "8 epochs in batches of" in said.err
+    assert "direct imaging" in said.out
+    assert load_bundle("letters.pans")[0].pattern_levels.shape[0] == 3
+
+
+def test_the_course_of_an_automaton_is_written_and_drawn(letters, tmp_path):
+    pytest.importorskip("matplotlib", reason="needs the plot extra")
+    assert main(["train", letters, *QUICK, "--history", "course", "-o", "letters.pans"]) == 0
+    course = json.loads((tmp_path / "course/history.json").read_text())
+    stages = [step["stage"] for step in course["epochs"]]
+    assert stages == ["grow"] * 4 + ["grey"] * 3 + ["shown"]
+    assert (tmp_path / "course/curves.png").read_bytes()[:4] == b"\x89PNG"
+    assert main(["train", letters, *QUICK, "--history", "course", "-o", "again.pans"]) == 2  # nothing is replaced
+
+
+def test_a_sensor_without_light_is_not_compared(capsys):
+    figures = {"clicks_mean": 0.0, "photons_mean": 0.0}
+    args = argparse.Namespace(task="t", out="t.pans", clicks=None, photons=10.0, seed=0)
+    found = train_own.finish(args, bars_task(20), load_profile("ideal"), figures)
+    assert found.payload == {}
+    assert "next:" in found.words
+    assert "--photons 10 was not met" in capsys.readouterr().err
+
+
+def test_a_budget_that_was_not_met_is_told(capsys):
+    train_own.warn_of_budget(argparse.Namespace(clicks=None, photons=10.0), clicks=3.0, photons=12.0)
+    assert "--photons 10 was not met: a decision takes 12.00" in capsys.readouterr().err
+    train_own.warn_of_budget(argparse.Namespace(clicks=3.0, photons=None), clicks=3.1, photons=12.0)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_curve_is_thinned_and_says_its_ends():
+    assert curve([]) == ""
+    assert curve([5.0]) == "▁  5 to 5, now 5"
+    rising = curve(list(np.linspace(0, 100, 400)), width=8)
+    assert rising.startswith("▁▂▃▄▅▆▇█ ")
+    assert rising.endswith("now 100")

@@ -1,0 +1,109 @@
+"""The size of a training, from the images: how many varied copies, the budget, exposures, states, batch and epochs, with reasons.
+
+Owns the rules and their words; never trains. They were chosen on held-back parts of made-up folders of 300 to 3000 images
+(docs/measurements/training.md), never on held-out images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.profile import Profile
+from pans.trainer.tasks.registry import Task
+from pans.trainer.tasks.variation import Variation
+
+OBJECTS = 8000  # training images with their varied copies: more took longer and gained little
+PIXELS_MAX = 1 << 24  # of all of them: what trains within minutes on one core
+PHOTONS = 10.0  # a decision's budget where none is asked for
+EXPOSURES, STATES = 32, 128  # of an automaton trained on so few images; more states learn them by heart
+STEPS_PER_EPOCH = 40  # fewer steps than that hardly move the patterns
+BATCH = (50, 500)
+FEATURES = 10  # fixed patterns where none are asked for
+FIXED_STEPS = 3000  # of a training of fixed patterns
+FIXED_EPOCHS = (20, 400)
+KEPT_PART = 12  # one in twelve training images chooses and calibrates, and has no copies
+FEW_PER_CLASS = 30
+UNEQUAL = 5.0  # times as many images in one class as in another
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What was chosen for a folder of images, and why, one sentence each."""
+
+    encoder: str  # automaton, or active for fixed patterns
+    objects: int  # training images with their varied copies
+    kept: int  # the last training images, without copies
+    photons: float
+    batch: int
+    epochs: int
+    reasons: tuple[str, ...]
+    exposures: int = 0
+    states: int = 0
+    features: int = 0
+
+
+def choose_encoder(profile: Profile) -> tuple[str, str]:
+    """Return the encoder for a user's own images, and the reason: an automaton wherever the profile can show one."""
+    if profile.mode == "sequential":
+        return (
+            "automaton",
+            "an automaton: at equal photons it decides better than fixed patterns (--encoder active for those)",
+        )
+    return "active", f"fixed patterns: {profile.name} is a {profile.mode} profile, an automaton needs a sequential one"
+
+
+def choose_training(task: Task, variation: Variation, encoder: str) -> Recipe:
+    """Return the training of `encoder` for a user's own images; what the user asks for takes the place of what is here."""
+    n, pixels = len(task.train), math.prod(task.image_shape)
+    kept = max(1, n // KEPT_PART)
+    objects = n if variation == Variation() else max(n, min(OBJECTS, PIXELS_MAX // pixels))
+    batch = min(BATCH[1], max(BATCH[0], objects // STEPS_PER_EPOCH))
+    reasons = [_varied_words(n, objects, variation)]
+    if encoder == "automaton":
+        reasons.append(f"{EXPOSURES} exposures of at most {STATES} states: more would learn so few images by heart")
+        return Recipe(encoder, objects, kept, PHOTONS, batch, 6, tuple(reasons), EXPOSURES, STATES)
+    epochs = min(FIXED_EPOCHS[1], max(FIXED_EPOCHS[0], math.ceil(FIXED_STEPS * batch / objects)))
+    reasons.append(f"{epochs} epochs in batches of {batch}: about {epochs * objects // batch} steps")
+    return Recipe(encoder, objects, kept, PHOTONS, batch, epochs, tuple(reasons), features=FEATURES)
+
+
+def _varied_words(n: int, objects: int, variation: Variation) -> str:
+    if variation == Variation():
+        return f"{n} training images as they are: no change of them made left-out images more likely"
+    return f"{objects} training images from {n}: {variation}; these changes made left-out images more likely"
+
+
+def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | None) -> Iterator[str]:
+    """Yield what the user should know before the training: too few images, unequal classes, a budget out of reach."""
+    counts = np.bincount(task.train.labels, minlength=len(task.classes))
+    fewest, most = int(counts.argmin()), int(counts.argmax())
+    if counts[fewest] < FEW_PER_CLASS:
+        yield (
+            f"class {task.classes[fewest]!r} has {counts[fewest]} training images, wanted are {FEW_PER_CLASS} or more: the accuracy on "
+            "new images is uncertain"
+        )
+    elif counts[most] > UNEQUAL * counts[fewest]:
+        yield (
+            f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: the "
+            "sensor prefers the larger class, so give classes the shares that they have in use"
+        )
+    n_test = len(task.test)
+    yield from _test_words(n_test)
+    dark = click_law(profile, profile.exposure.min_us).dark_per_exposure * (recipe.exposures or recipe.features)
+    budget = recipe.photons if clicks is None else clicks
+    if dark > budget / 2:
+        yield (
+            f"dark counts alone bring about {dark:.2g} clicks per decision on {profile.name}, the budget is {budget:g}: ask for "
+            "more light, or for fewer exposures"
+        )
+
+
+def _test_words(n_test: int) -> Iterator[str]:
+    error = 0.5 / math.sqrt(n_test)
+    if error > 0.05:
+        yield f"{n_test} held-out images: the standard error of the accuracy is up to {100 * error:.0f} points"

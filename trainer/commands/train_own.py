@@ -1,0 +1,160 @@
+"""What `pans train` adds for a user's own images: what is chosen from them, what is warned of, and what comes next.
+
+Owns the words on screen and the way the choices take the place of options that were not given; the rules are in the package choose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pans.runtime.cli import say, warn
+
+if TYPE_CHECKING:
+    from pans.runtime.instrument.profile import Profile
+    from pans.trainer.choose.recipe import Recipe
+    from pans.trainer.tasks.registry import Task
+
+AUTOMATON = "automaton"
+AUTOMATON_PROFILE = "ideal"
+CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
+BASELINE_TRIALS = 10
+LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
+BUDGET_OFF = 0.05  # relative: more is said at the end
+RUN_DECISIONS = 1000
+
+
+def is_own(args: argparse.Namespace) -> bool:
+    """Return whether the task is a folder or a file of the user's, and choices are wanted."""
+    from pans.trainer.tasks.registry import task_names
+
+    return args.task not in task_names() and not args.as_is
+
+
+def set_encoder(args: argparse.Namespace, of_fixed: tuple[str, ...]) -> None:
+    """Set `args.encoder` for own images, unless an option asks for one, or for what only fixed patterns have."""
+    if args.encoder is not None or any(getattr(args, name) not in (None, False) for name in of_fixed):
+        return
+    from pans.runtime.instrument.profile import load_profile
+    from pans.trainer.choose.recipe import choose_encoder
+
+    encoder, why = choose_encoder(load_profile(args.profile or AUTOMATON_PROFILE))
+    args.encoder = encoder if encoder == AUTOMATON else None
+    say(why)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """The task to train on, and the facts that the bundle and the answer keep of the choice."""
+
+    task: Task
+    facts: dict[str, Any]
+
+
+def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:
+    """Choose what the options leave open, say what and why, warn, and return the task with its varied copies."""
+    from pans.trainer.choose import choose_training, choose_variation, warnings_of
+    from pans.trainer.choose.variations import Choice
+    from pans.trainer.tasks.variation import Variation, enlarged
+
+    given = any(getattr(args, name) for name in CHANGES)
+    say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")
+    choice = (
+        Choice(Variation(), 0.0, 0.0) if given or task.target == "image" else choose_variation(task, args.seed or 0)
+    )
+    recipe = choose_training(task, choice.variation, args.encoder or "active")
+    for text in warnings_of(task, profile, recipe, args.clicks):
+        warn(text)
+    say("chosen from the images (--as-is chooses nothing):")
+    for reason in [*recipe.reasons, *_fill(args, recipe)]:
+        say(f"  {reason}")
+    bigger = enlarged(task, choice.variation, recipe.objects, recipe.kept, args.seed or 0)
+    changes = {name: value for name, value in asdict(choice.variation).items() if value}
+    facts = {"training_objects": len(bigger.train), "variation": changes}
+    return Chosen(bigger, facts | {"left_out_loss": [round(choice.loss_before, 4), round(choice.loss, 4)]})
+
+
+def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
+    """Set the options that were left open; return what was set, in words."""
+    names = (
+        ("exposures", "states", "batch", "epochs") if recipe.encoder == AUTOMATON else ("features", "batch", "epochs")
+    )
+    for name in names:
+        if getattr(args, name) is None:
+            setattr(args, name, getattr(recipe, name))
+    for name in ("copies", "soft"):  # not those of a public set whose name the folder bears
+        if recipe.encoder == AUTOMATON and getattr(args, name) is None:
+            setattr(args, name, 0)
+    if args.photons is None and args.clicks is None and getattr(args, "alpha", None) is None:
+        args.photons = recipe.photons
+        return [f"{recipe.photons:g} photons per decision: a first guess (--photons N for another budget)"]
+    return []
+
+
+@dataclass(frozen=True, slots=True)
+class After:
+    """What follows the figures of a training: keys of the answer, and words."""
+
+    payload: dict[str, Any]
+    words: str
+
+
+def finish(args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]) -> After:
+    """Warn of a budget that was not met, compare with direct imaging at equal photons, and name the next commands."""
+    photons = figures["photons_mean"]
+    warn_of_budget(args, figures["clicks_mean"], photons)
+    words, payload = [], {}
+    if task.light == "transmission" and photons >= LEAST_PHOTONS:
+        direct = compared(task, photons, args.seed or 0)
+        words, payload = [compared_words(direct)], {"direct_imaging": direct}
+    return After(payload, "\n".join([*words, next_commands(args, profile.name)]))
+
+
+def compared(task: Task, photons: float, seed: int) -> dict[str, Any]:
+    """Return what direct imaging decides at that many photons, by its exact posterior: accuracy, its error, photons, illumination."""
+    from pans.trainer.baselines.options import BaselineOptions
+    from pans.trainer.baselines.rows import baseline_rows
+
+    options = BaselineOptions("direct", "bayes", trials=BASELINE_TRIALS, seed=seed)
+    row = next(iter(baseline_rows(task, options, [photons], lambda _what, _done: None)))
+    return {
+        key: row[key] for key in ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
+    }
+
+
+def compared_words(found: dict[str, Any]) -> str:
+    """Return the comparison as a line for people."""
+    return (
+        f"SIMULATED direct imaging, the exact posterior of an ideal camera at the same photons: {100 * found['accuracy_mean']:.2f} %  "
+        f"(error from the objects {100 * found['accuracy_se_objects']:.2f} points, illumination {found['illumination']:.1f})"
+    )
+
+
+def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float) -> None:
+    """Warn where the finished sensor is far from the budget."""
+    for name, found in (("clicks", clicks), ("photons", photons)):
+        wanted = getattr(args, name)
+        if wanted is not None and abs(found / wanted - 1) > BUDGET_OFF:
+            warn(
+                f"--{name} {wanted:g} was not met: a decision takes {found:.2f}. Try more --epochs, other --exposures, or another "
+                "--profile"
+            )
+
+
+def next_commands(args: argparse.Namespace, profile: str) -> str:
+    """Return the commands that run the bundle on its held-out images."""
+    out = Path(args.out)
+    scene, folder = out.with_suffix(".npz"), out.with_name(f"{out.stem}-run")
+    if str(scene) == args.task:
+        scene = out.with_name(f"{out.stem}-scene.npz")
+    device = f"sim:{profile}?scene={scene}&pace=fast&seed=1"
+    lines = (
+        ["pans", "data", "scene", args.task, "-o", str(scene)],
+        ["pans", "run", str(out), "--device", device, "--decisions", str(RUN_DECISIONS), "--out", str(folder)],
+        ["pans", "report", str(folder / "run.pansrec"), "-o", str(out.with_name(f"{out.stem}-report.html"))],
+    )
+    return "\n".join(["next:", *(f"  {shlex.join(line)}" for line in lines)])
