@@ -172,7 +172,7 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data",
         metavar="SCENE",
-        help="say what rounding to the levels costs in accuracy on these labelled images: .npz, class folders or a shipped scene",
+        help="say what the levels cost in accuracy on these labelled images: .npz, class folders or a shipped scene",
     )
     parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
@@ -310,7 +310,7 @@ def _bundle_lines(out: Path, sha256: str, facts: Mapping[str, Any]) -> Iterator[
     if "accuracy_given" in facts:
         change = facts["accuracy_shown"] - facts["accuracy_given"]
         yield (
-            f"  SIMULATED accuracy {facts['accuracy_given']:.2%} with the patterns as given, {facts['accuracy_shown']:.2%} rounded: "
+            f"  SIMULATED accuracy {facts['accuracy_given']:.2%} with the patterns as given, {facts['accuracy_shown']:.2%} on these levels: "
             f"{100 * change:+.2f} ± {100 * facts['accuracy_difference_se']:.2f} points on {facts['objects']} objects"
         )
     if "exposure_us" in facts:
