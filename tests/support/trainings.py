@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 from functools import partial
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from tree import ROOT
 
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -54,3 +58,22 @@ def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> A
         levels.append(Level(light, torch.tensor(edges)))
     counts = [torch.rand((n, 4), generator=random, dtype=torch.float64) + 0.1 for n in (1, 2, 5)]
     return Machine(levels, counts)
+
+
+SCRIPT = ROOT / "docs/tutorial/practice_images.py"
+
+
+def practice_images() -> ModuleType:
+    """Return the script as a module; it needs Pillow."""
+    spec = importlib.util.spec_from_file_location("practice_images", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def practice_folder(folder: Path, name: str, number: int, seed: int = 1) -> Path:
+    """Draw the first `number` images of a set into `folder` and return it."""
+    practice_images().draw_folder(name, folder, seed, number)
+    return folder

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("PIL", reason="needs the train extra")
 
-from practice import practice_folder
+from trainings import practice_folder
 
 from pans.trainer.choose.variations import choose_variation
 from pans.trainer.tasks.registry import Objects, Task, load_task

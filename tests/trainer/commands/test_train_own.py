@@ -10,8 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("PIL", reason="needs the train extra")
 
-from practice import practice_folder
-from trainings import bars_task
+from trainings import bars_task, practice_folder
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
