@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pans.trainer.export.automaton import ExportedAutomaton, WalkFigures
 
 DEFAULT_PROFILE = "ideal"
+BUDGET_TOLERANCE = 0.01  # of the light or the clicks that were asked for
 TAKEN = (
     "photons",
     "clicks",
@@ -153,6 +154,7 @@ def _answer(
         "patterns": bundle.n_patterns,
         "exposures": automaton.n_slots,
         "price": trained.price,
+        "budget_off": budget_off(trained.options, exported.measured),
         "seconds": seconds,
         "simulated": True,
         **after.payload,
@@ -162,8 +164,31 @@ def _answer(
         f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
         _words("all held-out objects", exported.measured),
         _words("the first 200", exported.first_200),
+        *budget_words(trained.options, exported.measured),
     ]
     emit(args, payload, "\n".join([*lines, *([after.words] if after.words else [])]))
+
+
+def budget_off(options: AutomatonOptions, found: WalkFigures) -> float:
+    """Return by which part of the budget the held-out objects get more light or clicks; negative for less."""
+    if options.photons is not None:
+        return found.photons_mean / options.photons - 1
+    assert options.clicks is not None
+    return found.clicks_mean / options.clicks - 1
+
+
+def budget_words(options: AutomatonOptions, found: WalkFigures) -> list[str]:
+    """Return a line when the budget is missed: the price was found on training objects, and dwell times have steps."""
+    off = budget_off(options, found)
+    if abs(off) <= BUDGET_TOLERANCE:
+        return []
+    name, wanted = ("photons", options.photons) if options.photons is not None else ("clicks", options.clicks)
+    assert wanted is not None
+    again = f"--{name} {wanted / (1 + off):.4g}" if off > -1 else f"a larger --{name}"
+    return [
+        f"budget missed by {off:+.1%}: {wanted * (1 + off):.3g} {name} on all held-out objects, asked for {wanted:g}; "
+        f"to come closer, train with {again}"
+    ]
 
 
 def _words(which: str, found: WalkFigures) -> str:

@@ -11,6 +11,9 @@ from trainings import bars_task
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
+from pans.trainer.adaptive.options import AutomatonOptions
+from pans.trainer.commands.train_automaton import budget_words
+from pans.trainer.export.automaton import WalkFigures
 
 SHORT = ["--encoder", "automaton", "--exposures", "4", "--states", "8", "--epochs", "2", "--batch", "64"]
 
@@ -35,10 +38,30 @@ def test_trains_exports_and_reports(images, tmp_path, capsys):
     assert answer["first_200"]["objects"] == 200
     assert answer["accuracy_mean"] == bundle.expected["accuracy"] > 0.4
     assert answer["photons_mean"] < 3.3
+    assert answer["budget_off"] == pytest.approx(answer["photons_mean"] / 3 - 1)
     assert bundle.provenance["options"]["photons"] == 3.0
     assert not list(tmp_path.glob("*.checkpoint"))
     for key in ("clicks_mean", "illumination", "exposures_mean", "expected_calibration_error"):
         assert answer[key] == pytest.approx(answer["first_200"][key], rel=0.5, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("budget", "photons", "clicks", "said"),
+    [
+        ({"photons": 10.0}, 10.09, 4.0, []),
+        (
+            {"photons": 10.0},
+            10.3,
+            4.0,
+            ["budget missed by +3.0%: 10.3 photons on all held-out objects, asked for 10; "],
+        ),
+        ({"clicks": 5.0}, 10.0, 4.8, ["budget missed by -4.0%: 4.8 clicks on all held-out objects, asked for 5; "]),
+    ],
+)
+def test_a_missed_budget_is_told(budget, photons, clicks, said):
+    figures = WalkFigures(100, 0.8, 0.01, clicks, photons, 50.0, 4.0, 0.01)
+    lines = budget_words(AutomatonOptions(**budget), figures)
+    assert [line.partition("to come closer")[0] for line in lines] == said
 
 
 def refusal(capsys, *words):
