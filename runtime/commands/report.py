@@ -1,6 +1,6 @@
-"""`pans report`: one self-contained HTML page of a recording or a bundle.
+"""`pans report` and `pans compare`: one self-contained HTML page of a recording or a bundle, and of two runs side by side.
 
-Owns the command; the page is pages/run.py's. The page loads nothing from elsewhere and runs nothing.
+Owns the commands; the pages are those of `pages` and `compare`. They load nothing from elsewhere and run nothing.
 """
 
 from __future__ import annotations
@@ -31,3 +31,40 @@ def _run(args: argparse.Namespace) -> int:
 
 
 REPORT = Command("one self-contained page of a recording or a bundle", _configure, _run)
+
+
+def _configure_compare(parser: argparse.ArgumentParser) -> None:
+    for name in ("first", "second"):
+        parser.add_argument(
+            name,
+            type=Path,
+            metavar="A" if name == "first" else "B",
+            help="a run's folder, a recording (.pansrec), or a summary as `pans run --json` prints it (.json)",
+        )
+    parser.add_argument(
+        "--objects",
+        default="auto",
+        choices=("auto", "same", "different"),
+        help="whether objects of the same number are the same (default auto: of the same simulated scene)",
+    )
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="also write a page")
+    add_force(parser)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    if args.out is not None:
+        check_outputs([args.out], inputs=[args.first, args.second], force=args.force)
+    from pans.runtime.compare import compare, read_side
+    from pans.runtime.compare.words import comparison_words
+
+    found = compare(read_side(args.first), read_side(args.second), args.objects)
+    if args.out is not None:
+        from pans.runtime.compare.page import comparison_page
+
+        write_file(args.out, comparison_page(found), force=args.force)
+    report = {"report": None if args.out is None else str(args.out)}
+    emit(args, found.as_json() | report, comparison_words(found))
+    return EXIT_FINE
+
+
+COMPARE = Command("compare two runs: what changed, and is it significant", _configure_compare, _compare)

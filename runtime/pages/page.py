@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pans.runtime import safe_text
 
-WIDE, NARROW = 880, 345  # pixels of a drawing
+WIDE, HALF, NARROW = 880, 430, 345  # pixels of a drawing
 CONFUSION_MAX = 40  # classes
 
 
@@ -114,13 +114,14 @@ class Page:
         table = _scrolled("".join([*lines, "</tbody></table>"]), "confusion", classes)
         self._parts.append(f"<figure>{table}<figcaption>{safe_text.html(caption)}</figcaption></figure>")
 
-    def figure(self, drawing: Drawing, caption: str) -> None:
-        """Add a drawing in its wide and its narrow form."""
+    def figure(self, drawing: Drawing, caption: str, *, half: bool = False) -> None:
+        """Add a drawing in its wide and its narrow form; `half` is for one of two `sides`."""
         names: list[tuple[str, str]] = getattr(drawing, "names", [])
         items = "".join(f'<li><i class="{kind}"></i>{safe_text.html(name)}</li>' for kind, name in names)
         legend = f'<ul class="legend">{items}</ul>' if items else ""
         forms = "".join(
-            f'<div class="{form}">{drawing.svg(width)}</div>' for form, width in (("wide", WIDE), ("narrow", NARROW))
+            f'<div class="{form}">{drawing.svg(width)}</div>'
+            for form, width in (("wide", HALF if half else WIDE), ("narrow", NARROW))
         )
         self._parts.append(f"<figure>{legend}{forms}<figcaption>{safe_text.html(caption)}</figcaption></figure>")
 

@@ -1,0 +1,30 @@
+"""Two runs side by side: what was different about them, and whether their results differ by more than chance.
+
+Owns the tests and their words. It reads recordings, folders of runs and summaries; it never runs anything and never changes a file.
+
+>>> from pans.runtime.compare import mcnemar_exact
+>>> mcnemar_exact(1, 9)
+0.021484375
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from .comparison import Comparison, compare
+    from .side import Side, read_side
+    from .statistics import mcnemar_exact
+
+__all__ = ["Comparison", "Side", "compare", "mcnemar_exact", "read_side"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Comparison": ".comparison",
+        "Side": ".side",
+        "compare": ".comparison",
+        "mcnemar_exact": ".statistics",
+        "read_side": ".side",
+    },
+)

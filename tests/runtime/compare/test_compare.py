@@ -1,0 +1,135 @@
+"""`pans compare`: what it pairs, what it finds, what it says of damaged and foreign files, and its page."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import browser, clipped, console, look, serious
+from commands import fixed_run, json_of, words_of
+
+from pans.runtime.cli import main
+from pans.runtime.compare import compare, mcnemar_exact, read_side
+from pans.runtime.record import read_recording
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for name, shots in (("a", "1"), ("b", "1"), ("c", "4")):
+        words = [word.replace("seed=1", f"seed={ord(name)}") for word in fixed_run(80)]
+        assert main([*words, "--shots", shots, "--out", str(folder / name)]) == 0
+    return folder
+
+
+def test_the_same_objects_are_paired_and_counted(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = json_of(capsys, "compare", runs / "a", runs / "c")
+    first, second = (read_recording(runs / name / "run.pansrec").decisions() for name in ("a", "c"))
+    right = [dict(zip(rows["object"].tolist(), (rows["label"] == rows["truth"]).tolist())) for rows in (first, second)]
+    better = sum(right[0][one] and not right[1][one] for one in right[0])
+    worse = sum(right[1][one] and not right[0][one] for one in right[0])
+    rows = {row["name"]: row for row in found["findings"]}
+    assert found["paired"]
+    assert rows["accuracy"]["p"] == mcnemar_exact(better, worse)
+    assert rows["accuracy"]["difference"] == pytest.approx((better - worse) / 80)
+    assert rows["clicks_mean"]["significant"]
+    assert rows["clicks_mean"]["first"] == pytest.approx(first["clicks"].mean())
+    changed = {row["name"]: (row["first"], row["second"]) for row in found["changes"]}
+    assert changed["config.shots"] == ("1", "4")
+    assert not any(name.startswith(("bundle", "profile")) for name in changed)
+
+
+def test_a_run_beside_itself_differs_in_nothing(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = json_of(capsys, "compare", runs / "a", runs / "a" / "run.pansrec")
+    assert (found["changes"], found["significant"]) == ([], [])
+    assert main(["compare", str(runs / "a"), str(runs / "a")]) == 0
+    words = capsys.readouterr().out
+    assert "Bundle, profile, options and device are the same." in words
+    assert "No difference is larger than chance" in words
+    assert words.startswith("SIMULATED")
+
+
+def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) -> None:
+    first, second = read_side(runs / "a"), read_side(runs / "b")
+    assert first.decisions is not None
+    assert compare(first, second).paired
+    assert "80 and 80 distinct objects" in compare(first, second, "different").findings[0].method
+    real = replace(first, header={**first.header, "device_url": "serial:/dev/ttyACM0"})
+    assert "--objects same" in compare(real, second).why
+    assert compare(real, second, "same").paired
+    moved = first.decisions.copy()
+    moved["truth"] = np.roll(moved["truth"], 1)
+    why = compare(replace(first, decisions=moved), second, "same").why
+    assert re.match(r"\d+ of 80 objects of the same number have another true class", why)
+
+
+def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "c"):
+        summary = read_recording(runs / name / "run.pansrec").summary
+        (tmp_path / f"{name}.json").write_text(json.dumps(dict(summary)))
+    found = json_of(capsys, "compare", tmp_path / "a.json", tmp_path / "c.json")
+    whole = json_of(capsys, "compare", runs / "a", runs / "c", "--objects", "different")
+    assert not found["paired"]
+    for key in ("name", "p", "low", "high", "first", "second"):
+        assert found["findings"][0][key] == whole["findings"][0][key]
+
+
+def test_dark_counts_are_compared_by_their_rates(runs: Path) -> None:
+    first, second = read_side(runs / "a"), read_side(runs / "b")
+    dark = {"clicks": 40, "exposures": 1000, "low": 0, "high": 1, "expected": 0.01}
+    first = replace(first, summary={**first.summary, "dark": dark})
+    second = replace(second, summary={**second.summary, "dark": {**dark, "clicks": 4}})
+    found = {one.name: one for one in compare(first, second).findings}["dark_rate"]
+    assert found.difference == pytest.approx(10.0)
+    assert found.significant
+    assert found.low is not None
+    assert found.low > 3
+
+
+def test_a_cut_recording_is_compared_as_far_as_it_goes(runs: Path, tmp_path: Path) -> None:
+    data = (runs / "a" / "run.pansrec").read_bytes()
+    (tmp_path / "cut.pansrec").write_bytes(data[: int(0.8 * len(data))])
+    assert main(["compare", str(tmp_path / "cut.pansrec"), str(runs / "b"), "-o", str(tmp_path / "page.html")]) == 0
+    assert "Side A was cut" in words_of((tmp_path / "page.html").read_text())
+
+
+@pytest.mark.parametrize("what", ["missing", "empty folder", "bundle", "other json", "broken json", "two recordings"])
+def test_what_is_no_run_is_refused(what: str, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = tmp_path / {"other json": "a.json", "broken json": "b.json"}.get(what, "x")
+    if what in ("empty folder", "two recordings"):
+        place.mkdir()
+    if what == "two recordings":
+        for name in ("p", "q"):
+            (place / f"{name}.pansrec").write_bytes(b"")
+    texts = {"bundle": "PANSxyz", "other json": '{"a": 1}', "broken json": "{"}
+    if what in texts:
+        place.write_text(texts[what])
+    assert main(["compare", str(place), str(runs / "a")]) == 2
+    assert str(place) in capsys.readouterr().err
+
+
+def test_no_page_replaces_a_run(runs: Path) -> None:
+    before = (runs / "a" / "run.pansrec").read_bytes()
+    out = str(runs / "a" / "run.pansrec")
+    assert main(["compare", out, str(runs / "b"), "-o", out, "--force"]) == 2
+    assert (runs / "a" / "run.pansrec").read_bytes() == before
+
+
+def test_the_page_in_a_browser(runs: Path, tmp_path: Path) -> None:
+    place = tmp_path / "page.html"
+    assert main(["compare", str(runs / "a"), str(runs / "c"), "-o", str(place)]) == 0
+    page = place.read_text()
+    assert len(page) < 1_000_000
+    assert "<script" not in page
+    assert "A − B" in page
+    with browser(tmp_path) as driver:
+        driver.get(place.as_uri())
+        for width, dark in ((1280, False), (390, True)):
+            look(driver, width, dark=dark)
+            assert clipped(driver) == []
+            assert serious(driver) == []
+        assert console(driver) == []
