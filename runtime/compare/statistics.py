@@ -140,7 +140,8 @@ def _resampled_quantiles(counts: NDArray[np.int64], q: float, rng: np.random.Gen
     """The quantile of each resample of the blocks, (RESAMPLES,)."""
     blocks = len(counts)
     times = rng.multinomial(blocks, np.full(blocks, 1 / blocks), RESAMPLES)
-    sums = np.cumsum(times.astype(np.float64) @ counts.astype(np.float64), axis=1)  # whole numbers; floats multiply faster
+    drawn = times.astype(np.float64) @ counts.astype(np.float64)  # whole numbers, which floats multiply faster
+    sums = np.cumsum(drawn, axis=1)
     at = (sums < np.ceil(q * sums[:, -1:])).sum(axis=1)
     return np.asarray(LEAST_US * np.exp(BIN * (at + 0.5)), np.float64)
 
