@@ -20,7 +20,7 @@ GROUPS = {
     "Run and look": ("demo", "run", "replay", "verify", "info", "report", "compare", "export", "runs", "service"),
     "Instruments": ("profile", "calibrate", "simulate", "devices", "doctor"),
     "Train and compare": ("train", "evaluate", "baseline", "reproduce", "sweep", "batch", "data", "bundle"),
-    "Measure and test": ("bench", "trials", "fuzz"),
+    "Measure and test": ("bench", "conform", "trials", "fuzz"),
     "Shell": ("completion",),
 }
 OTHERS = "Others"

@@ -1,0 +1,144 @@
+"""Rules of section 1 (frames) and of reserved fields: what a receiver must live through, and still answer.
+
+Owns these checks; the bytes are made by hand where they must be wrong.
+"""
+
+from __future__ import annotations
+
+import random
+import zlib
+
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.framing import cobs_encode, encode_frame
+from pans.runtime.wire.messages import MessageType
+
+from .bench import Bench
+from .rules import need, rule
+
+GOLDEN = bytes.fromhex("020101010A44332211C4AF642E010101058FAF0A2A00")
+GOLDEN_SESSION = 0x11223344
+UNKNOWN_OPCODE = 0xEE
+
+
+@rule(
+    "1.1",
+    "The worked example, HELLO of session 0x11223344, is answered with WELCOME of that session, schema and version.",
+)
+def golden_hello(bench: Bench) -> None:
+    bench.session = GOLDEN_SESSION
+    bench.send(b"\0" + GOLDEN)
+    welcome = bench.wait(MessageType.WELCOME, what="to the worked example")
+    need(welcome.schema == wire.SCHEMA, f"WELCOME says schema {welcome.schema:#010x}, expected {wire.SCHEMA:#010x}")
+    need(welcome.protocol == wire.PROTOCOL_VERSION, f"WELCOME says protocol {welcome.protocol}")
+
+
+@rule("1.2", "Every frame but HELLO and WELCOME has a CRC that starts from the schema hash.")
+def seeded_crc(bench: Bench) -> None:
+    bench.ping()
+    body = wire.HEADER.pack(MessageType.PING, 0, 0, bench.session) + b"\1" * 12
+    bench.send(_framed(body, start=0))
+    bench.silent(MessageType.PONG, "to a PING whose CRC starts from 0")
+
+
+@rule("1.3", "A frame that fails its CRC is dropped, and the next one is taken.")
+def damaged_crc(bench: Bench) -> None:
+    frame = bytearray(wire.encode_ping(99, 0x0101010101010101, bench.session))
+    frame[-3] ^= 0x55
+    frame[-3] = frame[-3] or 1
+    bench.send(bytes(frame))
+    bench.silent(MessageType.PONG, "to a PING with a damaged byte")
+    bench.ping()
+
+
+@rule("1.4", "After any garbage and a delimiter the next frame is taken.")
+def garbage(bench: Bench) -> None:
+    dice = random.Random(1)
+    for size in (1, 3, 300, 5000):
+        bench.send(dice.randbytes(size) + b"\0")
+        bench.ping()
+
+
+@rule("1.5", "A frame that is cut off leaves nothing behind: a new frame begins after the next delimiter.")
+def cut_off(bench: Bench) -> None:
+    whole = wire.encode_command(1, UNKNOWN_OPCODE, bytes(40), bench.session)
+    for size in (1, 5, len(whole) // 2, len(whole) - 2):
+        bench.send(whole[:size] + b"\0")
+        bench.ping()
+
+
+@rule("1.6", "A frame longer than the limit is dropped, and the next one is taken.")
+def too_long(bench: Bench) -> None:
+    bench.send(b"\xff" * 70_000 + b"\0")
+    bench.ping()
+
+
+@rule("1.7", "Empty frames mean nothing.")
+def empty_frames(bench: Bench) -> None:
+    bench.send(bytes(1000))
+    bench.ping()
+
+
+@rule("1.8", "A frame may come in pieces, and several at once.")
+def pieces(bench: Bench) -> None:
+    for byte in wire.encode_ping(501, 7, bench.session):
+        bench.send(bytes([byte]))
+    bench.wait(MessageType.PONG, lambda pong: pong.probe_id == 501, what="to a PING sent byte by byte")
+    bench.send(b"".join(wire.encode_ping(number, 7, bench.session) for number in (502, 503)))
+    for number in (502, 503):
+        bench.wait(MessageType.PONG, lambda pong, n=number: pong.probe_id == n, what="to two PINGs in one piece")
+
+
+@rule("1.9", "An empty last group after a group of 254 may be sent or left out.")
+def last_group(bench: Bench) -> None:
+    body = _ends_in_a_full_group(bench.session, bench.last_id + 1)
+    coded = cobs_encode(body)
+    longer = coded if coded.endswith(b"\1") else coded + b"\1"
+    for form in (longer[:-1], longer):
+        bench.inbox.clear()
+        bench.send(form + b"\0")
+        ack = bench.wait(MessageType.ACK, what="to a frame that ends in a group of 254")
+        need(ack.last_id == bench.last_id + 1, "a frame that ends in a group of 254 was not taken")
+    bench.last_id += 1
+
+
+@rule("1.10", "Flags and reserved fields are ignored.")
+def flags(bench: Bench) -> None:
+    body = wire.HEADER.pack(MessageType.PING, 0xFF, 0xFFFF, bench.session) + bytes([77, 0, 0, 0]) + b"\2" * 8
+    bench.send(_framed(body, wire.SCHEMA))
+    bench.wait(MessageType.PONG, lambda pong: pong.probe_id == 77, what="to a PING with flags")
+
+
+@rule("1.11", "A message of an unknown type is dropped.")
+def unknown_type(bench: Bench) -> None:
+    bench.send(encode_frame(0x7E, b"\1\2\3", bench.session) + encode_frame(0xFE, b"", bench.session))
+    bench.ping()
+
+
+@rule("1.12", "A message whose payload has another length than its layout is dropped.")
+def wrong_length(bench: Bench) -> None:
+    for kind, size in (
+        (MessageType.PING, 11),
+        (MessageType.PING, 13),
+        (MessageType.GRANT, 7),
+        (MessageType.COMMAND, 7),
+    ):
+        bench.send(encode_frame(kind, b"\1" * size, bench.session))
+    bench.listen(0.1)
+    need(not bench.inbox or all(one.kind == MessageType.STATUS for one in bench.inbox), "one of them was answered")
+    bench.ping()
+
+
+def _framed(body: bytes, start: int) -> bytes:
+    return cobs_encode(body + zlib.crc32(body, start).to_bytes(4, "little")) + b"\0"
+
+
+def _ends_in_a_full_group(session: int, number: int) -> bytes:
+    """A command of an unknown opcode whose last 254 bytes, CRC included, hold no zero."""
+    head = wire.HEADER.pack(MessageType.COMMAND, 0, 0, session)
+    head += wire.STRUCTS["COMMAND"].pack(number, UNKNOWN_OPCODE, 0, 0)
+    for filler in range(1, 256):
+        body = head + bytes([filler]) * 250
+        crc = zlib.crc32(body, wire.SCHEMA).to_bytes(4, "little")
+        if 0 not in crc:
+            return body + crc
+    raise AssertionError("no filler without a zero in its CRC")

@@ -1,0 +1,214 @@
+"""Rules of section 4: how commands are numbered, acknowledged and refused.
+
+Owns these checks.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.wire.commands import (
+    Arm,
+    Gate,
+    PatternChunk,
+    pack_arm,
+    pack_gate,
+    pack_pattern,
+    pack_plan,
+)
+from pans.runtime.wire.messages import AckStatus, DeviceState, Opcode
+
+from .bench import Bench
+from .rules import NotTried, need, rule
+
+UNKNOWN_OPCODE = 0xEE
+MALFORMED, RANGE, STATE, LATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE, AckStatus.TOO_LATE
+
+
+@rule("4.1", "The command after the last one is carried out and acknowledged.")
+def next_command(bench: Bench) -> None:
+    for _ in range(3):
+        bench.done(Opcode.STOP)
+
+
+@rule("4.2", "A repeated command is not carried out again, and acknowledged.")
+def repeated(bench: Bench) -> None:
+    bench.done(Opcode.STOP)
+    ack = bench.command(UNKNOWN_OPCODE, number=bench.last_id)  # would be refused if it were carried out
+    need(ack.last_id == bench.last_id, f"last id {ack.last_id}, expected {bench.last_id}")
+    need(not ack.refuses(bench.last_id), "a command with an id that had been used was carried out")
+
+
+@rule("4.3", "A command behind a gap is not carried out; ACK says the last id before the gap.")
+def gap(bench: Bench) -> None:
+    bench.done(Opcode.STOP)
+    ack = bench.command(UNKNOWN_OPCODE, number=bench.last_id + 2)
+    need(ack.last_id == bench.last_id, f"last id {ack.last_id}, expected {bench.last_id}: a command was left out")
+    need(ack.refused_id <= bench.last_id, "a command behind a gap was carried out")
+    bench.done(Opcode.STOP)
+
+
+@rule("4.4", "ACK names the latest refused command, and the mask each one of the last 32.")
+def refused_mask(bench: Bench) -> None:
+    bench.refused(AckStatus.UNKNOWN_OPCODE, UNKNOWN_OPCODE, b"", "an unknown opcode")
+    first = bench.last_id
+    bench.done(Opcode.STOP)
+    bench.refused(AckStatus.UNKNOWN_OPCODE, UNKNOWN_OPCODE, b"", "an unknown opcode")
+    bench.last_id += 1
+    ack = bench.command(Opcode.STOP, number=bench.last_id)
+    need(ack.refused_id == first + 2, f"refused id {ack.refused_id}, expected {first + 2}")
+    need(ack.refused_mask & 0xF == 0b1010, f"refused mask {ack.refused_mask:#b}, expected it to end in 1010")
+
+
+@rule("4.5", "An unknown opcode is refused with 1.")
+def unknown_opcode(bench: Bench) -> None:
+    for opcode in (0, 0x0A, 0x80, 0xFF):
+        bench.refused(AckStatus.UNKNOWN_OPCODE, opcode, b"", f"opcode {opcode:#04x}")
+
+
+@rule("4.6", "A body that cannot be meant is refused with 2.")
+def malformed(bench: Bench) -> None:
+    layout = bench.layout()
+    plan = pack_plan(layout.chunk())
+    head = struct.pack("<HHII", 0, 0, 0, 4)
+    for opcode, body, what in (
+        (Opcode.STOP, b"x", "STOP with a body"),
+        (Opcode.RESET, b"xy", "RESET with a body"),
+        (Opcode.ARM, bytes(23), "ARM of 23 bytes"),
+        (Opcode.ARM, bytes(25), "ARM of 25 bytes"),
+        (Opcode.LOAD_PATTERN, head, "LOAD_PATTERN without levels"),
+        (Opcode.LOAD_PATTERN, head + b"\0", "LOAD_PATTERN with half a level"),
+        (Opcode.LOAD_PATTERN, head + bytes(10), "LOAD_PATTERN with five levels of four"),
+        (Opcode.LOAD_PLAN, plan[:20], "a part of LOAD_PLAN's header"),
+        (Opcode.LOAD_PLAN, plan[:36], "LOAD_PLAN without slots"),
+        (Opcode.LOAD_PLAN, plan[:-5], "LOAD_PLAN with a part of a slot"),
+        (Opcode.LOAD_PLAN, plan + bytes(12), "LOAD_PLAN with more slots than it says"),
+    ):
+        bench.refused(MALFORMED, opcode, body, what)
+
+
+@rule("4.7", "LOAD_PATTERN outside its ranges, or out of order, is refused with 3.")
+def pattern_ranges(bench: Bench) -> None:
+    facts = bench.facts
+
+    def refuse(index: int, first: int, whole: int, level: int, what: str) -> None:
+        body = struct.pack("<HHIIH", index, 0, first, whole, level)
+        bench.refused(RANGE, Opcode.LOAD_PATTERN, body, what)
+
+    if facts["pattern_memory"] <= 0xFFFF:
+        refuse(facts["pattern_memory"], 0, 4, 0, "a pattern beyond the memory")
+    if facts["levels"] <= 0xFFFF:
+        refuse(0, 0, 4, facts["levels"], "a level that the projector does not have")
+    if facts["pattern_pixels"] < 0xFFFFFFFF:
+        refuse(0, 0, facts["pattern_pixels"] + 1, 0, "a pattern of too many pixels")
+    refuse(1 if facts["pattern_memory"] > 1 else 0, 2, 4, 0, "a piece that continues nothing")
+
+
+@rule("4.8", "LOAD_PLAN outside its ranges is refused with 3.")
+def plan_ranges(bench: Bench) -> None:
+    layout = bench.layout()
+    good = layout.chunk()
+    most = bench.facts["channels"] if layout.mode else bench.facts["pattern_memory"]
+    wrong: list[dict[str, Any]] = [
+        {"mode": 1 - layout.mode},
+        {"n_patterns": 0},
+        {"exposure_ticks": 0},
+        {"cycle_ticks": 0},
+        {"cycle_ticks": (1 << 48) + 1},
+        {"block_exposures": 0},
+        {"cycles_per_object": 0},
+    ]
+    if most < 0xFFFF:
+        wrong.append({"n_patterns": most + 1})
+    if bench.facts["slot_memory"] < 0xFFFFFFFF:
+        wrong.append({"n_slots": bench.facts["slot_memory"] + 1})
+    for fields in wrong:
+        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(**fields)), f"LOAD_PLAN with {fields}")
+    for field, value in (("offset_ticks", good.cycle_ticks), ("pattern", good.n_patterns)):
+        slots = good.slots.copy()
+        slots[field][-1] = value
+        bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(slots=slots)), f"a slot with {field} {value}")
+
+
+@rule("4.9", "ARM without a complete plan is refused with 4.")
+def arm_without_plan(bench: Bench) -> None:
+    bench.open()
+    body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+    bench.refused(STATE, Opcode.ARM, body, "ARM in a new session")
+    layout = bench.layout()
+    bench.upload(layout)
+    slots = layout.chunk()
+    bench.done(Opcode.LOAD_PLAN, pack_plan(slots._replace(slots=slots.slots[:1])))
+    body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+    bench.refused(STATE, Opcode.ARM, body, "ARM after the first of several pieces of a plan")
+
+
+@rule(
+    "4.10",
+    "ARM outside its ranges is refused: 5 for a start that has passed, 3 for a lease of 0 or more than an hour, or a start too far ahead.",
+)
+def arm_ranges(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    now, hz = bench.ping().tx_tick, bench.facts["tick_hz"]
+    for status, arm, what in (
+        (LATE, Arm(now, 1, 1000), "ARM for a tick that has passed"),
+        (LATE, Arm(0, 1, 1000), "ARM for tick 0"),
+        (RANGE, Arm(now + hz, 1, 0), "ARM with a lease of 0"),
+        (RANGE, Arm(now + hz, 1, 3_600_001), "ARM with a lease of more than an hour"),
+        (RANGE, Arm(now + 3601 * hz, 1, 1000), "ARM for more than an hour ahead"),
+        (RANGE, Arm(now + hz, 1 << 62, 1000), "ARM for 2^62 cycles"),
+    ):
+        bench.refused(status, Opcode.ARM, pack_arm(arm), what)
+    bench.inbox.clear()
+    status = bench.until_state(DeviceState.IDLE)
+    need(status.state == DeviceState.IDLE, "a refused ARM changed the state")
+
+
+@rule("4.11", "LOAD_PATTERN, LOAD_PLAN and ARM are refused with 4 outside IDLE.")
+def uploads_need_idle(bench: Bench) -> None:
+    layout = bench.layout()
+    bench.upload(layout)
+    start = bench.arm(0, ahead_s=20.0, lease_ms=20_000)
+    for opcode, body in (*layout.commands(), (Opcode.ARM, pack_arm(Arm(start + 1, 1, 1000)))):
+        bench.refused(STATE, opcode, body, f"{Opcode(opcode).name} while ARMED")
+    bench.done(Opcode.STOP)
+
+
+@rule(
+    "4.12",
+    "GATE is refused with 4 in IDLE, with 5 when its tick has passed, with 3 outside its ranges, and carried out ahead of time.",
+)
+def gates(bench: Bench) -> None:
+    now, hz = bench.ping().tx_tick, bench.facts["tick_hz"]
+    bench.refused(STATE, Opcode.GATE, pack_gate(Gate(now + hz, 1, 0)), "GATE in IDLE")
+    bench.upload(bench.layout())
+    bench.arm(0, ahead_s=20.0, lease_ms=20_000)
+    now = bench.ping().tx_tick
+    for status, gate, what in (
+        (LATE, Gate(now, 100, 0), "GATE for a tick that has passed"),
+        (RANGE, Gate(now + hz, 0, 0), "GATE for 0 ticks"),
+        (RANGE, Gate(now + hz, 1, 0xFFFF), "GATE of output 65535"),
+    ):
+        bench.refused(status, Opcode.GATE, pack_gate(gate), what)
+    if bench.facts.get("gate_channels", 1):
+        bench.done(Opcode.GATE, pack_gate(Gate(bench.ping().tx_tick + hz // 2, hz // 1000, 0)))
+    bench.done(Opcode.STOP)
+
+
+@rule("4.13", "Pieces of a pattern come in order, and first pixel 0 starts over.")
+def pattern_pieces(bench: Bench) -> None:
+    whole = min(bench.facts["pattern_pixels"], 6)
+    if whole < 4:
+        raise NotTried("patterns of less than four pixels")
+
+    def piece(first: int, count: int) -> bytes:
+        return pack_pattern(PatternChunk(0, first, whole, np.zeros(count, np.uint16)))
+
+    bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
+    bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(3, 1), "a piece behind a gap")
+    bench.done(Opcode.LOAD_PATTERN, piece(2, 2))
+    bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
+    bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(4, 1), "a piece behind a gap, after first pixel 0")

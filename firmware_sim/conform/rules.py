@@ -1,0 +1,61 @@
+"""The table of rules: number, words and check; and what a check raises.
+
+Owns the registry that the check modules fill when they are imported; never talks to a device. The words are those of section 12 of
+docs/reference/protocol.md, compared by tests/firmware_sim/conform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from .bench import Bench
+
+
+class Broken(Exception):
+    """The device did not keep the rule; the text says what it did."""
+
+
+class NotTried(Exception):
+    """The rule cannot be tried on this device, or not over this link; the text says why."""
+
+
+class Rule(NamedTuple):
+    """One rule of the protocol. `check` returns when it is kept; it is None for what no link can show, and `why` says so."""
+
+    number: str
+    words: str
+    check: Callable[[Bench], None] | None
+    why: str = ""
+
+
+RULES: dict[str, Rule] = {}
+
+
+def rule(number: str, words: str) -> Callable[[Callable[[Bench], None]], Callable[[Bench], None]]:
+    """Register the function below as the check of rule `number`, "section.place"."""
+
+    def register(check: Callable[[Bench], None]) -> Callable[[Bench], None]:
+        assert number not in RULES, number
+        RULES[number] = Rule(number, words, check)
+        return check
+
+    return register
+
+
+def beyond_the_link(number: str, words: str, why: str) -> None:
+    """Register a rule that a link cannot show."""
+    assert number not in RULES, number
+    RULES[number] = Rule(number, words, None, why)
+
+
+def need(kept: bool, words: str) -> None:
+    """Raise Broken with `words` unless `kept`."""
+    if not kept:
+        raise Broken(words)
+
+
+def in_order(number: str) -> tuple[int, ...]:
+    """Return the key by which rules are sorted."""
+    return tuple(int(part) for part in number.split("."))

@@ -1,0 +1,319 @@
+"""Rules of sections 4 (states, lease) and 5 (the stream): whole runs, and what must agree in them.
+
+Owns these checks.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.messages import AckStatus, ClickBlock, DeviceState, FrameBlock, Mark, Opcode, StateReason
+
+from .bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
+from .plans import Layout
+from .rules import NotTried, beyond_the_link, need, rule
+
+CYCLES = 12
+LEASE_SLACK_S = 0.05  # of a device that looks at its lease between other things
+MOST_TO_FILL = 3000  # messages that a check is willing to wait for
+
+
+def blocks_of(stream: list[Any]) -> list[Any]:
+    """The blocks among the stream's messages."""
+    return [one for one in stream if isinstance(one, (ClickBlock, FrameBlock))]
+
+
+def exposures_of(block: Any) -> int:
+    """How many exposures a block holds."""
+    return len(block.words if isinstance(block, FrameBlock) else block.patterns)
+
+
+def run_once(bench: Bench, **changes: Any) -> tuple[Layout, int, list[Any], Any]:
+    """One short run: layout, start tick, stream messages, closing STATUS."""
+    layout = bench.layout(**changes)
+    start, stream, closing = bench.run(layout, CYCLES)
+    need(bool(blocks_of(stream)), "a whole run brought no block")
+    return layout, start, stream, closing
+
+
+@rule(
+    "4.14",
+    "A run goes from ARMED to RUNNING at its start tick and to IDLE (completed) after its last cycle, each with a STATUS.",
+)
+def states(bench: Bench) -> None:
+    layout = bench.layout()
+    bench.upload(layout)
+    bench.grant()
+    bench.inbox.clear()
+    start = bench.arm(CYCLES)
+    bench.until_state(DeviceState.ARMED)
+    running = bench.until_state(DeviceState.RUNNING)
+    need(running.tick >= start, f"RUNNING at tick {running.tick}, the start tick is {start}")
+    bench.grant(lease_ms=LEASE_MS)
+    idle = bench.wait_idle(layout.seconds(CYCLES) + PATIENCE_S)
+    need(idle.reason == StateReason.COMPLETED, f"reason {idle.reason}, expected 1 (completed)")
+    need(idle.tick >= start + CYCLES * layout.cycle_ticks, "IDLE before the last cycle was over")
+    need(
+        idle.next_exposure == CYCLES * layout.n_slots,
+        f"next exposure {idle.next_exposure}, expected {CYCLES * layout.n_slots}",
+    )
+    need(idle.lease_left_ms == 0, f"{idle.lease_left_ms} ms of a lease left in IDLE")
+
+
+@rule("4.15", "STOP ends a run: IDLE with reason 2, from ARMED and from RUNNING.")
+def stop(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    for state in (DeviceState.ARMED, DeviceState.RUNNING):
+        bench.arm(0)
+        bench.until_state(state)
+        bench.done(Opcode.STOP)
+        status = bench.until_state(DeviceState.IDLE)
+        need(status.reason == StateReason.STOPPED, f"reason {status.reason} after STOP, expected 2")
+        bench.inbox.clear()
+
+
+@rule("4.16", "A lease that nobody renews ends in SAFE (reason 3), when it has run out and not before.")
+def lease(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    bench.grant()
+    lease_ms, hz = 400, bench.facts["tick_hz"]
+    before = bench.ping().tx_tick
+    bench.arm(0, lease_ms=lease_ms, ahead_s=0.1)
+    after = bench.ping().rx_tick
+    status = bench.until_state(DeviceState.SAFE)
+    need(status.reason == StateReason.LEASE_EXPIRED, f"SAFE with reason {status.reason}, expected 3")
+    lasted = lease_ms * hz / 1000
+    need(
+        status.tick >= before + lasted - 1,
+        f"SAFE after {(status.tick - before) / hz * 1000:.0f} ms of a lease of {lease_ms}",
+    )
+    late = (status.tick - after - lasted) / hz
+    need(late <= LEASE_SLACK_S, f"SAFE {late * 1000:.0f} ms after the lease of {lease_ms} ms had run out")
+
+
+@rule("4.17", "GRANT with a lease renews it, GRANT with 0 leaves it as it is.")
+def renewal(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    bench.arm(0, lease_ms=500, ahead_s=0.1)
+    for _ in range(4):
+        bench.grant(lease_ms=500)
+        bench.listen(0.25)
+    need(
+        all(getattr(one.message, "state", 0) != DeviceState.SAFE for one in bench.inbox),
+        "SAFE although the lease was renewed",
+    )
+    bench.grant(lease_ms=300)
+    bench.listen(0.15)
+    bench.grant()
+    bench.wait_safe(0.15 + LEASE_SLACK_S + 0.2)
+
+
+@rule("4.18", "SAFE outlives the session and takes no ARM; RESET leaves it, and uploads are kept.")
+def safe(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    bench.arm(0, lease_ms=150, ahead_s=0.05)
+    bench.until_state(DeviceState.SAFE)
+    start = bench.ping().tx_tick + bench.facts["tick_hz"]
+    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM in SAFE")
+    bench.done(Opcode.RESET)
+    bench.until_state(DeviceState.IDLE)
+    bench.arm(0, lease_ms=150, ahead_s=0.05)
+    bench.until_state(DeviceState.SAFE)
+    bench.open(reset=False)
+    bench.until_state(DeviceState.SAFE)
+    bench.done(Opcode.RESET)
+    bench.until_state(DeviceState.IDLE)
+
+
+@rule("4.19", "A GRANT in IDLE starts no lease: STATUS says 0 ms.")
+def grant_in_idle(bench: Bench) -> None:
+    bench.grant(lease_ms=5000)
+    bench.inbox.clear()
+    status = bench.until_state(DeviceState.IDLE)
+    need(status.lease_left_ms == 0, f"a GRANT in IDLE left a lease of {status.lease_left_ms} ms")
+
+
+beyond_the_link(
+    "4.20",
+    "In SAFE and IDLE the projector is dark and the gates are closed.",
+    "light and gates need a detector and a scope",
+)
+
+
+@rule("5.1", "The stream's sequence starts at 0 with each ARM and counts up by 1.")
+def sequence(bench: Bench) -> None:
+    for _ in range(2):
+        _, _, stream, _ = run_once(bench)
+        found = [one.seq for one in stream]
+        need(found == list(range(len(found))), f"sequence {found[:12]}...")
+
+
+@rule(
+    "5.2",
+    "A block holds consecutive exposures of one cycle and one object, evenly spaced, and no more than the plan's blocks have.",
+)
+def block_rules(bench: Bench) -> None:
+    layout, _, stream, _ = run_once(bench)
+    following = 0
+    for block in blocks_of(stream):
+        count = exposures_of(block)
+        first_cycle, last_cycle = (
+            block.exposure_index // layout.n_slots,
+            (block.exposure_index + count - 1) // layout.n_slots,
+        )
+        need(
+            block.exposure_index == following,
+            f"a block begins with exposure {block.exposure_index}, expected {following}",
+        )
+        need(count <= layout.block_exposures, f"a block of {count} exposures, the plan's have {layout.block_exposures}")
+        need(first_cycle == last_cycle, f"a block with exposures of cycles {first_cycle} and {last_cycle}")
+        need(
+            block.period_ticks == layout.period_ticks,
+            f"{block.period_ticks} ticks between exposures, the plan has {layout.period_ticks}",
+        )
+        following += count
+    need(following == CYCLES * layout.n_slots, f"{following} exposures, the run has {CYCLES * layout.n_slots}")
+
+
+@rule("5.3", "Blocks are CLICKS or FRAMES, as the mode says, and name the pattern that was shown.")
+def shown(bench: Bench) -> None:
+    layout, _, stream, _ = run_once(bench)
+    for block in blocks_of(stream):
+        need(
+            isinstance(block, FrameBlock) == bool(layout.mode),
+            f"a {type(block).__name__} from a device in mode {layout.mode}",
+        )
+        if isinstance(block, ClickBlock):
+            wanted = [layout.shown[(block.exposure_index + k) % layout.n_slots] for k in range(len(block.patterns))]
+            need(block.patterns.tolist() == wanted, f"patterns {block.patterns.tolist()}, the plan shows {wanted}")
+        else:
+            words = block.words.shape[1]
+            need(words in (1, 2, 4) or words % 8 == 0, f"words of {words} bytes")
+            need(8 * words >= layout.n_patterns, f"words of {words} bytes for {layout.n_patterns} channels")
+
+
+@rule(
+    "5.4",
+    "An exposure begins at the start tick plus the plan's offset or later, by less than half the spacing, and is no later than its STATUS.",
+)
+def timing(bench: Bench) -> None:
+    layout, start, stream, closing = run_once(bench)
+    for block in blocks_of(stream):
+        late = block.tick - start - layout.begins(block.exposure_index)
+        need(late >= 0, f"exposure {block.exposure_index} began {-late} ticks before its time")
+        need(
+            late < layout.period_ticks / 2,
+            f"exposure {block.exposure_index} began {late} ticks late, of a spacing of {layout.period_ticks}",
+        )
+        need(block.tick <= closing.tick, f"a block of tick {block.tick}, and STATUS of tick {closing.tick} after it")
+
+
+@rule("5.5", "The object of a block is the number of the visit since ARM, or unknown.")
+def objects(bench: Bench) -> None:
+    layout, _, stream, _ = run_once(bench)
+    per_object = layout.n_slots * layout.cycles_per_object
+    for block in blocks_of(stream):
+        wanted = block.exposure_index // per_object
+        need(
+            block.object_index in (wanted, 0xFFFFFFFF),
+            f"object {block.object_index} in exposure {block.exposure_index}, expected {wanted}",
+        )
+    for mark in (one for one in stream if isinstance(one, Mark) and one.half_exposures == 0):
+        need(
+            mark.exposure_index == mark.object_index * per_object,
+            f"MARK of object {mark.object_index} at exposure {mark.exposure_index}",
+        )
+
+
+@rule(
+    "5.6",
+    "No stream message leaves before its sequence is below the limit of the latest GRANT; the limit is 0 in a new session.",
+)
+def window(bench: Bench) -> None:
+    bench.open()
+    layout = bench.layout(block_exposures=1)
+    bench.upload(layout)
+    bench.arm(CYCLES)
+    bench.until_state(DeviceState.RUNNING)
+    for limit in (0, 3, 7):
+        if limit:
+            bench.grant(limit)
+        bench.listen(0.1 + 8 * layout.cycle_ticks / layout.tick_hz)
+        seen = [one for one in bench.inbox if one.kind in (0x90, 0x91, 0x92)]
+        need(len(seen) <= limit, f"{len(seen)} stream messages with a limit of {limit}")
+    need(len(seen) == 7, f"{len(seen)} stream messages with a limit of 7 and more waiting")
+    bench.done(Opcode.STOP)
+
+
+@rule(
+    "5.7",
+    "Exposures are in blocks or in drops: a block's first exposure = those before it + its drops, and STATUS agrees at the end.",
+)
+def books(bench: Bench) -> None:
+    held = int(bench.facts.get("buffer_messages", 0))
+    if not 0 < held <= MOST_TO_FILL:
+        raise NotTried(f"a buffer of {held} messages: this check fills buffers of 1 to {MOST_TO_FILL}")
+    layout = bench.layout(block_exposures=1, cycles_per_object=1 << 20)
+    cycles = -(-(held + 40) // layout.n_slots) + 10
+    bench.upload(layout)
+    bench.grant(limit=10)
+    bench.arm(cycles, lease_ms=60_000)
+    bench.until_state(DeviceState.RUNNING)
+    bench.listen(layout.seconds(cycles) / 2)
+    bench.grant(limit=20)
+    closing = bench.wait_idle(layout.seconds(cycles) + PATIENCE_S)
+    bench.grant()
+    bench.listen(0.3 + held * 1e-3)
+    blocks = blocks_of(bench.stream())
+    before = 0
+    for block in blocks:
+        need(
+            block.exposure_index == before + block.drops,
+            f"exposure {block.exposure_index} after {before} in blocks and {block.drops} drops",
+        )
+        before += exposures_of(block)
+    need(closing.drops > 0, "nothing was dropped although the buffer must have been full")
+    need(
+        before + closing.drops == closing.next_exposure,
+        f"{before} exposures in blocks, {closing.drops} drops, {closing.next_exposure} in STATUS",
+    )
+
+
+@rule("5.8", "STOP sends the exposures that have ended in a shorter block, and counts them.")
+def broken_off(bench: Bench) -> None:
+    layout = bench.layout(block_exposures=3)
+    bench.upload(layout)
+    bench.grant()
+    bench.arm(0)
+    bench.until_state(DeviceState.RUNNING)
+    bench.listen(4.3 * layout.cycle_ticks / layout.tick_hz)
+    bench.done(Opcode.STOP)
+    status = bench.until_state(DeviceState.IDLE)
+    bench.listen(STEP_S)
+    counted = sum(exposures_of(block) for block in blocks_of(bench.stream()))
+    need(counted == status.next_exposure, f"{counted} exposures in blocks, next exposure {status.next_exposure}")
+
+
+@rule("5.9", "Bits beyond the last exposure or channel are 0.")
+def spare_bits(bench: Bench) -> None:
+    layout, _, stream, _ = run_once(bench)
+    if not layout.mode:
+        for piece in bench.raw_clicks():
+            count = int.from_bytes(piece[28:30], "little")
+            spare = piece[-1] >> (count % 8) if count % 8 else 0
+            need(spare == 0, f"a block of {count} exposures with the last byte {piece[-1]:#04x}")
+        return
+    for block in blocks_of(stream):
+        value = int.from_bytes(block.words[0].tobytes(), "little")
+        need(value >> layout.n_patterns == 0, f"a word {value:#x} of {layout.n_patterns} channels")
+
+
+@rule("5.10", "STATUS is repeated after the end of a run and says the same.")
+def closing_repeated(bench: Bench) -> None:
+    _, _, _, closing = run_once(bench)
+    again = bench.until_state(DeviceState.IDLE)
+    need(
+        (again.next_exposure, again.drops) == (closing.next_exposure, closing.drops),
+        "two STATUS after the end say different numbers",
+    )

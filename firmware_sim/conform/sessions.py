@@ -1,0 +1,200 @@
+"""Rules of sections 2 and 3 (sessions, WELCOME) and 6 (probes, the clock).
+
+Owns these checks.
+"""
+
+from __future__ import annotations
+
+from pans.runtime.wire import messages as wire
+from pans.runtime.wire.automata import AUTOMATON_SCHEMA
+from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.fields import wrong_facts
+from pans.runtime.wire.framing import encode_frame
+from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
+
+from .bench import PATIENCE_S, Bench
+from .rules import Broken, beyond_the_link, need, rule
+
+CLOCK_PPM = 1000.0  # section 9
+CLOCK_S = 2.0
+FLOOD = 300
+STATUS_EVERY_S = 1.3  # once a second, and a little for the way
+
+
+@rule("2.1", "HELLO is answered with WELCOME in the new session, and STATUS follows at once.")
+def welcome(bench: Bench) -> None:
+    bench.open(reset=False)
+    bench.wait(MessageType.STATUS, within_s=0.5, what="after WELCOME")
+
+
+@rule("2.2", "HELLO with the nonce of the present session is answered again and changes nothing.")
+def repeated_hello(bench: Bench) -> None:
+    bench.done(Opcode.STOP)
+    bench.send(wire.encode_hello(bench.session))
+    bench.wait(MessageType.WELCOME, what="to a repeated HELLO")
+    ack = bench.command(Opcode.STOP, number=bench.last_id)
+    need(ack.last_id == bench.last_id, f"a repeated HELLO forgot the command ids: last id {ack.last_id}")
+
+
+@rule("2.3", "A new session forgets uploads, command ids and the run: the device is IDLE.")
+def new_session(bench: Bench) -> None:
+    bench.upload(bench.layout())
+    bench.arm(0, ahead_s=0.5)
+    bench.open()
+    ack = bench.command(Opcode.STOP)
+    need(ack.last_id == bench.last_id, f"the command ids did not start over: last id {ack.last_id}")
+    start = bench.ping().tx_tick + bench.facts["tick_hz"]
+    bench.refused(AckStatus.WRONG_STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM after a new session")
+
+
+@rule("2.4", "Frames of another session are dropped.")
+def foreign(bench: Bench) -> None:
+    bench.send(
+        wire.encode_ping(1, 1, bench.session ^ 2)
+        + wire.encode_command(bench.last_id + 1, Opcode.STOP, b"", bench.session ^ 2)
+    )
+    bench.listen(0.2)
+    need(not any(one.kind in (MessageType.PONG, MessageType.ACK) for one in bench.inbox), "one of them was answered")
+    bench.done(Opcode.STOP)
+
+
+@rule("2.5", "HELLO of another schema is answered with the device's own WELCOME, and there is no session then.")
+def other_schema(bench: Bench) -> None:
+    bench.session ^= 4
+    bench.inbox.clear()
+    bench.send(
+        encode_frame(
+            MessageType.HELLO, wire.STRUCTS["HELLO"].pack(wire.SCHEMA ^ 1, wire.PROTOCOL_VERSION, 0), bench.session
+        )
+    )
+    found = bench.wait(MessageType.WELCOME, what="to a HELLO of another schema")
+    need(found.schema == wire.SCHEMA, f"WELCOME says schema {found.schema:#010x}")
+    bench.send(wire.encode_ping(1, 1, bench.session))
+    bench.silent(MessageType.PONG, "in a session that must not be")
+
+
+@rule("2.6", "The tick counter does not restart with a session.")
+def ticks_go_on(bench: Bench) -> None:
+    before = bench.ping().tx_tick
+    bench.open()
+    after = bench.ping().rx_tick
+    need(after >= before, f"tick {before} in one session, {after} in the next")
+
+
+@rule("2.7", "STATUS comes once per second.")
+def status_every_second(bench: Bench) -> None:
+    bench.listen(0.05)
+    bench.inbox.clear()
+    for _ in range(2):
+        bench.wait(MessageType.STATUS, within_s=STATUS_EVERY_S)
+
+
+beyond_the_link(
+    "2.8", "Another epoch says that the tick counter has restarted.", "the device would have to be switched off"
+)
+
+
+@rule("3.1", "WELCOME's map holds what it must, in its ranges, and no key twice.")
+def facts(bench: Bench) -> None:
+    wrong = wrong_facts(bench.facts)
+    need(not wrong, "; ".join(wrong))
+
+
+@rule("3.2", "tick_hz and mode are those of the profile.")
+def facts_of_profile(bench: Bench) -> None:
+    for key, expected in (("tick_hz", bench.profile.clock.tick_hz), ("mode", bench.profile.mode)):
+        need(
+            bench.facts[key] == expected,
+            f"{key} is {bench.facts[key]}, the profile {bench.profile.name} says {expected}",
+        )
+
+
+@rule("3.3", "A device that announces automata does so with the number of the extension.")
+def announced(bench: Bench) -> None:
+    found = bench.facts.get("automaton_schema", AUTOMATON_SCHEMA)
+    need(found == AUTOMATON_SCHEMA, f"automaton_schema is {found:#010x}, expected {AUTOMATON_SCHEMA:#010x}")
+
+
+@rule("6.1", "PONG echoes probe id and host nanoseconds.")
+def echo(bench: Bench) -> None:
+    for number, ns in ((0, 0), (0xFFFFFFFF, (1 << 64) - 1), (0x01020304, 0x0102030405060708)):
+        bench.send(wire.encode_ping(number, ns, bench.session))
+        pong = bench.wait(MessageType.PONG)
+        need(
+            (pong.probe_id, pong.host_ns) == (number, ns),
+            f"PING {number:#x}, {ns:#x} came back as {pong.probe_id:#x}, {pong.host_ns:#x}",
+        )
+
+
+@rule("6.2", "A PING is answered once.")
+def answered_once(bench: Bench) -> None:
+    bench.ping()
+    bench.silent(MessageType.PONG, "a second time")
+
+
+@rule("6.3", "The ticks of arrival and departure lie within the time that the probe was away, and never go back.")
+def clock_honesty(bench: Bench) -> None:
+    hz, last = bench.facts["tick_hz"], 0
+    for _ in range(20):
+        sent_ns = bench.link.now_ns()
+        pong = bench.ping()
+        away = (bench.link.now_ns() - sent_ns) * 1e-9 * hz * (1 + CLOCK_PPM * 1e-6) + 1 + 20e-6 * hz
+        need(pong.rx_tick >= last, f"tick {pong.rx_tick} after {last}")
+        need(pong.rx_tick <= pong.tx_tick, f"departure {pong.tx_tick} before arrival {pong.rx_tick}")
+        need(pong.tx_tick - pong.rx_tick <= away, f"held for {pong.tx_tick - pong.rx_tick} ticks, away for {away:.0f}")
+        last = pong.tx_tick
+
+
+@rule("6.4", "The tick counter runs at tick_hz, within 1000 ppm.")
+def clock_rate(bench: Bench) -> None:
+    def probe() -> tuple[int, float, float]:
+        best = None
+        for _ in range(16):
+            sent_ns = bench.link.now_ns()
+            pong = bench.ping()
+            trip_ns = bench.link.now_ns() - sent_ns
+            if best is None or trip_ns < best[2]:
+                best = (pong.rx_tick, sent_ns + trip_ns / 2, trip_ns)
+        assert best is not None
+        return best
+
+    tick, at_ns, trip_ns = probe()
+    bench.listen(CLOCK_S)
+    later_tick, later_ns, later_trip_ns = probe()
+    wanted = (later_ns - at_ns) * 1e-9 * bench.facts["tick_hz"]
+    ppm = ((later_tick - tick) / wanted - 1) * 1e6
+    allowed = CLOCK_PPM + (trip_ns + later_trip_ns) / 2 / (later_ns - at_ns) * 1e6
+    need(abs(ppm) <= allowed, f"the counter runs {ppm:+.0f} ppm off, allowed {allowed:.0f}")
+
+
+@rule("6.5", "A flood of probes and repetitions does no harm: the device answers when it is over, and no probe twice.")
+def flood(bench: Bench) -> None:
+    bench.done(Opcode.STOP)
+    repeated = wire.encode_command(bench.last_id, Opcode.STOP, b"", bench.session)
+    for first in range(1000, 1000 + FLOOD, 30):
+        bench.send(b"".join(wire.encode_ping(n, 1, bench.session) for n in range(first, first + 30)) + repeated * 10)
+    bench.listen(0.5)
+    seen = [one.message.probe_id for one in bench.inbox if one.kind == MessageType.PONG]
+    need(len(seen) == len(set(seen)), "a probe was answered twice")
+    need(set(seen) <= set(range(1000, 1000 + FLOOD)), "a probe was answered that was never sent")
+    bench.ping()
+    status = bench.wait(MessageType.STATUS, within_s=PATIENCE_S)
+    need(status.state == DeviceState.IDLE, f"the flood left the device {DeviceState(status.state).name}")
+
+
+@rule("6.6", "Answers are in time while the stream runs: a PING within 250 ms.")
+def probes_in_a_run(bench: Bench) -> None:
+    layout = bench.layout(block_exposures=1)
+    bench.upload(layout)
+    bench.grant()
+    bench.arm(0)
+    bench.until_state(DeviceState.RUNNING)
+    answered = 0
+    for _ in range(16):
+        try:
+            bench.ping(within_s=0.25)
+            answered += 1
+        except Broken:
+            continue
+    bench.done(Opcode.STOP)
+    need(answered > 0, "none of sixteen probes was answered within 250 ms")
