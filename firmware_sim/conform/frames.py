@@ -12,7 +12,7 @@ from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import cobs_encode, encode_frame
 from pans.runtime.wire.messages import MessageType
 
-from .bench import Bench
+from .bench import QUIET_S, Bench
 from .rules import need, rule
 
 GOLDEN = bytes.fromhex("020101010A44332211C4AF642E010101058FAF0A2A00")
@@ -84,8 +84,9 @@ def pieces(bench: Bench) -> None:
         bench.send(bytes([byte]))
     bench.wait(MessageType.PONG, lambda pong: pong.probe_id == 501, what="to a PING sent byte by byte")
     bench.send(b"".join(wire.encode_ping(number, 7, bench.session) for number in (502, 503)))
-    for number in (502, 503):
-        bench.wait(MessageType.PONG, lambda pong, n=number: pong.probe_id == n, what="to two PINGs in one piece")
+    bench.listen(QUIET_S)
+    answered = {one.message.probe_id for one in bench.inbox if one.kind == MessageType.PONG}
+    need({502, 503} <= answered, f"of two PINGs in one piece {len(answered)} were answered")
 
 
 @rule("1.9", "An empty last group after a group of 254 may be sent or left out.")

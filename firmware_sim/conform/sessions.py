@@ -6,11 +6,11 @@ Owns these checks.
 from __future__ import annotations
 
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import AUTOMATON_SCHEMA
 from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.fields import wrong_facts
 from pans.runtime.wire.framing import encode_frame
 from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode
+from pans.runtime.wire.schema import AUTOMATON_SCHEMA
 
 from .bench import PATIENCE_S, Bench
 from .rules import Broken, beyond_the_link, need, rule

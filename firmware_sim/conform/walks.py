@@ -5,6 +5,8 @@ Owns these checks; on a device that announces no automata only its refusals are 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pans.runtime.wire.automata import (
@@ -112,7 +114,7 @@ def state_ranges(bench: Bench) -> None:
     bench.upload(bench.layout(adaptive=SLOTS))
     good = four_states(found.dwell_steps)
 
-    def refuse(what: str, status: int = RANGE, **fields: object) -> None:
+    def refuse(what: str, status: int = RANGE, **fields: Any) -> None:
         rows = good.states.copy()
         for name in ("pattern", "dwell", "next_dark", "next_click"):
             if name in fields:
