@@ -7,10 +7,9 @@ docs/reference/protocol.md, compared by tests/firmware_sim/conform.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from .bench import Bench
+Check = Callable[[Any], None]  # of a Bench, which stands above this module
 
 
 class Broken(Exception):
@@ -26,17 +25,17 @@ class Rule(NamedTuple):
 
     number: str
     words: str
-    check: Callable[[Bench], None] | None
+    check: Check | None
     why: str = ""
 
 
 RULES: dict[str, Rule] = {}
 
 
-def rule(number: str, words: str) -> Callable[[Callable[[Bench], None]], Callable[[Bench], None]]:
+def rule(number: str, words: str) -> Callable[[Check], Check]:
     """Register the function below as the check of rule `number`, "section.place"."""
 
-    def register(check: Callable[[Bench], None]) -> Callable[[Bench], None]:
+    def register(check: Check) -> Check:
         assert number not in RULES, number
         RULES[number] = Rule(number, words, check)
         return check
