@@ -36,12 +36,12 @@ AUTOMATA_OF: dict[str, dict[float, tuple[tuple[str, float], ...]]] = {
         6.0: (("photons", 5.98), ("exposures", 40), ("states", 192), ("epochs", 7), *EARLIER),
         10.0: (("photons", 10.0), ("exposures", 48), ("states", 256), *EARLIER),
         17.0: (("photons", 16.75), ("exposures", 72), ("states", 320), ("epochs", 8)),
-        40.0: (("photons", 39.4), ("exposures", 96), ("states", 320), ("epochs", 8)),
+        40.0: (("photons", 39.2), ("exposures", 80), ("states", 224), ("epochs", 6)),
     },
     "mnist": {
         10.0: (("photons", 9.6), ("exposures", 44), ("states", 224), ("epochs", 7), *EARLIER),
-        18.0: (("photons", 17.8), ("exposures", 72), ("states", 288), ("epochs", 9)),
-        40.0: (("photons", 39.4), ("exposures", 96), ("states", 320), ("epochs", 8)),
+        18.0: (("photons", 17.8), ("exposures", 72), ("states", 288), ("epochs", 7)),
+        40.0: (("photons", 39.2), ("exposures", 64), ("states", 208), ("epochs", 6)),
     },
 }
 CLICKS_OF = {"fashion-mnist": (1.281, 2.145, 3.135, 4.939), "mnist": (2.164, 4.993)}  # larger ones: the automata above

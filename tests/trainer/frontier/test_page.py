@@ -66,6 +66,14 @@ def test_margins_are_over_direct_imaging_at_the_same_photons():
     assert (best["way"], best["task"]) == (ways.AUTOMATON, "mnist")
 
 
+def test_automata_have_a_command_for_every_level_and_other_ways_one():
+    rows = [made(way, n, n, 0.5) | {"command": f"{way} {n}"} for way in (ways.AUTOMATON, ways.DIRECT) for n in (4, 10)]
+    found = [
+        row["command"] for row in summary.commands([*rows, made(ways.AUTOMATON, 4, 4, 0.6, 1) | {"command": "seed 1"}])
+    ]
+    assert found == [f"{ways.AUTOMATON} 4", f"{ways.AUTOMATON} 10", f"{ways.DIRECT} 4"]
+
+
 def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_the_best():
     rows = list(fixed.paper_rows())
     rows += [made(ways.AUTOMATON, 4, 4.0, 0.99, clicks=2.0), made(ways.AUTOMATON, 6, 6.0, 0.7, clicks=2.1)]
