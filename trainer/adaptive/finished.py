@@ -76,7 +76,8 @@ def meet_budget(
 ) -> None:
     """Dim or brighten all patterns alike until the objects `drawn` take 99 % of the budget; a few percent at most.
 
-    They are drawn from those that were fitted, as light is not learned by heart.
+    They are drawn from those that were fitted. A large automaton learns a little of their light by heart: one of 72 exposures for MNIST
+    took 4 % more of test images, small ones no more.
     """
     if price.budget is None:
         return
