@@ -57,7 +57,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     _refuse_foreign(args)
     torch_with(args.threads)
     from pans.runtime.instrument.profile import load_profile
-    from pans.trainer.adaptive.options import check_automaton_options
+    from pans.trainer.adaptive.options import check_automaton_options, for_task
     from pans.trainer.adaptive.train import train_automaton
     from pans.trainer.device import computing_on, keep_freed_memory
     from pans.trainer.tasks.registry import load_task
@@ -67,6 +67,8 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args)
     check_automaton_options(options, task, profile)
+    if args.teacher is not None and not for_task(options, task.name).soft:
+        raise UsageError("--teacher: no soft targets are wanted", remedy="add --soft 0.5, say, or leave it out")
     keep_freed_memory()
     started = time.perf_counter()
     course: list[Progress] = []

@@ -64,6 +64,31 @@ def test_a_missed_budget_is_told(budget, photons, clicks, said):
     assert [line.partition("to come closer")[0] for line in lines] == said
 
 
+def test_soft_targets_are_kept_in_the_file_asked_for(images, tmp_path, capsys):
+    out, file = tmp_path / "bars.pans", tmp_path / "answers.npz"
+    words = [
+        "train",
+        images,
+        *SHORT,
+        "--photons",
+        "3",
+        "--soft",
+        "0.5",
+        "--teacher",
+        str(file),
+        "--force",
+        "-o",
+        str(out),
+    ]
+    assert main(words) == 0
+    assert "network for soft targets, epoch 6/6: loss" in capsys.readouterr().err
+    assert load_bundle(out)[0].provenance["options"]["soft"] == 0.5
+    kept = file.read_bytes()
+    assert main(words) == 0
+    assert "network for soft targets" not in capsys.readouterr().err
+    assert file.read_bytes() == kept
+
+
 def refusal(capsys, *words):
     assert main(["train", *words]) == 2
     return capsys.readouterr().err
@@ -76,6 +101,13 @@ def test_refusals(images, tmp_path, capsys):
         capsys, images, *SHORT, "--photons", "3", "--features", "4", "--head", "conv", *out
     )
     assert "--states belongs to an automaton" in refusal(capsys, images, "--features", "3", "--states", "4", *out)
+    words = refusal(capsys, images, "--features", "3", "--exposure-price", "0.1", *out)
+    assert "--exposure-price belongs to an automaton" in words
+    for option, value in (("--soft", "1.1"), ("--decide", "-0.1"), ("--exposure-price", "11.0")):
+        words = refusal(capsys, images, *SHORT, "--photons", "3", f"{option}={value}", *out)
+        assert f"{option} is {value}, allowed: 0 to" in words
+    teacher = ["--teacher", str(tmp_path / "x.npz")]
+    assert "no soft targets are wanted" in refusal(capsys, images, *SHORT, "--photons", "3", *teacher, *out)
     assert "--features is missing" in refusal(capsys, images, *out)
     fiber = refusal(capsys, "fiber", *SHORT, "--photons", "3", *out)
     assert "the light is the scene's own" in fiber
