@@ -198,9 +198,10 @@ class _FileHandler(logging.handlers.RotatingFileHandler):
         most = round((ROTATE_MB if rotate_mb is None else rotate_mb) * MIB)
         try:
             super().__init__(path, maxBytes=most, backupCount=KEPT, encoding="utf-8", errors="backslashreplace")
-        except OSError as error:
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise UsageError(
-                f"{path}: cannot be written to: {error.strerror or error}", remedy="choose another name for --log-file"
+                f"{path}: cannot be written to: {reason}", remedy="choose another name for --log-file"
             ) from error
         self.setFormatter(lines)
 

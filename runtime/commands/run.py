@@ -34,6 +34,7 @@ from .options import (
     flow_of,
     serve_of,
 )
+from .run_files import input_files
 
 DEMO_BUNDLE = "fashion-adaptive.pans"
 DEMO_PROFILE = "dmd-spad"
@@ -128,7 +129,7 @@ def _run(args: argparse.Namespace) -> int:
     job = _job(args, bundle_path(args.bundle), args.device, profile, args.decisions, args.record)
     if args.write_config is None:
         return carry_out(args, job)
-    path = write_options(args)
+    path = write_options(args, input_files(job))
     emit(args, {"config": str(path)}, f"{path}\nnext: pans run --config {shlex.quote(str(path))}")
     return EXIT_FINE
 

@@ -29,7 +29,7 @@ STATE_MAX_BYTES = 1 << 16
 
 def check_run_files(job: Job) -> None:
     """Check every output of `job` before anything is opened; UsageError if one exists, is an input, or cannot be written."""
-    inputs = [*job.inputs, job.bundle_path, job.dark.calibration, *files_of_url(job.device)]
+    inputs = input_files(job)
     outputs = [path for path in (job.recording, job.page, job.trace) if path is not None]
     if job.recording is not None and job.continuous.limits is not None:
         outputs = [index_path(path) if path == job.recording else path for path in outputs]
@@ -50,6 +50,11 @@ def check_run_files(job: Job) -> None:
         makes_folders=True,
     )
     _check_disk(job)
+
+
+def input_files(job: Job) -> list[str | Path | None]:
+    """Return the files that a run reads."""
+    return [*job.inputs, job.bundle_path, job.dark.calibration, *files_of_url(job.device)]
 
 
 def _check_disk(job: Job) -> None:

@@ -48,7 +48,10 @@ def items_of(command: str, inputs: Sequence[str], vary: Sequence[str], extra: st
     """
     options = [_values(one) for one in vary]
     paths = [path for one in inputs for path in (_matching(one) if files else [one])]
-    words = shlex.split(extra)
+    try:
+        words = shlex.split(extra)
+    except ValueError as error:
+        raise UsageError(f"--with {extra!r}: {error}", remedy="close its quotes") from error
     items = [
         _item(command, path, dict(zip((name for name, _ in options), chosen, strict=True)), words)
         for path in dict.fromkeys(paths)

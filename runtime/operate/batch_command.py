@@ -181,7 +181,7 @@ BATCH = Command(
     _run,
     (
         "pans batch replay 'runs/*/run.pansrec' --workers 4 -o replays.parquet",
-        "pans batch evaluate fashion10.pans --vary seed=0-9 --with '--trials 5' -o seeds.jsonl",
-        "pans batch report 'runs/*/run.pansrec' --with '-o {folder}/report.html' --dask tcp://host:8786 -o reports.jsonl",
+        "pans batch evaluate fashion10.pans --vary seed=0-9 --with='--trials 5' -o seeds.jsonl",
+        "pans batch report 'runs/*/run.pansrec' --with='-o {folder}/report.html' --dask tcp://host:8786 -o reports.jsonl",
     ),
 )

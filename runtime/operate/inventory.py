@@ -65,10 +65,9 @@ def runs_in(root: Path) -> list[Run]:
     """Return the runs in `root` and, if it is one itself, in it; the newest first. UsageError for a folder that cannot be read."""
     try:
         inside = [path for path in root.iterdir() if path.is_dir() and not path.is_symlink()]
-    except OSError as error:
-        raise UsageError(
-            f"{root}: cannot be read: {error.strerror or error}", remedy="name a folder of runs"
-        ) from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"{root}: cannot be read: {reason}", remedy="name a folder of runs") from error
     found = [run for folder in (root, *inside) if (run := run_of(folder)) is not None]
     return sorted(found, key=lambda run: (run.started, run.folder.name), reverse=True)
 

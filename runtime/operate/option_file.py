@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -57,10 +57,13 @@ def prepare_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> No
         _make_default(parser, options[name], _converted(parser, options[name], value, f"{where(name)}: {name}"))
 
 
-def write_options(args: argparse.Namespace) -> Path:
-    """Write all options of `args`, parsed by a parser that `prepare_options` has seen, to `args.write_config`; return it."""
+def write_options(args: argparse.Namespace, inputs: Iterable[str | Path | None] = ()) -> Path:
+    """Write all options of `args`, parsed by a parser that `prepare_options` has seen, to `args.write_config`; return it.
+
+    UsageError where that is one of `inputs`, which the command reads, or the file of options itself.
+    """
     path: Path = args.write_config
-    check_outputs([path], inputs=[args.config], force=args.force)
+    check_outputs([path], inputs=[args.config, *inputs], force=args.force)
     lines = [
         f"# Options of `{args.option_parser.prog}`, written by pans {__version__}. Read them with --config FILE.",
         "",

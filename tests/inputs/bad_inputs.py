@@ -47,6 +47,9 @@ GOOD = {
     "reproduce": "alpha --collect --cache cache -o new",
     "sweep": "s.npz --features 2 --storage new.log --trials 1",
     "completion": "bash",
+    "runs": ".",
+    "service": "monitoring -o new",
+    "batch": "info b.pans -o new.jsonl",
 }
 NUMBERS = ("nan", "inf", "-inf", "1e999", "9" * 40, "", "three", "0x10", "1,5")
 TOO_LOW = "-1"
@@ -80,7 +83,10 @@ READS = {
 WRITES = {
     "--out": "", "--record": "pansrec", "--trace": "txt", "--state": "json", "--pictures": "npz", "--plot": "png", "--storage": "log",
 }  # fmt: skip
-FOLDERS = {("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("evaluate", "--pictures")}
+FOLDERS = {
+    *(("demo", "--out"), ("run", "--out"), ("export", "--out"), ("reproduce", "--out"), ("evaluate", "--pictures")),
+    ("service", "--out"),
+}
 SUFFIXES = {"report": "html", "bundle": "pans", "calibrate": "json", "train": "pans", "data": "npz"}
 
 
@@ -161,6 +167,33 @@ BY_HAND = {
     },
     "data": {"scene": 2, "fetch nonsense": 2, "scene cells -o new.txt": 2, "scene nonsense -o new.npz": 2, "scene a b -o new.npz": 2},
     "verify": {"": 2, "no-such-name": 2, "b.pans missing.pans": 2},
+    "run --decisions 1 --out new --config": {
+        **{f"{name}.toml": 2 for name in ("missing", "empty", "noise", "latin", "folder", "fifo", "loop", "f", "nul\0")},
+    },
+    f"run b.pans --device {FAST} --write-config": {
+        **{name: 2 for name in ("there.toml", "no/such/new.toml", "folder.toml", "fifo.toml", "b.pans", "nul\0", "b.pans --force")},
+        **{more: 2 for more in ("new.toml --keep-mb 3", "new.toml --unset shots")},
+    },
+    "info b.pans --log-file": {
+        **{name: 2 for name in ("there.txt", "no/such/new.log", "folder.txt", "fifo.txt", "broken.txt", "b.pans", "nul\0", "x" * 300)},
+        **{more: 2 for more in ("new.log --log-format xml", "new.log --log-rotate-mb 0")},
+    },
+    "info b.pans": {"--log-format json": 2, "--log-rotate-mb 3": 2},
+    "runs": {
+        **{more: 2 for more in ("missing", "b.pans", "fifo.txt", "nul\0", "a b", "prune .", ". --yes", ". --keep 3", "prune . --keep x")},
+        **{more: 2 for more in ("prune . --older-than 30", "prune . --older-than -3d", "prune . --larger-than 5gb")},
+    },
+    "service": {
+        **{more: 2 for more in ("show", "verify", "remove", "monitoring", "nonsense", "install --config latin.toml")},
+        **{more: 2 for more in ("show --config f.toml", "verify --name no-such-service", "remove --name ../x", "monitoring -o b.pans")},
+        **{more: 2 for more in ("show --config missing.toml", "monitoring -o new --start 3", "show --config f.toml --watchdog-s 3")},
+    },
+    "batch": {
+        **{f"{more} -o new.jsonl": 2 for more in ("info none*", "fuzz b.pans", "info missing.pans", "info b.pans --vary x")},
+        **{f"info b.pans -o new.jsonl {more}": 2 for more in ("--vary =3", "--workers 0", "--with '", "--with=--colour")},
+        **{f"info b.pans -o {name}": 2 for name in ("new.csv", "no/such/new.jsonl", "b.pans", "fifo.txt")},
+        "info b.pans": 2,
+    },
     "help": {"nonsense": 2},
     "": {"nonsense": 2, "--nonsense": 2, "rnu": 2},
 }  # fmt: skip
