@@ -311,7 +311,8 @@ def _bundle_lines(out: Path, sha256: str, facts: Mapping[str, Any]) -> Iterator[
         change = facts["accuracy_shown"] - facts["accuracy_given"]
         yield (
             f"  SIMULATED accuracy {facts['accuracy_given']:.2%} with the patterns as given, "
-            f"{facts['accuracy_shown']:.2%} on these levels: {100 * change:+.2f} ± {100 * facts['accuracy_difference_se']:.2f} points on {facts['objects']} objects"
+            f"{facts['accuracy_shown']:.2%} on these levels: "
+            f"{100 * change:+.2f} ± {100 * facts['accuracy_difference_se']:.2f} points on {facts['objects']} objects"
         )
     if "exposure_us" in facts:
         yield f"  exposure {facts['exposure_us']:.6g} us"
