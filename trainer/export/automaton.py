@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from pans.runtime import __version__
 from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.bundle.walks import walk_nodes
@@ -29,6 +27,8 @@ from pans.trainer.adaptive.posteriors import calibration_error
 from pans.trainer.adaptive.train import TrainedAutomaton
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.tasks.registry import Objects, Task
+
+from .writer import origin, programs
 
 COMPARED_OBJECTS = 100
 TOLERANCE = 1e-5  # of chances and of relative light: posteriors are stored in float32
@@ -108,16 +108,10 @@ def bundle_of(
     shown, pattern = np.unique(automaton.pattern, return_inverse=True)
     automaton = replace(automaton, pattern=pattern.astype(np.uint16))
     facts = {
-        "data_sha256": task.sha256,
-        "data_split": task.split,
-        "task_light": task.light,
-        "task_optics": task.optics,
-        "task_source": task.source,
-        "profile": profile.name,
-        "profile_sha256": profile.sha256,
+        **origin(task, profile),
         "held_back": {key: round(value, 6) for key, value in asdict(trained.held_back).items()},
         "calibration_error": trained.posteriors.calibration_error,
-        "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}",
+        "trained_with": programs(),
         **provenance,
     }
     return make_bundle(

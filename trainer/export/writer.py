@@ -92,7 +92,7 @@ def export(
         image_shape=about.image_shape,
         optics=optics,
         back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
-        provenance={**about.provenance, "trained_with": f"pans-runtime {__version__}, torch {torch.__version__}"},
+        provenance={**about.provenance, "trained_with": programs()},
     )
     with whole_file(path, force=force) as unchecked:
         write_bundle(bundle, unchecked)
@@ -100,6 +100,24 @@ def export(
         words, difference = compare(bundle, head, click_mean)
         check(bundle)
     return Exported(bundle, digest, words, difference, dead)
+
+
+def origin(task: Task, profile: Profile) -> dict[str, Any]:
+    """Return what a bundle says of the data and the instrument that it was trained with."""
+    return {
+        "data_sha256": task.sha256,
+        "data_split": task.split,
+        "task_light": task.light,
+        "task_optics": task.optics,
+        "task_source": task.source,
+        "profile": profile.name,
+        "profile_sha256": profile.sha256,
+    }
+
+
+def programs() -> str:
+    """Return the programs that trained a bundle, with their versions."""
+    return f"pans-runtime {__version__}, torch {torch.__version__}"
 
 
 def export_trained(
@@ -122,17 +140,7 @@ def export_trained(
         optics = analyser_of(trained, task, profile)
     else:
         optics = Shown(profile.projector.levels, quantised.pattern_levels, quantised.photons_per_level)
-    facts = {
-        "data_sha256": task.sha256,
-        "data_split": task.split,
-        "task_light": task.light,
-        "task_optics": task.optics,
-        "task_source": task.source,
-        "profile": profile.name,
-        "profile_sha256": profile.sha256,
-        "validation_losses": list(trained.validation_losses),
-        **provenance,
-    }
+    facts = origin(task, profile) | {"validation_losses": list(trained.validation_losses), **provenance}
     about = Description(name, task.name, task.classes, task.image_shape, facts)
 
     def check(bundle: Bundle) -> None:
