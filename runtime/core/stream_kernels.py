@@ -20,8 +20,7 @@ from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 from .decision import NO_LABEL, DecisionFlag
 from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, add_exposures, add_walks, complete, spill, sum_up
 
-# state, int64 (N_STATE,): where the stream stands (stream.N_PLACE columns), where the walk stands, and what it continues of Core and
-# DecisionWindows
+# state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the walk stand; what it continues of Core and DecisionWindows
 MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT = range(stream.N_PLACE, stream.N_PLACE + 7)
 N_DECISIONS, N_ABSTAINED, LAST_TICK, JITTER = range(OBJECT + 1, OBJECT + 5)
 EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES = range(JITTER + 1, JITTER + 8)
@@ -67,8 +66,7 @@ class MarkArrays(NamedTuple):
 
 
 class Block(NamedTuple):
-    """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, the first one exposure `first`, `relative` to the
-    visit's first.
+    """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, from exposure `first`, `relative` in the visit, on.
 
     `end_tick` is that of the first exposure's end. `truth` is that of `object`, -1 where it is not known. `top_mask` are the bits of the
     last byte of a word that are channels.

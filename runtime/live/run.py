@@ -24,14 +24,7 @@ from pans.runtime.timing.ledger import TimingLedger
 from pans.runtime.wire.commands import Arm, Gate, pack_arm, pack_gate
 from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import (
-    DeviceState,
-    MessageType,
-    Opcode,
-    StateReason,
-    decode_status,
-    pack_body,
-)
+from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateReason, decode_status, pack_body
 from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
