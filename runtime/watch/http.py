@@ -1,11 +1,11 @@
 """A small HTTP server for one page and its events: one thread, few connections, little time and few bytes for each.
 
 Owns sockets, limits and the few words of HTTP that a scrape or a browser needs; page and events are the caller's. Whatever clients do, the
-thread handles a few events every ROUND_S and sleeps between, makes the page at most every PAGE_KEPT_S, and holds MAX_CLIENTS connections:
-a further one takes the place of the oldest, so that those who open many and say nothing cannot shut out one who asks. A browser that
-follows the events (server-sent events, WHATWG HTML 9.2) is one of MAX_LISTENERS; one that does not read misses events and is dropped
-after LISTENER_STUCK_S. On a loopback address, requests that name another host are refused: a web page elsewhere could have made its own
-name point here (DNS rebinding).
+thread handles a few events every ROUND_S (CROWDED_ROUND_S while many connect) and sleeps between, makes the page at most every
+PAGE_KEPT_S, and holds MAX_CLIENTS connections: a further one takes the place of the oldest, so that those who open many and say nothing
+cannot shut out one who asks. A browser that follows the events (server-sent events, WHATWG HTML 9.2) is one of MAX_LISTENERS; one that
+does not read misses events and is dropped after LISTENER_STUCK_S. On a loopback address, requests that name another host are refused: a
+web page elsewhere could have made its own name point here (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ MAX_CLIENTS = 8
 REQUEST_S = 2.0  # from the connection to the last byte of the answer
 HEADER_MAX_BYTES = 8192
 ROUND_S = 0.01
+# Under attack: whoever holds the interpreter's lock may lose the processor with it, and the loop of a run then waits for both.
+CROWDED_ROUND_S = 0.1
+CROWDED_S = 1.0  # for so long after a connection had to go for another one
 ACCEPTS_PER_ROUND = 4  # fewer than MAX_CLIENTS: who asks at once is heard before others can take the place
 BACKLOG = 128  # in the kernel, where they cost nothing
 PAGE_KEPT_S = 0.25
@@ -89,6 +92,7 @@ class PageServer:
         self._local = is_loopback(host)
         self._listeners: dict[int, _Listener] = {}  # by file descriptor
         self._made_s, self._made = -PAGE_KEPT_S, b""
+        self._crowded_s = -CROWDED_S  # when a connection last had to go for another one
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         self._listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
         self._listener.setblocking(False)
@@ -126,7 +130,7 @@ class PageServer:
                 self._tell(listener, now_s)
             for client in [one for one in self._clients.values() if now_s - one.since_s > REQUEST_S]:
                 self._drop(client)
-            self._ending.wait(ROUND_S)
+            self._ending.wait(CROWDED_ROUND_S if now_s - self._crowded_s < CROWDED_S else ROUND_S)
 
     def _accept(self) -> None:
         for _ in range(ACCEPTS_PER_ROUND):
@@ -136,6 +140,7 @@ class PageServer:
                 return
             connection.setblocking(False)
             if len(self._clients) == MAX_CLIENTS:
+                self._crowded_s = time.monotonic()
                 self._drop(next(iter(self._clients.values())))
             client = self._clients[connection.fileno()] = _Client(connection)
             self._selector.register(connection, selectors.EVENT_READ, client)
