@@ -43,6 +43,11 @@ def begin(words: list[str]) -> None:
     _voice.command = next((word for word in words if not word.startswith("-")), "")
 
 
+def is_quiet() -> bool:
+    """Return whether `--quiet` was given."""
+    return _voice.quiet
+
+
 def has_said() -> bool:
     """Return whether anything has been printed since `begin`."""
     return _voice.said

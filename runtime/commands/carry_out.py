@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
+from pans.runtime.cli.talk import is_quiet
 from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.html_card import html_card
 from pans.runtime.link.base import open_link
@@ -136,7 +137,7 @@ class _Beside(NamedTuple):
 def _monitor_of(job: Job) -> Monitor:
     from pans.runtime.monitor import Monitor
 
-    return Monitor(panel=job.shows and sys.stderr.isatty(), address=job.serve, lines=job.shows)
+    return Monitor(panel=job.shows and not is_quiet() and sys.stderr.isatty(), address=job.serve, lines=job.shows)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,9 @@ def comparison_page(comparison: Comparison) -> bytes:
     page.table(_sides(first, second), ("", "A", "B"))
     page.heading("What changed")
     if comparison.changes:
-        page.table([(one.name, one.first or "-", one.second or "-") for one in comparison.changes], ("", "A", "B"))
+        page.table(
+            [(one.name, one.first or "-", one.second or "-") for one in comparison.changes], ("", "A", "B"), "long"
+        )
     else:
         page.text("Bundle, profile, options and device are the same.")
     page.heading("What came of it")

@@ -86,7 +86,7 @@ class Page:
         self._parts.append(f'<ul class="tiles">{"".join(items)}</ul>')
 
     def table(self, rows: Iterable[Sequence[object]], head: Sequence[str] = (), kind: str = "") -> None:
-        """Add a table; the first column names the row."""
+        """Add a table; the first column names the row. `kind` is facts, long (texts that wrap) or nothing."""
         lines = [f'<table class="{kind}">' if kind else "<table>"]
         if head:
             cells = "".join(f'<th scope="col">{safe_text.html(name)}</th>' for name in head)
@@ -95,7 +95,8 @@ class Page:
         for row in rows:
             cells = "".join(f"<td>{safe_text.html(value)}</td>" for value in row[1:])
             lines.append(f'<tr><th scope="row">{safe_text.html(row[0])}</th>{cells}</tr>')
-        self._parts.append(_scrolled("\n".join([*lines, "</tbody></table>"]), "table", head))
+        table = "\n".join([*lines, "</tbody></table>"])
+        self._parts.append(table if kind == "long" else _scrolled(table, "table", head))
 
     def facts(self, facts: Mapping[str, Any]) -> None:
         """Add nested facts as a table of dotted names."""

@@ -17,7 +17,9 @@ from nasty import NASTY
 from pans.firmware_sim.testing import small_setup
 from pans.runtime import cli, safe_text
 from pans.runtime.errors import UsageError
-from pans.runtime.pages.page import Page
+from pans.runtime.pages.charts import Axis, Chart, Curve, Mark
+from pans.runtime.pages.page import Page, Picture
+from pans.runtime.pages.pixels import png
 
 nasty = pytest.mark.parametrize("text", NASTY, ids=lambda text: ascii(text)[1:30])
 
@@ -81,7 +83,16 @@ def tags_of(text: str) -> Tags:
     page.heading(text)
     page.table([(text, text)], head=(text,))
     page.facts({text: {"inner": [text]}})
-    page.figure(b"\x89PNG", text)
+    page.verdict(text, "fail", [(text, "advice")])
+    page.tiles([(text, text, text)])
+    page.pictures([Picture(png([[0, 255]]), text, [text])], text)
+    page.confusion(np.eye(2, dtype=np.int64), (text, text), text)
+    page.sentences([text])
+    axis = Axis(text, 0.0, 1.0, text=lambda value: text)
+    curves = [Curve([0, 1], [0, 1], text), Curve([0, 1], [1, 0], text, "b")]
+    page.figure(Chart(text, axis, axis, curves=curves, marks=[Mark(0.5, text), Mark(0.5, text, True)]), text)
+    with page.folded(text):
+        page.subheading(text)
     tags = Tags()
     tags.feed(page.html().decode())
     return tags
