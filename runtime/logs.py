@@ -60,13 +60,17 @@ def logging_of(args: argparse.Namespace) -> Iterator[None]:
             if getattr(args, option) is not None:
                 name = option.replace("_", "-")
                 raise UsageError(f"--{name} has no effect without a log file", remedy="name one with --log-file")
+    handlers: list[_FileHandler | _JournalHandler] = [_JournalHandler()] if _is_journal() else []
+    if path is not None:
+        lines = _JsonLine() if args.log_format == "json" else _TextLine()
+        handlers.append(_FileHandler(path, lines, args.log_rotate_mb))
+    if not handlers:
         yield
         return
-    handler = _FileHandler(path, _JsonLine() if args.log_format == "json" else _TextLine(), args.log_rotate_mb)
-    lines: queue.Queue[Any] = queue.Queue(QUEUE_LINES)
-    entrance = _Entrance(lines)
+    waiting: queue.Queue[Any] = queue.Queue(QUEUE_LINES)
+    entrance = _Entrance(waiting)
     entrance.addFilter(_KindLimit())
-    listener = _Listener(lines, handler)
+    listener = _Listener(waiting, *handlers)
     level = LOGGER.level
     LOGGER.setLevel(logging.INFO)
     LOGGER.addHandler(entrance)
@@ -77,9 +81,10 @@ def logging_of(args: argparse.Namespace) -> Iterator[None]:
         LOGGER.removeHandler(entrance)
         LOGGER.setLevel(level)
         listener.stop()
-        handler.close()
-        if lost := entrance.lost + handler.lost:
-            print(f"pans: {lost} lines are missing from {path}", file=sys.stderr)
+        for handler in handlers:
+            handler.close()
+        if lost := entrance.lost + sum(handler.lost for handler in handlers):
+            print(f"pans: {lost} lines are missing from {path or 'the journal'}", file=sys.stderr)
 
 
 def log_event(kind: str, facts: Mapping[str, Any], level: int = logging.INFO) -> None:
@@ -115,11 +120,21 @@ def _time_of(record: logging.LogRecord) -> str:
     return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
 
 
+def _told(record: logging.LogRecord) -> str:
+    facts = getattr(record, "facts", {})
+    return record.getMessage() + "".join(f" {key}={_plain(value)}" for key, value in facts.items())
+
+
 class _TextLine(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        facts = getattr(record, "facts", {})
-        told = "".join(f" {key}={_plain(value)}" for key, value in facts.items())
-        return one_line(f"{_time_of(record)} {record.levelname} {record.getMessage()}{told}", LINE_MAX)
+        return one_line(f"{_time_of(record)} {record.levelname} {_told(record)}", LINE_MAX)
+
+
+class _EventLine(logging.Formatter):
+    """The journal adds the time itself."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return stderr_line(one_line(f"pans: {_told(record)}", LINE_MAX), record.levelno)
 
 
 class _JsonLine(logging.Formatter):
@@ -186,6 +201,19 @@ class _KindLimit(logging.Filter):
         if left_out := self._left_out.pop(kind, 0):
             facts["not_logged_before"] = left_out
         return True
+
+
+class _JournalHandler(logging.StreamHandler):  # type: ignore[type-arg]
+    """The events of a run on a stderr that leads to the journal, with their priorities; what the command says is there already."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+        self.lost = 0
+        self.setFormatter(_EventLine())
+        self.addFilter(lambda record: hasattr(record, "facts"))
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        self.lost += 1
 
 
 class _FileHandler(logging.handlers.RotatingFileHandler):
