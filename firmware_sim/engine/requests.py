@@ -23,6 +23,10 @@ STATE_ROW_BYTES = 20
 def light_desk(view: View, folder: Path) -> LightDesk:
     """Return the desk of a device that looks at `view`; its files go to `folder`."""
     projector = view.profile.projector
+    if view.profile.mode == "sequential":
+        from pans.firmware_sim.device import walk_kernels
+
+        walk_kernels.warm_up()  # a host that has sent states must not wait for a compiler
     pixels = min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS)
     return LightDesk(LightService(view, PatternMemory(projector.pattern_memory, pixels, projector.levels), folder))
 

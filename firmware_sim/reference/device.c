@@ -294,9 +294,13 @@ static enum sending choose(struct pans_device *d)
         frame_pong(d);
         return OF_PONGS;
     }
-    if (d->answers.used != 0)
-        return OF_ANSWERS;
-    return stream_may_send(d) ? OF_STREAM : NONE;
+    bool stream = stream_may_send(d), answers = d->answers.used != 0;
+    if (stream && !(answers && d->stream_was_last)) { /* in turn: a block goes before the STATUS that was made after it */
+        d->stream_was_last = true;
+        return OF_STREAM;
+    }
+    d->stream_was_last = false;
+    return answers ? OF_ANSWERS : NONE;
 }
 
 static struct ring *ring_of(struct pans_device *d)

@@ -130,6 +130,7 @@ struct pans_device {
     struct pong pong[PONGS];
     uint8_t n_pongs;
     enum sending sending; /* whose frame has left in part */
+    bool stream_was_last; /* the frame before was of the stream, and an answer waits */
     struct pattern *patterns;
     uint64_t held_pixels;
     uint32_t patterns_revision;

@@ -26,10 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pans.firmware_sim.checks.mutation import LAYOUTS, MISSING, STAMP, Mutation, by, field_of, is_of, mutate, to
-from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
 from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.engine import SteppedEngine
+from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.ports.shell import TcpPort, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.still import Scene, scene_from_arrays
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
@@ -211,7 +214,7 @@ class Session:
 
 
 class Stage:
-    """What sessions of one mode have in common, made once; `over` is virtual, or tcp: a socket to a thread, in real time."""
+    """What sessions of one mode have in common, made once; `over`: see `pans fuzz`."""
 
     def __init__(self, mode: str, over: str = "virtual") -> None:
         self.mode, self._over = mode, over
@@ -245,12 +248,18 @@ class Stage:
 
     def _run(self, path: Path, seed: int, session: Session) -> None:
         clock = DeviceClock(self.profile.clock.tick_hz)
-        start_ns = START_NS if self._over == "virtual" else time.perf_counter_ns()
-        device = Instrument(self.profile, self.scene, seed=seed, power_on_tick=clock.tick_at(start_ns))
+        start_ns = time.perf_counter_ns() if self._over == "tcp" else START_NS
+        device = self._device(seed, clock.tick_at(start_ns))
         exposures = OBJECTS * self.plan.cycles_per_object * self.plan.slots_per_cycle
         evidence = Evidence(exposures, len(self.bundle.classes), self.profile.clock.tick_hz)
-        with virtual_link(device, clock) if self._over == "virtual" else tcp_link(device, clock) as way:
+        with tcp_link(device, clock) if self._over == "tcp" else virtual_link(device, clock) as way:
             self._drive(MutatedLink(way, session.mutations, evidence), path, session)
+
+    def _device(self, seed: int, tick: int) -> SteppedDevice:
+        if self._over != "c":
+            return Instrument(self.profile, self.scene, seed=seed, power_on_tick=tick)
+        options = SimOptions(self.profile.name, seed=seed)
+        return SteppedEngine(options, tick, profile=self.profile, scene=SceneFile("fields", self.scene))
 
     def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         # No claim on the processor: many sessions share it, and none is judged by its latencies.
@@ -278,13 +287,13 @@ class Stage:
 
 
 @contextmanager
-def virtual_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
+def virtual_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
     """A link to `device` whose time passes while the host waits."""
     yield VirtualLink(device, clock, "fields")
 
 
 @contextmanager
-def tcp_link(device: Instrument, clock: DeviceClock) -> Iterator[Link]:
+def tcp_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
     """A socket to `device`, which a thread serves in real time."""
     port, stopped = TcpPort("127.0.0.1", 0), threading.Event()
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)

@@ -324,7 +324,11 @@ class Settings:
         type=Range(0, 10**9, whole=True).option,
         help="instead of those: whole sessions in which a field says something else",
     )
-    over: str = option("virtual", "the link of --fields: virtual, or tcp in real time", choices=("virtual", "tcp"))
+    over: str = option(
+        "virtual",
+        "of --fields: virtual time, tcp in real time, or c: the reference firmware in virtual time",
+        choices=("virtual", "tcp", "c"),
+    )
     jobs: int = option(
         1,
         type=Range(1, 256, whole=True).option,

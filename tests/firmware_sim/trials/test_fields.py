@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -170,3 +171,11 @@ def test_over_a_socket_in_real_time_the_host_finds_the_same(tmp_path: Path) -> N
     stage = Stage("sequential", "tcp")
     session = stage.run(tmp_path, 1, Mutation("CLICKS", "object_index", *by(17), most=1))
     assert "object" in ended(session).contradictions
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler on this machine")
+def test_sessions_with_the_reference_firmware_end_as_they_must() -> None:
+    ended, wrong = sessions(seed=33, count=6, over="c")
+    assert wrong == []
+    assert ended.total() == 6
+    assert ended["fail"] + ended["refused"] > 0

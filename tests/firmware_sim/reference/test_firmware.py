@@ -1,0 +1,85 @@
+"""The firmware by itself: strange input under sanitizers, and its size on two small processors."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from c_device import needs_compiler
+
+from pans.firmware_sim.engine.build import FOLDER, core_sources
+
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror")
+SANITIZERS = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+# name -> compiler and its words; what the document states for each, in bytes
+TARGETS = {
+    "Cortex-M4": ("arm-none-eabi-gcc", ("-mcpu=cortex-m4", "-mthumb"), 14_000),
+    "RV32": ("riscv64-unknown-elf-gcc", ("-march=rv32imac", "-mabi=ilp32", "--specs=picolibc.specs"), 18_000),
+}
+MOST_STACK_OF_A_FUNCTION = 160
+ALLOCATORS = re.compile(r"\b(malloc|calloc|realloc|free|alloca)\b")
+
+
+def run(*words: str | Path, folder: Path, seconds: float = 120) -> str:
+    done = subprocess.run([*map(str, words)], cwd=folder, capture_output=True, text=True, timeout=seconds)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def compiled_for(target: str, folder: Path) -> list[Path]:
+    """The core's and the board's objects for one of TARGETS, warnings being errors; skipped without its compiler."""
+    compiler, words, _ = TARGETS[target]
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    sources = [*core_sources(), *sorted((FOLDER / "rp2040").glob("*.c"))]
+    run(compiler, *STRICT, "-Os", *words, "-fstack-usage", "-c", *sources, folder=folder)
+    return [folder / f"{path.stem}.o" for path in core_sources()]
+
+
+@needs_compiler
+def test_strange_input_harms_nothing(tmp_path: Path) -> None:
+    program = tmp_path / "fuzz"
+    compiler = next(name for name in ("cc", "gcc", "clang") if shutil.which(name))
+    words = [compiler, "-std=c99", *SANITIZERS, *core_sources(), FOLDER / "fuzz" / "fuzz.c", "-o", program]
+    built = subprocess.run([*map(str, words)], capture_output=True, text=True)
+    if built.returncode and "asan" in built.stderr:
+        pytest.skip("this compiler has no sanitizers")
+    assert built.returncode == 0, built.stderr
+    said = run(program, "2", "3", folder=tmp_path)
+    figures = {name: int(number) for number, name in re.findall(r"(\d+) ([a-z]+)", said)}
+    assert figures["frames"] > 1000
+    assert figures["armed"] > 3
+    assert figures["blocks"] > 30
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_core_and_the_board_fit_a_small_processor(target: str, tmp_path: Path) -> None:
+    objects = compiled_for(target, tmp_path)
+    compiler, _, most = TARGETS[target]
+    sizes = run(compiler.replace("gcc", "size"), "-t", *objects, folder=tmp_path).splitlines()[-1].split()
+    text, data, bss = map(int, sizes[:3])
+    assert text <= most
+    assert (data, bss) == (0, 0), "the core has memory of its own: all of it is the caller's"
+    for path in objects:
+        for line in path.with_suffix(".su").read_text().splitlines():
+            _, used, kind = line.split("\t")
+            assert kind == "static", line
+            assert int(used) <= MOST_STACK_OF_A_FUNCTION, line
+
+
+def test_the_core_allocates_nothing_and_calls_no_system() -> None:
+    for path in (*core_sources(), *FOLDER.glob("*.h")):
+        text = re.sub(r"/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
+        assert not ALLOCATORS.search(text), path
+        headers = set(re.findall(r"#include <([^>]+)>", text))
+        assert headers <= {"string.h", "stdbool.h", "stddef.h", "stdint.h"}, path
+
+
+def test_the_document_states_the_sizes() -> None:
+    text = (FOLDER.parents[1] / "docs/how-to/reference-instrument.md").read_text()
+    for target, (_, words, _) in TARGETS.items():
+        assert target in text
+        assert all(word in text for word in words)
