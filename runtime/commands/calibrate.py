@@ -103,6 +103,7 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     from pans.runtime.core.calibration import CalibrationCore
     from pans.runtime.link.base import open_link
     from pans.runtime.live import RunConfig, run_live
+    from pans.runtime.live.continuous import INTERRUPTED
     from pans.runtime.report.summary import contradictions_of
 
     core = CalibrationCore(design.plan, design.n_cycles)
@@ -110,6 +111,8 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
     config = RunConfig(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
     result = run_live(open_link(device), profile, design.bundle, design.plan, core, config)
+    if result.ended == INTERRUPTED:
+        raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":
         raise LinkError(f"the calibration was not completed: {result.ended}", remedy="check the link and try again")
     keep = ("serial", "firmware", "name", "simulated")

@@ -20,8 +20,8 @@ from pans.runtime.errors import UsageError
 from pans.runtime.operate.parquet import need_pyarrow, write_decisions
 from pans.runtime.operate.pattern_files import about, array_parts, head_with_facts, pattern_pngs
 from pans.runtime.outputs import check_outputs, make_folder, write_file
-from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
+from pans.runtime.record.parts import open_recording
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.csv_files import FILES, write_csv
 from pans.runtime.report.verify import file_kind
@@ -32,7 +32,7 @@ FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="FILE", help="a recording (.pansrec) or a bundle (.pans)")
+    parser.add_argument("recording", type=Path, metavar="FILE", help="a recording (file, folder or index of its parts), or a bundle")
     parser.add_argument(
         "--format",
         required=True,
@@ -51,7 +51,7 @@ def _run(args: argparse.Namespace) -> int:
     check_outputs(outputs, inputs=[args.recording], force=args.force, makes_folders=is_folder)
     if args.format == "parquet":
         need_pyarrow()
-    recording = read_recording(args.recording)
+    recording = open_recording(args.recording)
     plan = recorded_plan(recording)
     clicks = click_list(recording, plan)
     written = [args.out]

@@ -13,7 +13,12 @@ from pans.runtime.outputs import check_outputs, write_file
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("path", type=Path, metavar="FILE", help="a recording (.pansrec) or a bundle (.pans)")
+    parser.add_argument(
+        "path",
+        type=Path,
+        metavar="FILE",
+        help="a recording (file, folder or index of its parts), or a bundle",
+    )
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.html", help="the page to write")
     add_force(parser)
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import UsageError
-from pans.runtime.record import Recording, read_recording
+from pans.runtime.record import Recording
+from pans.runtime.record.parts import open_recording
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.verify import file_kind
 
@@ -61,7 +62,7 @@ def page_of(path: str | Path) -> bytes:
     """Return one self-contained HTML page of a recording or a bundle; UsageError for another kind of file or a missing one."""
     kind = file_kind(path)
     if kind == "recording":
-        return recording_page(read_recording(path, salvage=True))
+        return recording_page(open_recording(path, salvage=True))
     if kind == "bundle":
         bundle, sha256 = load_bundle(path)
         return bundle_page(bundle, sha256, Path(path))

@@ -6,19 +6,27 @@ parts parted_recorder.py's. `chain_violations` says what is wrong between parts;
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from glob import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.container import Block
 from pans.runtime.errors import DamagedFileError, UsageError
 
 from .format import Kind
 from .part_keeper import INDEX_SUFFIX, chained
 from .parted_recorder import PART_EVENT
-from .recording import Recording
+from .recording import Recording, read_recording
 
+REPEATED = frozenset((Kind.HEADER, Kind.BUNDLE))  # in each part
 NUMBER_DIGITS_MAX = 10  # the index of a block is a u32, and a part has several
 
 
@@ -118,3 +126,85 @@ def chain_violations(recordings: list[Recording]) -> list[str]:
 
 def _chain_before(part: Mapping[str, Any]) -> str:
     return str((part.get("before") or {}).get("chain_sha256", ""))
+
+
+# ---- a run in parts as one recording ----
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedRecording(Recording):
+    """The parts of a run, read one after the other; the bundle, which each part repeats, is that of the first. Plan and ARM,
+    which they repeat too, come again in `commands`, where repetitions change nothing.
+
+    `path` is what was opened, `decisions_sha256` the chain over the parts' logs, `summary` that of the last part. A `Block` of
+    `iter_blocks` has its index within its part.
+    """
+
+    parts: tuple[Recording, ...]
+
+    def iter_blocks(self, *wanted: Kind) -> Iterator[Block]:
+        """Yield the whole blocks of these kinds, part by part; header and bundle of the first one alone."""
+        for number, part in enumerate(self.parts):
+            once = REPEATED if number else frozenset()
+            yield from (block for block in part.iter_blocks(*wanted) if block.kind not in once)
+
+    def iter_decisions(self) -> Iterator[NDArray[np.void]]:
+        """Yield the decisions block by block, DECISION_DTYPE (n,)."""
+        for part in self.parts:
+            yield from part.iter_decisions()
+
+    def bundle_data(self) -> bytes:
+        """Return the bytes of the bundle that the run used, b"" if it was not recorded."""
+        return self.parts[0].bundle_data()
+
+    def bundle(self) -> Bundle:
+        """Return the bundle that the run used; UsageError if it was not recorded."""
+        return self.parts[0].bundle()
+
+
+def open_recording(path: str | Path, *, salvage: bool = False) -> Recording:
+    """Return the recording that `path` stands for: a file, the parts of a run (their folder or index) as one, or a run's folder.
+
+    Errors as of `read_recording`; DamagedFileError too for parts that do not follow each other (with `salvage` it is the damage).
+    """
+    if not is_of_parts(path):
+        return read_recording(path, salvage=salvage)
+    if not (paths := find_parts(path)):
+        return read_recording(_only_recording(Path(path)), salvage=salvage)
+    parts = tuple(read_recording(one, salvage=salvage) for one in paths)
+    broken = chain_violations(list(parts))
+    if broken and not salvage:
+        raise DamagedFileError(
+            f"{path}: {broken[0]}", remedy="`pans verify` lists everything; each part can be read by itself"
+        )
+    return _joined(Path(path), parts, broken)
+
+
+def _only_recording(folder: Path) -> Path:
+    """Return the one recording of a run's folder."""
+    found = sorted(folder.glob("*.pansrec"))
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:5]) or "none"
+        raise UsageError(f"{folder}: {len(found)} recordings are here ({names})", remedy="name one recording")
+    return found[0]
+
+
+def _joined(path: Path, parts: tuple[Recording, ...], broken: list[str]) -> JoinedRecording:
+    first, last, chain = parts[0], parts[-1], ""
+    for part in parts:
+        chain = chained(chain, part.decisions_sha256)
+    return JoinedRecording(
+        path=path,
+        size=sum(part.size for part in parts),
+        version=max(part.version for part in parts),
+        header=first.header,
+        kinds=sum((Counter(part.kinds) for part in parts), Counter()),
+        n_decisions=sum(part.n_decisions for part in parts),
+        decisions_sha256=chain,
+        complete=all(part.complete for part in parts),
+        end_offset=last.end_offset,
+        summary=last.summary,
+        damage="; ".join([*(part.damage for part in parts if part.damage), *broken]),
+        bundle_place=first.bundle_place,
+        parts=parts,
+    )

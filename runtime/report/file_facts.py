@@ -21,7 +21,8 @@ from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.runtime.record import Recording, read_recording
+from pans.runtime.record import Recording
+from pans.runtime.record.parts import open_recording
 
 from .handshakes import handshakes
 from .verify import file_kind
@@ -36,7 +37,7 @@ def file_facts(path: str | Path) -> dict[str, Any]:
         bundle, sha256 = load_bundle(path)
         return {"kind": kind, "path": str(path), "sha256": sha256, **_bundle_facts(bundle)}
     if kind == "recording":
-        return {"kind": kind, "path": str(path), **_recording_facts(read_recording(path, salvage=True))}
+        return {"kind": kind, "path": str(path), **_recording_facts(open_recording(path, salvage=True))}
     if kind == "calibration":
         calibration = load_calibration(path)
         facts = {key: value for key, value in calibration.values.items() if key != "sha256"}

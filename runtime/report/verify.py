@@ -30,7 +30,7 @@ from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
 from pans.runtime.record.part_index import compare_with_index
 from pans.runtime.record.part_keeper import INDEX_SUFFIX
-from pans.runtime.record.parts import chain_violations, find_parts, first_decision, parts_in, stem_of
+from pans.runtime.record.parts import chain_violations, find_parts, first_decision, is_of_parts, parts_in, stem_of
 from pans.runtime.record.replaying import replay_faults
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 from pans.runtime.wire.session import ANSWER_TYPES
@@ -60,6 +60,8 @@ def file_kind(path: str | Path) -> str:
     """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
+    if is_of_parts(path):
+        return "recording"
     with open_regular(bundle_path(path)) as file:
         start = file.read(len(BUNDLE_MAGIC))
     suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
