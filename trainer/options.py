@@ -58,7 +58,7 @@ class Options:
     light: float = 1.0  # of the initial patterns, times the paper's
     mix: float = 0.0  # share of the loss that several shots have in stage 2, for patterns that gain from them
     shots: int = 1  # the head is fitted to the mean clicks of 1, 2, 3, 5, ... up to that many shots
-    shift_px: int = 0  # training images are moved by up to that much along the rows, for objects that pass by
+    shift_px: int = 0  # training images are moved by up to that much along the rows, for objects in flow
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
 

@@ -28,7 +28,7 @@ from pans.runtime.timing.cpu import check_core
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_options(parser, SimOptions)
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
-    parser.add_argument("--core", type=int, metavar="N", help="bind it to processor core N and keep that awake")
+    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 % of that core")
     parser.add_argument(
         "--echo",
         type=Range(0, 1 << 20, whole=True).option,
@@ -126,4 +126,12 @@ def _leave(signum: int, frame: FrameType | None) -> NoReturn:
     raise SystemExit(0)
 
 
-SIMULATE = Command("run a simulated instrument that other programs open as an ordinary device", _configure, _run)
+SIMULATE = Command(
+    "run a simulated instrument that other programs open as an ordinary device",
+    _configure,
+    _run,
+    examples=(
+        "pans simulate --profile dmd-spad --scene fashion200 --listen pty",
+        "pans simulate --profile oled-qcmos --listen tcp:127.0.0.1:0 --faults loss:0.01",
+    ),
+)

@@ -78,5 +78,18 @@ def _configure_fuzz(parser: argparse.ArgumentParser) -> None:
     add_options(parser, load_trial("fuzz").settings)
 
 
-TRIALS_COMMAND = Command("run a long check of the whole system; without a name, list them", _configure, _run)
-FUZZ = Command(TRIALS["fuzz"].summary, _configure_fuzz, lambda args: run_trial("fuzz", args))
+TRIALS_COMMAND = Command(
+    "run a long check of the whole system; without a name, list them",
+    _configure,
+    _run,
+    examples=(
+        "pans trials",
+        "pans trials clock --seconds 2",
+    ),
+)
+FUZZ = Command(
+    TRIALS["fuzz"].summary,
+    _configure_fuzz,
+    lambda args: run_trial("fuzz", args),
+    examples=("pans fuzz --frames 200 --bytes 20000",),
+)

@@ -1,7 +1,7 @@
 """The automaton that the host has uploaded, and the states that the host names one by one.
 
 Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), with every limit checked before anything is stored; never
-draws a click. A command that cannot be meant raises `Refused` and leaves what is stored as it was.
+draws a click. A command that makes no sense raises `Refused` and leaves what is stored as it was.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class SceneFile:
 
     @property
     def moves(self) -> bool:
-        """Whether objects pass by on their own, instead of waiting for the plan."""
+        """Whether objects flow past on their own, instead of waiting for the plan."""
         return not isinstance(self.what, Scene)
 
     @property

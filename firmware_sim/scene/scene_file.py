@@ -108,7 +108,7 @@ def _open(name_or_path: str | Path) -> SceneFile:
 
 
 def read_scene_file(path: Path, name: str) -> SceneFile:
-    """Read the scene at `path` and call it `name`; ConfigError with file:line:col for whatever cannot be meant."""
+    """Read the scene at `path` and call it `name`; ConfigError with file:line:col for whatever makes no sense."""
     text = _read(path)
     tables, positions = read_toml(text, str(path))
     check = _Check(tables, positions, path)

@@ -157,7 +157,7 @@ class MutatedLink:
         return encode_frame(frame.type, payload, frame.session, frame.flags)
 
     def _excludes(self, mutation: Mutation, old: bytes, new: bytes) -> bool:
-        """Whether the changed message cannot be meant, or cannot be true."""
+        """Whether the changed message makes no sense, or cannot be true."""
         kind = "CLICKS" if mutation.message == STAMP else mutation.message
         decode = getattr(messages, f"decode_{kind.lower()}")
         try:

@@ -140,7 +140,7 @@ def carry_out(job: Job, folder: Path) -> Outcome:
 
 
 def _awake_on(job: Job, which: int) -> list[str]:
-    """Words that bind the loop of host (0) or instrument (1) to its core and keep that awake."""
+    """Options that pin the loop of host (0) or instrument (1) to its core."""
     return ["--core", str(job.pin[which])] if job.awake and job.pin is not None else []
 
 

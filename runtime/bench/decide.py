@@ -89,7 +89,7 @@ def _bundle_rows(bundle: Bundle, inputs: Path | None, n: int) -> list[Row]:
 
 
 def _picture_row(bundle: Bundle, n: int) -> Row:
-    """A head that gives back pictures: time for one, alone and in a batch, and the largest error of a pixel against float64."""
+    """A head that returns pictures: time for one, alone and in a batch, and the largest error of a pixel against float64."""
     decider = PictureDecider(bundle)
     counts = np.random.default_rng(1).integers(0, 2, (n, bundle.n_features))
     pixels = decider.scores_batch(counts, 1)

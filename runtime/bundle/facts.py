@@ -36,7 +36,7 @@ FEATURES_MAX = 4096
 PIXELS_MAX = 1 << 22
 LEVELS_MAX = 65536
 CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
-OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head gives back
+OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head returns
 TEXT_MAX_CHARACTERS = 200
 TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
@@ -70,7 +70,7 @@ class Bundle:
     int8_head: Int8Head | None = None  # the head in integers, for our kernels
     int8_onnx: bytes | None = None  # the same as a quantised ONNX model
     analyser: Analyser | None = None  # the optics of a passive sensor
-    picture_shape: tuple[int, int] | None = None  # height and width of the picture that the head gives back
+    picture_shape: tuple[int, int] | None = None  # height and width of the picture that the head returns
     automaton: Automaton | None = None  # decides by itself: no head and no table beside it
     golden_walks: NDArray[np.uint32] | None = None  # (g, n_slots + 1) nodes that each golden click word passes
     expected: Mapping[str, Any] | None = None  # of an automaton: its exact expectation, walks.EXPECTED_KEYS

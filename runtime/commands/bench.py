@@ -1,4 +1,4 @@
-"""`pans bench`: speed beside error, on this machine, now.
+"""`pans bench`: decision speed and accuracy of this machine.
 
 Owns the arguments and the report; each benchmark is found by entry point (`pans.benches`), so that the simulator's joins from its own
 package. Exit code 0 whatever the figures are: a benchmark measures, tests judge.
@@ -9,10 +9,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
+from pans.runtime.cli.finding import missing_extra
 from pans.runtime.errors import UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.outputs import check_outputs
@@ -47,7 +49,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         help="ingest: also run the whole way over this many frames",
     )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
-    parser.add_argument("--plot", type=Path, help="write a picture of speed against error (plot extra)")
+    parser.add_argument("--plot", type=Path, help="write a plot of speed against error (plot extra)")
     add_force(parser)
 
 
@@ -57,6 +59,8 @@ def _run(args: argparse.Namespace) -> int:
     _check_used(args)
     options = BenchOptions(tuple(args.bundle), tuple(args.inputs), args.seconds, args.frames, args.load, args.quick)
     if args.plot is not None:
+        if not _is_installed("matplotlib"):
+            raise missing_extra("--plot", "matplotlib", "plot")
         check_outputs([args.plot], inputs=[*args.bundle, *args.inputs], force=args.force)
     before = machine_facts()
     rows: list[dict[str, Any]] = []
@@ -73,6 +77,13 @@ def _run(args: argparse.Namespace) -> int:
     text = "\n".join(f"{key:<16} {value}" for key, value in machine.items())
     emit(args, {"machine": machine, "rows": rows}, f"{text}\n\n{table_text(rows)}")
     return EXIT_FINE
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def _check_used(args: argparse.Namespace) -> None:
@@ -95,4 +106,12 @@ def _find(name: str) -> Callable[[Any], list[dict[str, Any]]] | None:
     return None
 
 
-BENCH = Command("measure speed and error on this machine", _configure, _run)
+BENCH = Command(
+    "benchmark decision speed and accuracy",
+    _configure,
+    _run,
+    examples=(
+        "pans bench decide --quick",
+        "pans bench loop --seconds 10 --load",
+    ),
+)

@@ -141,4 +141,9 @@ def _words(path: Path, values: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-CALIBRATE = Command("measure photon level and dark rates of an instrument, into a dated file", _configure, _calibrate)
+CALIBRATE = Command(
+    "measure photon level and dark rates of an instrument, into a dated file",
+    _configure,
+    _calibrate,
+    examples=("pans calibrate --device serial:/dev/ttyACM0 --profile my-lab.toml -o lab.json",),
+)

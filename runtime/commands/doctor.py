@@ -50,5 +50,18 @@ def _doctor(args: argparse.Namespace) -> int:
     return EXIT_ALERT if broken else EXIT_FINE
 
 
-DEVICES = Command("list ports and USB devices, and whether they can be opened", _configure_devices, _devices)
-DOCTOR = Command("check this machine: ports, permissions, libraries, clock, scheduler", _configure_doctor, _doctor)
+DEVICES = Command(
+    "list ports and USB devices, and whether they can be opened",
+    _configure_devices,
+    _devices,
+    examples=("pans devices",),
+)
+DOCTOR = Command(
+    "check this machine: ports, permissions, libraries, clock, scheduler",
+    _configure_doctor,
+    _doctor,
+    examples=(
+        "pans doctor",
+        "pans doctor --udev | sudo tee /etc/udev/rules.d/70-pans.rules",
+    ),
+)

@@ -352,6 +352,27 @@ def _load_array(path: Path) -> NDArray[Any]:
     return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
-VERIFY = Command("check bundles, recordings, calibrations and profiles", _configure_verify, _verify)
-INFO = Command("show what a file holds", _configure_info, _info)
-BUNDLE = Command("make a bundle from any trained model", _configure_bundle, _bundle)
+VERIFY = Command(
+    "check bundles, recordings, calibrations and profiles",
+    _configure_verify,
+    _verify,
+    examples=("pans verify pans-runs/latest/run.pansrec my.pans my-lab.toml",),
+)
+INFO = Command(
+    "show what a file holds",
+    _configure_info,
+    _info,
+    examples=(
+        "pans info fashion10",
+        "pans info pans-runs/latest/run.pansrec --json",
+    ),
+)
+BUNDLE = Command(
+    "make a bundle from any trained model",
+    _configure_bundle,
+    _bundle,
+    examples=(
+        "pans bundle --patterns P.npy --head H.onnx --classes a,b,c --profile oled-qcmos -o my.pans",
+        "pans bundle --patterns P.npy --table T.npy --classes a,b --levels 2 --data scene.npz -o my.pans",
+    ),
+)

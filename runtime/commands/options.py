@@ -1,6 +1,6 @@
 """Options of `pans run` in groups: passing objects, calibration and dark counts, running for days.
 
-Owns how these are spelled and what cannot be meant; never loads what a run needs.
+Owns how these are spelled and what makes no sense; never loads what a run needs.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
 
 def add_flow_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a flow to `pans run`."""
-    group = parser.add_argument_group("objects that pass by (docs/how-to/flow.md)")
+    group = parser.add_argument_group("objects in flow (docs/how-to/flow.md)")
     group.add_argument("--flow", metavar="cells|tape|FILE", help="settings of the flow: shipped ones or a TOML file")
     group.add_argument(
         "--gate-class", action="append", default=[], metavar="NAME", help="class to pulse for (repeatable, or a,b)"
@@ -76,7 +76,7 @@ def add_flow_options(parser: argparse.ArgumentParser) -> None:
         "--act",
         default="device",
         metavar="URL",
-        help="what pulses: device (default: its GATE command), a second instrument's URL (tcp:HOST:PORT too), or NAME:...",
+        help="what makes the pulse: device (default: its GATE command), a second instrument's URL (tcp:HOST:PORT too), or NAME:...",
     )
     group.add_argument(
         "--act-profile",
@@ -138,7 +138,7 @@ def add_dark_options(parser: argparse.ArgumentParser) -> None:
         "--on-dark",
         default="warn",
         choices=("warn", "tables", "mask", "abstain"),
-        help="when the dark counts have changed: tell (default), decide with tables for them, leave channels out, or abstain",
+        help="when dark counts have changed: report it (default), decide with adapted tables, leave channels out, or abstain",
     )
 
 
@@ -202,7 +202,7 @@ def serve_of(args: argparse.Namespace) -> str:
 
 
 def continuous_of(args: argparse.Namespace) -> Continuous:
-    """Return what the options ask for; UsageError for what cannot be meant. Commands without the options ask for nothing."""
+    """Return what the options ask for; UsageError for what makes no sense. Commands without the options ask for nothing."""
     rotate_mb, keep_mb = getattr(args, "rotate_mb", None) or 0.0, getattr(args, "keep_mb", None) or 0.0
     if keep_mb and not rotate_mb:
         raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")

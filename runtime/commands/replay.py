@@ -24,7 +24,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "recording", type=Path, help="a recording (.pansrec), a folder with one in parts, or the index of its parts"
     )
     parser.add_argument("--bundle", type=Path, help="decide with this bundle instead of the recorded one")
-    parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head gives back")
+    parser.add_argument("--pictures", type=Path, metavar="OUT.npz", help="write the pictures that the head returns")
     parser.add_argument(
         "--truth",
         type=Path,
@@ -117,4 +117,12 @@ def _words(found: Replayed) -> list[str]:
     return [] if found.passages is None else passage_words(found.passages)
 
 
-REPLAY = Command("recompute a recording's decisions and compare", _configure, _run)
+REPLAY = Command(
+    "recompute a recording's decisions and compare",
+    _configure,
+    _run,
+    examples=(
+        "pans replay pans-runs/latest/run.pansrec",
+        "pans replay run.pansrec --bundle other.pans",
+    ),
+)

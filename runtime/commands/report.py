@@ -35,7 +35,15 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
-REPORT = Command("one self-contained page of a recording or a bundle", _configure, _run)
+REPORT = Command(
+    "one self-contained page of a recording or a bundle",
+    _configure,
+    _run,
+    examples=(
+        "pans report pans-runs/latest/run.pansrec -o run.html",
+        "pans report my.pans -o bundle.html",
+    ),
+)
 
 
 def _configure_compare(parser: argparse.ArgumentParser) -> None:
@@ -72,4 +80,9 @@ def _compare(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
-COMPARE = Command("compare two runs: what changed, and is it significant", _configure_compare, _compare)
+COMPARE = Command(
+    "compare two runs: what changed, and is it significant",
+    _configure_compare,
+    _compare,
+    examples=("pans compare pans-runs/2026-11-22T1412-fashion10 pans-runs/latest -o compared.html",),
+)

@@ -71,9 +71,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     add_walk_options(parser)
     parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
-    parser.add_argument(
-        "--core", type=int, metavar="N", help="bind the loop to processor core N and keep that awake; takes all of it"
-    )
+    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 % of that core")
     parser.add_argument(
         "--out",
         type=Path,
@@ -197,9 +195,22 @@ def profile_of(device: str) -> str:
     raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
 
 
-RUN = Command("decide on a device's clicks with a trained bundle, live", _configure_run, _run, prepare=prepare_options)
+RUN = Command(
+    "decide on a device's clicks with a trained bundle, live",
+    _configure_run,
+    _run,
+    prepare=prepare_options,
+    examples=(
+        "pans run parts.pans --device serial:/dev/ttyACM0 --profile my-lab.toml --seconds 60",
+        "pans run fashion10 --device sim:oled-qcmos?pace=fast --decisions 200",
+    ),
+)
 DEMO = Command(
     "the main job with nothing but the package: a simulated instrument, real images, timed decisions",
     _configure_demo,
     _demo,
+    examples=(
+        "pans demo",
+        "pans demo --pace fast --seconds 2 --json",
+    ),
 )

@@ -2,7 +2,7 @@
 
 Owns what is exposed when, which exposures belong to which decision, what a gap does to it, and what the state of the detector does to it.
 It does no input or output, reads no clock and draws no random number, so that a live run, a replay and a simulation give the same
-decisions bit for bit. Objects that pass by are the business of flow, which builds on this package.
+decisions bit for bit. Objects in flow are handled by the package flow, which builds on this package.
 
 >>> from importlib.resources import files
 >>> from pans.runtime.bundle import load_bundle

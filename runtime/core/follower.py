@@ -69,7 +69,7 @@ class Follower:
     A run that lost its device and found it again goes on in another stream: `begin` ends the old one and starts the next.
     """
 
-    moving = False  # whether objects pass by
+    moving = False  # whether objects flow past
 
     def __init__(self, plan: Plan, n_cycles: int, n_classes: int = ANY_CLASS) -> None:
         self.contradictions: Counter[str] = (

@@ -34,7 +34,7 @@ class Contradiction:
 
 
 class PlanRules:
-    """The rules of one plan; `moving` where objects pass by, and blocks therefore name none."""
+    """The rules of one plan; `moving` where objects flow past, and blocks therefore name none."""
 
     def __init__(self, plan: Plan, n_classes: int, *, moving: bool) -> None:
         self._offsets = plan.slot_offset_ticks.tolist()

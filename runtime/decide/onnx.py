@@ -101,7 +101,7 @@ class PictureDecider:
 
     def __init__(self, bundle: Bundle) -> None:
         if bundle.picture_shape is None or bundle.head_onnx is None:
-            raise UsageError(f"{bundle.name} decides among classes, it gives back no pictures")
+            raise UsageError(f"{bundle.name} decides among classes, it returns no pictures")
         self.choice: Mapping[str, Any] = {"chosen": self.name, "why": "pictures come from the head alone"}
         self.n_features = bundle.n_features
         self.picture_shape = bundle.picture_shape

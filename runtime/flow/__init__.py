@@ -1,4 +1,4 @@
-"""The core for objects that pass by, cells or a tape of bars: onset, best window, release, and the pulses asked for.
+"""The core for objects in flow, cells or a tape of bars: onset, best window, release, and the pulses asked for.
 
 Owns the search for passages in a stream of frames, one decision for each, and the comparison of decisions with the device's marks
 afterwards. Like core it does no input or output and reads no clock; pulses are sent by live. `make_flow_core` makes the core that a flow's

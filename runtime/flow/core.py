@@ -1,4 +1,4 @@
-"""Decisions about objects that pass by, one for each: what cells (cells.py) and a tape (tape.py) have in common.
+"""Decisions about objects in flow, one for each: what cells (cells.py) and a tape (tape.py) have in common.
 
 Owns the ring of the last frames, the verdict on a window, the pulse it asks for and why a passage is given up; frames run through
 kernels.py. Never reads a clock and never learns the truth before it has decided: matching.py compares afterwards. A core of a flow has

@@ -1,4 +1,4 @@
-"""The plan of a flow: parallel frames without end, for objects that pass by.
+"""The plan of a flow: parallel frames without end, for objects in flow.
 
 Owns the layout of one cycle and the refusal of what the hardware cannot do, with the numbers; which frames belong to an object is found
 out afterwards (flow.py). `build_flow_plan` returns a `Plan` or raises PlanError. The device ends a block at the end of a cycle.

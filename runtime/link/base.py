@@ -45,7 +45,7 @@ class Link(Protocol):
 def open_link(url: str) -> Link:
     """Open the device that `url` names: `serial:...`, `usb:...`, or a scheme of the entry points `pans.devices` (`sim:` is one).
 
-    Raises UsageError for a URL that cannot be meant and LinkError for a device that cannot be reached.
+    Raises UsageError for a URL that makes no sense and LinkError for a device that cannot be reached.
     """
     scheme, colon, rest = url.partition(":")
     if not colon or not rest:

@@ -1,9 +1,9 @@
-"""Stamped chunks from a link: the loop reads for itself while it waits, and a thread stands in while the loop is busy.
+"""Stamped chunks from a link: the loop reads for itself while it waits, and a helper thread reads while the loop is busy.
 
 Owns who reads, the queue between the two, and the reader's death; never looks into the bytes. A hand-over between threads costs more
-than a round trip to the instrument, so whoever waits for bytes reads them: `wait` takes the one chair before the link. Away
-from it for longer than LOOK_EVERY_S, the loop finds the stand-in reading into the queue, which gives the chair back when `wait`
-is called. Every chunk is stamped right after its read by whoever read it, and one reader at a time keeps their order.
+than a round trip to the instrument, so whoever waits for bytes reads them: `wait` takes the lock on reading. When the loop has been
+busy for longer than LOOK_EVERY_S, the helper thread reads into the queue, and hands reading back when `wait` is called. Every
+chunk is stamped right after its read by whoever read it, and one reader at a time keeps their order.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pans.runtime.errors import PansError
 if TYPE_CHECKING:
     from .base import Link
 
-LOOK_EVERY_S = 0.002  # how often the stand-in looks whether the loop has left
-STAND_IN_POLL_S = 0.005  # and how long it may keep a loop that has come back from the chair, if nothing arrives
+LOOK_EVERY_S = 0.002  # how often the helper looks whether the loop is busy
+HELPER_POLL_S = 0.005  # and how long it may keep a loop that has come back waiting, if nothing arrives
 EAGER_NS = 200_000
 REST_NS = 1_000_000_000  # how long a device that goes on sending is listened to when its link is given up
 MAX_QUEUED_BYTES = 1 << 24
@@ -34,22 +34,22 @@ class Chunk(NamedTuple):
 
 
 class LinkReader:
-    """Stamped chunks from a link; a thread stands in for a busy loop, unless the link's time is virtual.
+    """Stamped chunks from a link; a helper thread reads for a busy loop, unless the link's time is virtual.
 
-    The queue is bounded by MAX_QUEUED_BYTES: above it the stand-in stops reading, so that the transport and then the receive
+    The queue is bounded by MAX_QUEUED_BYTES: above it the helper stops reading, so that the transport and then the receive
     window hold the device back. The end of a link, or of the thread, is kept and raised by every further `wait`.
     """
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._chair = threading.Lock()  # whoever holds it reads the link
+        self._reading = threading.Lock()  # whoever holds it reads the link
         self._chunks: deque[Chunk] = deque()
         self._queued_bytes = 0
         self._ready = threading.Condition()
         self._death: BaseException | None = None
-        self._away = True  # the loop, from the chair
-        self._visits = 0  # of the loop to the chair
-        self._standing_in = False
+        self._away = True  # the loop does something else
+        self._visits = 0  # how often the loop has read
+        self._helping = False
         self._stopping = False
         self._thread: threading.Thread | None = None
         if not link.virtual:
@@ -58,7 +58,7 @@ class LinkReader:
 
     @property
     def thread_id(self) -> int | None:
-        """Native id of the stand-in's thread, for the scheduler; None without one."""
+        """Native id of the helper thread, for the scheduler; None without one."""
         return None if self._thread is None else self._thread.native_id
 
     def wait(self, timeout_s: float, *, eager: bool = False) -> list[Chunk]:
@@ -70,7 +70,7 @@ class LinkReader:
         self._away = False
         self._visits += 1
         try:
-            if self._chair.acquire(blocking=False):
+            if self._reading.acquire(blocking=False):
                 try:
                     if not self._chunks and self._death is None:
                         data = self._read_awake() if eager and self._thread is not None else b""
@@ -80,7 +80,7 @@ class LinkReader:
                     self._death = error
                     raise
                 finally:
-                    self._chair.release()
+                    self._reading.release()
             return self._queued(timeout_s)
         finally:
             self._away = True
@@ -119,10 +119,10 @@ class LinkReader:
         return data
 
     def _queued(self, timeout_s: float) -> list[Chunk]:
-        """Take what the stand-in has read, or is about to; nothing as soon as it has given the chair back."""
+        """Take what the helper has read, or is about to; nothing as soon as it has handed reading back."""
         deadline_s = time.monotonic() + timeout_s
         with self._ready:
-            while self._standing_in and not self._chunks and self._death is None:
+            while self._helping and not self._chunks and self._death is None:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0:
                     break
@@ -141,35 +141,35 @@ class LinkReader:
             while not self._stopping:
                 time.sleep(LOOK_EVERY_S)
                 if self._away and self._visits == seen:
-                    self._stand_in()
+                    self._help()
                 seen = self._visits
         except BaseException as error:  # whatever ends the thread must end the run loudly, not leave it waiting
             with self._ready:
                 self._death = error
-                self._standing_in = False
+                self._helping = False
                 self._ready.notify_all()
 
-    def _stand_in(self) -> None:
+    def _help(self) -> None:
         """Read until the loop is back."""
-        self._standing_in = True  # before the chair is taken: who finds it taken may wait
+        self._helping = True  # before the lock is taken: who finds it taken may wait
         try:
-            if self._chair.acquire(blocking=False):
+            if self._reading.acquire(blocking=False):
                 try:
                     while self._away and not self._stopping:
-                        data = self._link.read(STAND_IN_POLL_S)
+                        data = self._link.read(HELPER_POLL_S)
                         if data:
                             self._put(Chunk(self._link.now_ns(), data))
                 finally:
-                    self._chair.release()
+                    self._reading.release()
         finally:
             with self._ready:
-                self._standing_in = False
+                self._helping = False
                 self._ready.notify_all()
 
     def _put(self, chunk: Chunk) -> None:
         with self._ready:
             while self._queued_bytes > MAX_QUEUED_BYTES and not self._stopping:
-                self._ready.wait(STAND_IN_POLL_S)
+                self._ready.wait(HELPER_POLL_S)
             self._chunks.append(chunk)
             self._queued_bytes += len(chunk.data)
             self._ready.notify_all()

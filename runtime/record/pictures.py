@@ -36,11 +36,9 @@ class PictureLog:
         self._shots = 1
 
     def over(self, decider: Decider) -> Decider:
-        """Return the back end that the core is to ask; UsageError for one that gives back no pictures."""
+        """Return the back end that the core is to ask; UsageError for one that returns no pictures."""
         if not isinstance(decider, PictureDecider):
-            raise UsageError(
-                "the bundle decides among classes, it gives back no pictures", remedy="leave --pictures out"
-            )
+            raise UsageError("the bundle decides among classes, it returns no pictures", remedy="leave --pictures out")
         self._decider = decider
         self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
         return self

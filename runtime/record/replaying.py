@@ -104,7 +104,7 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
     """
     core, _ = _replayed(recording, bundle, None)
     if not isinstance(core, FlowCore):
-        raise UsageError(f"{recording.path}: no objects pass by in this run")
+        raise UsageError(f"{recording.path}: no objects flow past in this run")
     return replayed_figures(core, recording.events()), core.matcher.confusion
 
 

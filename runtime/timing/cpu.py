@@ -25,7 +25,7 @@ def check_core(core: int | None) -> None:
     if core is None:
         return
     if not hasattr(os, "sched_setaffinity"):
-        raise UsageError(f"--core {core}: this system does not bind threads to cores", remedy="leave --core away")
+        raise UsageError(f"--core {core}: this system cannot pin threads to cores", remedy="leave --core out")
     allowed = sorted(os.sched_getaffinity(0))
     if core not in allowed:
         raise UsageError(f"--core {core}, allowed: {', '.join(map(str, allowed))}")
@@ -33,7 +33,7 @@ def check_core(core: int | None) -> None:
 
 @contextmanager
 def busy_core(core: int | None) -> Iterator[dict[str, Any]]:
-    """Bind the calling thread to `core` and keep that awake while the block runs; yield {what: "granted" or why not}, {} for None."""
+    """Pin the calling thread to `core` and keep that core busy while the block runs; yield {what: "granted" or why not}, {} for None."""
     if core is None or not hasattr(os, "sched_setaffinity"):
         yield {}
         return

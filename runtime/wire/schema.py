@@ -27,7 +27,7 @@ NO_OBJECT = 0xFFFFFFFF
 
 
 class MalformedMessage(PansError):
-    """A frame whose CRC is right but whose payload cannot be meant; counted by the receiver, never fatal."""
+    """A frame whose CRC is right but whose payload makes no sense; counted by the receiver, never fatal."""
 
 
 class MessageType(IntEnum):

@@ -268,7 +268,7 @@ def _bits(data: bytes) -> NDArray[np.uint8]:
 def decide_again(recording: Recording, bundle: Bundle, backend: str = "") -> NDArray[np.void]:
     """Return the rows that the messages of `recording` give, ROW (n,)."""
     config = recording.header["config"]
-    demand("flow" not in config, "objects pass by")
+    demand("flow" not in config, "objects flow past")
     demand(config["dark"].get("guard", {}).get("policy", "warn") == "warn", "the dark counts decide too")
     plan, arms = sent_plan(recording)
     scores = BACKENDS[backend or config["backend"]](bundle)

@@ -1,4 +1,4 @@
-"""Numbers of options, sizes of arrays and kinds of files: what cannot be meant is refused with what is allowed, in no time."""
+"""Numbers of options, sizes of arrays and kinds of files: what makes no sense is refused with what is allowed, in no time."""
 
 from __future__ import annotations
 

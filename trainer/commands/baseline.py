@@ -189,4 +189,5 @@ BASELINE = Command(
     "direct imaging, compressive sensing, conventional end-to-end, trained masks and Hadamard pairs, at equal photons",
     _configure,
     _run,
+    examples=("pans baseline direct --task parts --photons 5 17 100",),
 )

@@ -141,4 +141,12 @@ def _tasks(absent: set[str]) -> list[dict[str, str]]:
     ]
 
 
-DATA = Command("list or fetch the public data sets; write a scene for the simulator", _configure, _data)
+DATA = Command(
+    "list or fetch the public data sets; write a scene for the simulator",
+    _configure,
+    _data,
+    examples=(
+        "pans data list",
+        "pans data scene parts -o parts.npz",
+    ),
+)

@@ -1,7 +1,7 @@
 """`pans evaluate`: what a bundle decides on held-out objects, against photons.
 
 Owns the arguments and how the answer looks; the figures come from the package evaluate. All of them are SIMULATED through a profile. A
-bundle that gives back pictures is judged by SSIM and mean squared error.
+bundle that returns pictures is judged by SSIM and mean squared error.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dark", type=float, metavar="R", help="dark photoelectrons per exposure, instead of the profile's"
     )
-    parser.add_argument("--eta", type=float, default=1.0, metavar="E", help="all light times E (default 1)")
+    parser.add_argument("--eta", type=float, default=1.0, metavar="E", help="scale all light by E (default 1)")
     parser.add_argument(
         "--confidence",
         type=CONFIDENCE_RANGE.option,
         default=0.0,
         metavar="C",
-        help="of an automaton: decide as soon as a class is that sure, abstain at the end below it",
+        help="of an automaton: decide as soon as a class is this probable, abstain if none is at the end",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trials (default 0)")
     parser.add_argument(
@@ -82,6 +82,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.data_seed is not None and args.data_seed < 0:
         raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
     if args.pictures is not None:
+        with needing("--pictures", "plot"):
+            import matplotlib  # noqa: F401 - asked for before the work, not after it
         outputs = [args.pictures / name for name in PICTURE_FILES]
         check_outputs(outputs, inputs=[args.bundle, args.task, args.profile], force=args.force, makes_folders=True)
     bundle, digest = load_bundle(args.bundle)
@@ -227,4 +229,12 @@ def _light_words(figures: Mapping[str, Any]) -> str:
     )
 
 
-EVALUATE = Command("accuracy of a bundle against photons, sampled or exact", _configure_evaluate, _evaluate)
+EVALUATE = Command(
+    "accuracy of a bundle against photons, sampled or exact",
+    _configure_evaluate,
+    _evaluate,
+    examples=(
+        "pans evaluate parts.pans --exact",
+        "pans evaluate parts.pans --profile my-lab.toml --shots 3",
+    ),
+)

@@ -142,4 +142,12 @@ def _check(name: str, args: argparse.Namespace) -> None:
         raise UsageError(f"--rows {args.rows} --dark {args.dark}", remedy=f"{name} has {has}")
 
 
-REPRODUCE = Command("the paper's tables and figures, ours beside the paper's", _configure, _run)
+REPRODUCE = Command(
+    "the paper's tables and figures, ours beside the paper's",
+    _configure,
+    _run,
+    examples=(
+        "pans reproduce list",
+        "pans reproduce fashion-mnist -o out",
+    ),
+)

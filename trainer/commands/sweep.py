@@ -197,4 +197,9 @@ def _check_same(study: Any, base: Options, data_sha256: str) -> None:
             study.set_user_attr(key, value)
 
 
-SWEEP = Command("search training options with optuna, in several processes or machines", _configure, _run)
+SWEEP = Command(
+    "search training options with optuna, in several processes or machines",
+    _configure,
+    _run,
+    examples=("pans sweep parts --features 6 --storage study.log --trials 50",),
+)

@@ -332,4 +332,12 @@ def _epoch_line(epoch: EpochReport, options: Options) -> str:
     )
 
 
-TRAIN = Command("train patterns and head through a profile, and export a bundle", _configure_train, _train)
+TRAIN = Command(
+    "train patterns and head through a profile, and export a bundle",
+    _configure_train,
+    _train,
+    examples=(
+        "pans train parts --features 6 --profile my-lab.toml -o parts.pans",
+        "pans train fashion-mnist --features 10 --photons 8 -o fashion.pans",
+    ),
+)

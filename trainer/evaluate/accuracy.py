@@ -170,7 +170,7 @@ def evaluate_sampled(
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPictures:
-    """Means per picture given back. `ssim_std` is the spread over trials, `ssim_se_objects` the error from having few objects."""
+    """Means per picture returned. `ssim_std` is the spread over trials, `ssim_se_objects` the error from having few objects."""
 
     ssim_mean: float
     ssim_std: float

@@ -95,9 +95,7 @@ def held_out_of(
     data_seed = int(told.get("data_seed", 0)) if conditions.data_seed is None else conditions.data_seed
     found = load_task(task or str(told.get("task_argument", bundle.task)), data_dir, data_seed=data_seed)
     if bundle.picture_shape not in (None, found.image_shape):
-        raise ValueError(
-            f"{bundle.name} gives back pictures of {bundle.picture_shape}, the task has {found.image_shape}"
-        )
+        raise ValueError(f"{bundle.name} returns pictures of {bundle.picture_shape}, the task has {found.image_shape}")
     if bundle.picture_shape is None and found.classes != bundle.classes:
         raise ValueError(
             f"{bundle.name} decides among {len(bundle.classes)} classes ({', '.join(bundle.classes[:3])}, ...), the task "

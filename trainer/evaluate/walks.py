@@ -1,7 +1,7 @@
 """What an automaton decides on held-out objects: exact sums over all walks, or sampled walks; calibration of its posteriors.
 
 Owns the figures of `pans evaluate` for automata; the sums over walks are runtime's `decide.expectation`. Clicks, photons, illumination and
-exposures always stand together. SIMULATED figures: the click law of the profile, no instrument.
+exposures are always reported together. SIMULATED figures: the click law of the profile, no instrument.
 """
 
 from __future__ import annotations

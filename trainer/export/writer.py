@@ -77,7 +77,7 @@ def export(
 
     UsageError if `path` exists, unless `force`. A wrong bundle never stands there.
 
-    A head that gives back pictures decides among no classes. `check` may refuse what was read, by PansError.
+    A head that returns pictures decides among no classes. `check` may refuse what was read, by PansError.
     """
     graph, dead = head_onnx(head, click_mean)
     picture_shape = head.image_shape if isinstance(head, Decoders) else None

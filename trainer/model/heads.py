@@ -157,7 +157,7 @@ class DecoderHead(_DenseHead):
         return super().rest(torch.relu(self.second(hidden)))
 
 
-Decoders = PictureHead | DecoderHead  # what gives back pictures
+Decoders = PictureHead | DecoderHead  # what returns pictures
 Heads = MlpHead | ConvHead | Decoders
 
 

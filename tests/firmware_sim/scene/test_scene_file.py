@@ -1,4 +1,4 @@
-"""Scene files in TOML: what they say comes back as facts, and whatever cannot be meant is refused with its place."""
+"""Scene files in TOML: what they say comes back as facts, and whatever makes no sense is refused with its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects that pass by: the same frames give the same passages however they are cut; a gap is never decided over; one decision each."""
+"""Objects in flow: the same frames give the same passages however they are cut; a gap is never decided over; one decision each."""
 
 from __future__ import annotations
 

@@ -1,0 +1,104 @@
+"""Without any of the extras: every command that needs one says which, with the pip command, and touches nothing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pans.runtime.cli import main
+
+BLOCKED = ("torch", "onnx", "PIL", "optuna", "matplotlib", "sklearn", "h5py", "prometheus_client")
+NEEDS = {  # command line: what it needs, and the extra that has it
+    "train s.npz --features 2 -o new.pans": ("torch", "train"),
+    "train s.npz --encoder automaton --photons 3 -o new.pans": ("torch", "train"),
+    "sweep s.npz --features 2 --storage new.log": ("optuna", "sweep"),
+    "baseline direct --task s.npz --method cnn": ("torch", "train"),
+    "reproduce alpha --collect --cache new -o out": ("torch", "train"),
+    "export r.pansrec --format photon-hdf5 -o new.h5": ("h5py", "export"),
+    "bench decide --quick --plot new.png": ("matplotlib", "plot"),
+    "evaluate fashion10 --task s.npz --objects 2 --pictures new": ("matplotlib", "plot"),
+}
+WORK_WITHOUT = (
+    "",
+    "help run",
+    "profile list",
+    "verify r.pansrec",
+    "info fashion10",
+    "replay r.pansrec",
+    "evaluate fashion10 --task s.npz",
+)
+CHILD = """
+import contextlib, io, json, sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in BLOCKED:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+BLOCKED = json.loads(sys.argv[1])
+sys.meta_path.insert(0, Blocked())
+from pans.runtime.cli import main
+
+found = {}
+for line in json.loads(sys.argv[2]):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(line.split())
+        except SystemExit as end:
+            code = int(end.code or 0)
+    found[line] = [code, err.getvalue()]
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str]]:
+    """Exit code and stderr of every line, in one process without the extras; its folder must not change."""
+    folder = tmp_path_factory.mktemp("lean")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        words = [
+            "run",
+            "fashion10",
+            "--device",
+            "sim:oled-qcmos?pace=fast",
+            "--decisions",
+            "3",
+            "--record",
+            "r.pansrec",
+        ]
+        assert main([*words, "-q"]) == 0
+    images = np.random.default_rng(0).integers(0, 255, (200, 28, 28)).astype(np.uint8)
+    names = ["T-shirt/top", "Trouser", "Pullover", "Dress", "Coat", "Sandal", "Shirt", "Sneaker", "Bag", "Ankle boot"]
+    np.savez(folder / "s.npz", images=images, labels=np.arange(200) % 10, classes=np.array(names))
+    before = sorted(folder.rglob("*"))
+    lines = json.dumps([*NEEDS, *WORK_WITHOUT])
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, json.dumps(BLOCKED), lines],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        check=True,
+    )
+    assert sorted(folder.rglob("*")) == before
+    return {line: (code, err) for line, (code, err) in json.loads(done.stdout.splitlines()[-1]).items()}
+
+
+@pytest.mark.parametrize("line", NEEDS)
+def test_the_extra_is_named(line: str, found: dict[str, tuple[int, str]]) -> None:
+    (code, err), (package, extra) = found[line], NEEDS[line]
+    assert code == 2, err
+    assert package in err
+    assert "remedy: pip install 'pans-runtime[" in err
+    assert extra in err.split("pans-runtime[")[1].split("]")[0]
+
+
+@pytest.mark.parametrize("line", WORK_WITHOUT)
+def test_the_rest_works_without(line: str, found: dict[str, tuple[int, str]]) -> None:
+    code, err = found[line]
+    assert code == 0, err
