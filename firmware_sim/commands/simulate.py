@@ -28,7 +28,7 @@ from pans.runtime.timing.cpu import check_core
 def _configure(parser: argparse.ArgumentParser) -> None:
     add_options(parser, SimOptions)
     parser.add_argument("--listen", default="pty", help="pty (default) or tcp:127.0.0.1:PORT")
-    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 % of that core")
+    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 %% of that core")
     parser.add_argument(
         "--echo",
         type=Range(0, 1 << 20, whole=True).option,

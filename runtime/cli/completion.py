@@ -67,7 +67,7 @@ def _words_of(parser: argparse.ArgumentParser) -> _Words:
     for action in parser._actions:
         choices = tuple(str(choice) for choice in action.choices or ())
         if action.option_strings:
-            help = one_line(action.help or "", 80)
+            help = one_line((action.help or "").replace("%%", "%"), 80)
             options.append(_Option(tuple(action.option_strings), choices, action.nargs != 0, help))
         else:
             places += choices

@@ -32,7 +32,9 @@ FORMATS = (*OF_RECORDINGS, *OF_BUNDLES)
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, metavar="FILE", help="a recording (file, folder or index of its parts), or a bundle")
+    parser.add_argument(
+        "recording", type=Path, metavar="FILE", help="a recording (file, folder or index of its parts), or a bundle"
+    )
     parser.add_argument(
         "--format",
         required=True,

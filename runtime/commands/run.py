@@ -71,7 +71,7 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     add_walk_options(parser)
     parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
-    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 % of that core")
+    parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 %% of that core")
     parser.add_argument(
         "--out",
         type=Path,

@@ -258,6 +258,7 @@ def test_every_example_of_a_command_can_be_parsed() -> None:
             found = finding.load_command(point)
         except UsageError:
             continue  # its extra is not installed
+        assert parser_of(name, found).format_help()  # a bare % in a help text would raise
         for line in found.examples:
             for words in re.findall(rf"pans {name}( [^|>)]*)?", line):
                 parser_of(name, found).parse_args(shlex.split(words))
