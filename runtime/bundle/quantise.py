@@ -40,7 +40,8 @@ def quantise_patterns(
 ) -> QuantisedPatterns:
     """Round patterns, finite and >= 0, (d_f, pixels), to levels 0..levels-1 of which the highest gives `top` photoelectrons.
 
-    `top` is the brightest pixel unless given; brighter pixels are clipped to it. `photons_per_level` is `top` over (levels - 1);
+    `top` is the brightest pixel unless given; brighter pixels are clipped to it. With `dither` it is what suits best (`dithered_top`).
+    `photons_per_level` is `top` over (levels - 1);
     every pixel goes to the nearest level (halves to even). With `dither`, the rows and columns of a pattern, the error of each pixel is
     carried on to its neighbours, for few levels. For transmissions in [0, 1] the photoelectrons of pattern i change by at
     most `error_bound[i]`, the larger of the light added and the light taken away.
@@ -56,15 +57,17 @@ def quantise_patterns(
         row, column = (int(n) for n in np.argwhere(bad)[0])
         value = wanted[row, column]
         raise ValueError(f"pattern {row} has {value} at pixel {column}, allowed: finite photons, 0 or more")
-    scale = (float(wanted.max()) if top is None else float(top)) / (levels - 1)
+    if dither is not None and dither[0] * dither[1] != wanted.shape[1]:
+        raise ValueError(f"patterns have {wanted.shape[1]} pixels, their shape is given as {dither[0]} x {dither[1]}")
+    if top is None:
+        top = float(wanted.max()) if dither is None else dithered_top(wanted.reshape(-1, *dither), levels)
+    scale = float(top) / (levels - 1)
     if not 0 < scale < np.inf:
         raise ValueError("no pattern has any light, allowed: at least one pixel above 0")
     if dither is None:
         rounded = np.clip(np.rint(wanted / scale), 0, levels - 1)
-    elif dither[0] * dither[1] == wanted.shape[1]:
-        rounded = diffused((wanted / scale).reshape(-1, *dither), levels).reshape(wanted.shape)
     else:
-        raise ValueError(f"patterns have {wanted.shape[1]} pixels, their shape is given as {dither[0]} x {dither[1]}")
+        rounded = diffused((wanted / scale).reshape(-1, *dither), levels).reshape(wanted.shape)
     change = rounded * scale - wanted
     return QuantisedPatterns(
         pattern_levels=rounded.astype(np.uint16),
@@ -77,18 +80,40 @@ def quantise_patterns(
     )
 
 
+def dithered_top(wanted: NDArray[np.float64], levels: int) -> float:
+    """Return the brightest level (photoelectrons) with which error diffusion keeps neighbourhoods of `wanted` best, (n, rows, columns).
+
+    One pixel that outshines all others would else leave them one level or none. Tried are the brightest pixel and its halves down to
+    1/512, compared by the mean squared error after a blur over 3 x 3 pixels.
+    """
+    brightest = float(wanted.max())
+    tops = [brightest * 0.5**halves for halves in range(10)] if brightest > 0 else [brightest]
+
+    def error(top: float) -> float:
+        shown = diffused(wanted * ((levels - 1) / top), levels) * (top / (levels - 1))
+        return float((_blurred(shown - wanted) ** 2).sum())
+
+    return min(tops, key=error) if brightest > 0 else brightest
+
+
+def _blurred(images: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums over 3 x 3 pixels, with nothing beyond the edge."""
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1)))
+    rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    return np.asarray(rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:])
+
+
 def diffused(wanted: NDArray[np.float64], levels: int) -> NDArray[np.float64]:
     """Return whole levels (n, rows, columns) of `wanted`, in levels, by error diffusion; rows run to the right and to the left in turn.
 
-    Of each error 7/16 go to the next pixel, 3/16, 5/16 and 1/16 to those before, below and after in the next row. What leaves the image is
-    lost, and light above the highest level is not made up for elsewhere.
+    Of each error 7/16 go to the next pixel, 3/16, 5/16 and 1/16 to those before, below and after in the next row, light above the highest
+    level too. What leaves the image is lost.
     """
     n, rows, columns = wanted.shape
     shown = np.empty_like(wanted)
-    left = np.minimum(wanted, levels - 1)
     below = np.zeros((n, columns + 2))
     for row in range(rows):
-        now, below = left[:, row] + below[:, 1:-1], np.zeros((n, columns + 2))
+        now, below = wanted[:, row] + below[:, 1:-1], np.zeros((n, columns + 2))
         step = 1 if row % 2 == 0 else -1
         ahead = np.zeros(n)
         for column in range(columns)[::step]:

@@ -80,8 +80,9 @@ def floyd_steinberg_by_hand(wanted: np.ndarray, levels: int) -> np.ndarray:
 @pytest.mark.parametrize("levels", [2, 3, 4])
 def test_error_diffusion_is_that_of_floyd_and_steinberg(levels: int) -> None:
     patterns = RNG.uniform(0, 1, (3, 6 * 9))
-    found = quantise_patterns(patterns, levels, dither=(6, 9))
-    scale = patterns.max() / (levels - 1)
+    top = float(patterns.max())
+    found = quantise_patterns(patterns, levels, top, dither=(6, 9))
+    scale = top / (levels - 1)
     for pattern, shown in zip(patterns, found.pattern_levels):
         assert np.array_equal(shown.reshape(6, 9), floyd_steinberg_by_hand(pattern.reshape(6, 9) / scale, levels))
 
@@ -98,13 +99,25 @@ def test_error_diffusion_keeps_the_light_of_dim_patterns_that_rounding_loses() -
     assert spread.error_bound == pytest.approx([max(change[change > 0].sum(), -change[change < 0].sum())])
 
 
-def test_error_diffusion_leaves_what_is_a_level_already_and_clips_what_is_too_bright() -> None:
+def test_error_diffusion_leaves_what_is_a_level_already() -> None:
     levels = RNG.integers(0, 4, (2, 30)) / 3
     levels[0, 0] = 1.0
-    assert np.array_equal(
-        quantise_patterns(levels, 4, dither=(5, 6)).patterns(), quantise_patterns(levels, 4).patterns()
-    )
-    bright = quantise_patterns(np.array([[5.0, 0.0, 0.0, 0.0]]), 2, 1.0, dither=(1, 4))
-    assert bright.pattern_levels.tolist() == [[1, 0, 0, 0]]
+    found = quantise_patterns(levels, 4, 1.0, dither=(5, 6))
+    assert np.array_equal(found.patterns(), quantise_patterns(levels, 4).patterns())
     with pytest.raises(ValueError, match="4 pixels, their shape is given as 2 x 3"):
         quantise_patterns(np.ones((1, 4)), 2, dither=(2, 3))
+
+
+def test_one_bright_pixel_does_not_take_the_levels_of_all_others() -> None:
+    patterns = RNG.uniform(0, 0.02, (4, 400))
+    patterns[0, 210] = 1.0
+    found = quantise_patterns(patterns, 2, dither=(20, 20))
+    assert found.photons_per_level < 0.1
+    assert found.illumination == pytest.approx(patterns.sum(), rel=0.1)
+    as_bright = quantise_patterns(patterns, 2, 1.0, dither=(20, 20))
+
+    def blocks(patterns: np.ndarray) -> np.ndarray:
+        return patterns[1:].reshape(3, 5, 4, 5, 4).sum(axis=(2, 4))
+
+    errors = [np.abs(blocks(one.patterns()) - blocks(patterns)).mean() for one in (found, as_bright)]
+    assert errors[0] < errors[1] / 3
