@@ -11,6 +11,7 @@ import doctest
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -131,6 +132,8 @@ def test_the_page_does_what_it_says(page: Path, tmp_path: Path, monkeypatch: pyt
             elif "PANS_DATA" not in os.environ:
                 pytest.skip("needs PANS_DATA")
         where = f"{page.relative_to(ROOT)}:{block.line}"
+        if "file" in block.notes:
+            shutil.copy(ROOT / block.notes["file"], tmp_path)
         if block.language == "python":
             exec(compile(block.text, where, "exec"), names)
         elif block.language == "pycon":
