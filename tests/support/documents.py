@@ -87,7 +87,7 @@ def sentences(page: Path) -> list[str]:
     text = _BLOCK.sub("\n\n", page.read_text(encoding="utf-8"))
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"\]\([^)]*\)", "]", text)
-    text = re.sub(r"(?m)^(#.*|\|.*|!\[.*)$", "\n", text)
+    text = re.sub(r"(?m)^\s*(#.*|\|.*|!\[.*)$", "\n", text)
     text = re.sub(r"(?m)^\s*([-*]|\d+\.)\s", "\n\n", text)
     return [
         s for part in re.split(r"\n\s*\n", text) for s in re.split(r"(?<=[.?!])[*_)`]*\s+", " ".join(part.split())) if s
