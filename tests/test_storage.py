@@ -8,6 +8,7 @@ fault.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import random
 import secrets
@@ -104,9 +105,10 @@ class Bench:
         ended = self.storage.noted(words, self.folder, journal)
         return ended, states(disk, journal)
 
-    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0) -> Ended:
+    def run(self, case: Case, at: int = 0, fault: Fault = Fault.NONE, error: int = 0, *, fresh: bool = False) -> Ended:
         words = case.words.replace("TRACE", str(self.trace)).split()
-        return self.storage.run(words, self.folder, at, fault, error)
+        run = self.storage.fresh if fresh else self.storage.run
+        return run(words, self.folder, at, fault, error)
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +178,7 @@ def check_readable(path: Path, *, whole: bool) -> None:
         load_calibration(path)
     elif path.name == "state.json":
         assert is_state_file(path)
+        json.loads(path.read_text())
     elif path.name == "run.parts.json":
         read_index(path)
     elif path.suffix == ".pansrec":
@@ -244,6 +247,34 @@ def test_a_call_of_every_command(name: str, bench: Bench) -> None:
 def test_every_call_of_every_command(name: str, bench: Bench) -> None:
     runs = tried(bench, name, None)
     print(f"{name}: {runs} runs")
+
+
+def tried_fresh(bench: Bench, name: str, drawn: int) -> None:
+    """A process that nothing has prepared makes the same calls as a forked one, and fails as well."""
+    case, chosen = CASES[name], random.Random(f"{SEED} fresh {name}")
+    if case.needs:
+        pytest.importorskip(case.needs)
+    bench.fresh()
+    forked = bench.run(case)
+    before = bench.fresh()
+    clean = bench.run(case, fresh=True)
+    judge(bench, case, before, clean, Fault.NONE)
+    if not case.may:  # a state file is written by the clock
+        assert (clean.code, clean.calls) == (forked.code, forked.calls)
+    for fault, error in chosen.sample(FAULTS, drawn):
+        at, before = chosen.randint(1, clean.calls), bench.fresh()
+        ended = bench.run(case, at, fault, error, fresh=True)
+        judge(bench, case, before, ended, fault)
+
+
+def test_a_fresh_process_meets_the_same_storage(bench: Bench) -> None:
+    tried_fresh(bench, "export", 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_a_fresh_process_of_every_command(name: str, bench: Bench) -> None:
+    tried_fresh(bench, name, 3)
 
 
 # ---- a power cut: what was not synced is lost ----

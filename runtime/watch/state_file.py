@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 FORMAT = "pans-state 1"
 EVERY_S = 1.0
 GOODBYE_S = 5.0
+OTHER_WRITER_S = 1.0
 
 
 def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: float) -> dict[str, Any]:
@@ -99,7 +100,7 @@ class StateFile:
         self.path = path
         self.trouble = ""
         self._look, self._beside = look, path.with_name(f".{path.name}.{os.getpid()}.partial")
-        self._ending = threading.Event()
+        self._ending, self._alone = threading.Event(), threading.Lock()
         self._left: dict[str, Any] = {}
         self._write()
         self._thread = threading.Thread(target=self._keep, name="pans-state", daemon=True)
@@ -121,10 +122,17 @@ class StateFile:
             self._write()
 
     def _write(self) -> None:
+        if not self._alone.acquire(timeout=OTHER_WRITER_S):
+            return  # the other thread hangs in the file system
         try:
-            with open(self._beside, "wb", buffering=0) as file:
+            with open(self._beside, "wb") as file:
                 file.write(canonical_json(self._look() | self._left) + b"\n")
+                file.flush()  # buffered, because one write may take only a part
                 os.fsync(file.fileno())  # or a power cut leaves an empty file in place of the latest state
             os.replace(self._beside, self.path)
         except OSError as error:  # a run does not end because nobody can watch it
             self.trouble = str(error)
+            with suppress(OSError):
+                os.unlink(self._beside)
+        finally:
+            self._alone.release()

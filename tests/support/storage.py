@@ -1,7 +1,8 @@
 """Storage that fails: runs commands in processes of their own, in which the n-th call on files below a folder fails, is cut or is the last.
 
 The faults are made between the process and the kernel (storage_faults.c, by LD_PRELOAD): nothing of the project is replaced. A process with
-everything imported is forked for each command, so that hundreds of them take a minute. As a program it is that process.
+everything imported is forked for each command, so that hundreds of them take a minute. As a program it is that process. A forked process
+differs from a fresh one in what it need not do: import, compile or load kernels, fill caches. `fresh` runs a command in a fresh one.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ class FaultyStorage:
         shim = folder / "storage_faults.so"
         source = str(HERE / "storage_faults.c")
         subprocess.run([compiler(), "-shared", "-fPIC", "-O1", "-o", str(shim), source, "-ldl"], check=True)
-        environment = {
+        self._environment = environment = {
             **os.environ,
             "LD_PRELOAD": str(shim),
             "PYTHONPATH": os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         }
-        words = [sys.executable, str(HERE / "storage.py"), str(shim), str(folder)]
+        self._program = words = [sys.executable, str(HERE / "storage.py"), str(shim), str(folder)]
         self._errors = folder / "server.txt"
         with self._errors.open("wb") as errors:
             self._process = subprocess.Popen(
@@ -70,6 +71,20 @@ class FaultyStorage:
         """Run a command in `folder`, on whose files call number `at` meets `fault`."""
         asked = {"words": list(words), "folder": str(folder), "at": at, "fault": int(fault), "error": error}
         return Ended(**self._ask(asked))
+
+    def fresh(
+        self, words: Sequence[str], folder: Path, at: int = 0, fault: Fault = Fault.NONE, error: int = 0
+    ) -> Ended:
+        """As `run`, in a process that nothing has prepared."""
+        asked = {"words": list(words), "folder": str(folder), "at": at, "fault": int(fault), "error": error}
+        with (folder.parent / "calls").open("w+") as told:
+            done = subprocess.run(
+                [*self._program, json.dumps(asked), str(told.fileno())],
+                env=self._environment, pass_fds=(told.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE, text=True, timeout=LONGEST_S, check=False,
+            )  # fmt: skip
+            told.seek(0)
+            return Ended(done.returncode, int(told.read() or 0), done.stderr)
 
     def noted(self, words: Sequence[str], folder: Path, journal: Path) -> Ended:
         """Run a command in `folder`; what it does to the files there is written to `journal` (power_cut.py reads it)."""
@@ -113,6 +128,18 @@ def _serve(shim: str, folder: str) -> None:
         print(json.dumps(found), file=answers, flush=True)
 
 
+def _once(shim: str, asked: dict[str, Any], told: int) -> None:
+    """Carry out one question in this process."""
+    from pans.runtime.cli import main
+
+    faults = ctypes.CDLL(shim)
+    os.chdir(asked["folder"])
+    faults.storage_arm(asked["folder"].encode(), asked["at"], asked["fault"], asked["error"])
+    code = main(asked["words"])
+    os.write(told, str(faults.storage_calls()).encode())
+    os._exit(code)
+
+
 def _forked(main: Any, faults: Any, asked: dict[str, Any]) -> dict[str, Any]:
     said, told = os.memfd_create("stderr"), os.memfd_create("calls")
     child = os.fork()
@@ -150,4 +177,6 @@ def _forked(main: Any, faults: Any, asked: dict[str, Any]) -> dict[str, Any]:
 ERRORS = (errno.EIO, errno.ENOSPC)
 
 if __name__ == "__main__":
+    if len(sys.argv) > 3:
+        _once(sys.argv[1], json.loads(sys.argv[3]), int(sys.argv[4]))
     _serve(*sys.argv[1:])

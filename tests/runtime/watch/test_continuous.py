@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -40,6 +41,19 @@ def test_a_state_file_that_cannot_be_written_does_not_end_the_run(tmp_path: Path
     state = StateFile(tmp_path / "missing" / "state.json", dict)
     state.close()
     assert "No such file" in state.trouble
+
+
+def test_what_a_full_disk_cut_off_does_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = StateFile(tmp_path / "state.json", lambda: {"n": 1})
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    state.close()
+    assert "No space left" in state.trouble
+    assert [one.name for one in tmp_path.iterdir()] == ["state.json"]
+    assert json.loads((tmp_path / "state.json").read_text()) == {"n": 1}
 
 
 def test_before_the_run_there_is_a_picture_too() -> None:
