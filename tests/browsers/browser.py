@@ -1,6 +1,6 @@
 """A headless chromium for tests of pages: widths, light and dark, console errors, and axe-core where it is there.
 
-`AXE_CORE` names axe-core's archive (axe-core-*.tgz) or its axe.min.js; without it the accessibility check is skipped.
+`AXE_CORE` names axe-core's archive (axe-core-*.tgz) or its axe.min.js; without it accessibility is not checked, with a warning.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import base64
 import os
 import shutil
 import tarfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -108,10 +109,11 @@ def axe_source() -> str | None:
 
 
 def serious(driver: Any) -> list[str]:
-    """Return axe-core's serious and critical findings."""
+    """Return axe-core's serious and critical findings; none, with a warning, where AXE_CORE does not name it."""
     source = axe_source()
     if source is None:
-        pytest.skip("AXE_CORE does not name axe-core")
+        warnings.warn("AXE_CORE does not name axe-core: accessibility is not checked", stacklevel=2)
+        return []
     driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
     driver.execute_script(source)
     result = driver.execute_async_script(
