@@ -106,7 +106,8 @@ class After:
 def finish(args: argparse.Namespace, task: Task, profile: Profile, figures: Mapping[str, Any]) -> After:
     """Warn of a budget that was not met, compare with direct imaging at equal photons, and name the next commands."""
     photons = figures["photons_mean"]
-    warn_of_budget(args, figures["clicks_mean"], photons)
+    if args.encoder != AUTOMATON:  # whose own words tell it
+        warn_of_budget(args, figures["clicks_mean"], photons)
     words, payload = [], {}
     if task.light == "transmission" and photons >= LEAST_PHOTONS:
         direct = compared(task, photons, args.seed or 0)

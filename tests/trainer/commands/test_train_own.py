@@ -97,7 +97,7 @@ def test_the_course_of_an_automaton_is_written_and_drawn(letters, tmp_path):
 
 def test_a_sensor_without_light_is_not_compared(capsys):
     figures = {"clicks_mean": 0.0, "photons_mean": 0.0}
-    args = argparse.Namespace(task="t", out="t.pans", clicks=None, photons=10.0, seed=0)
+    args = argparse.Namespace(task="t", encoder="active", out="t.pans", clicks=None, photons=10.0, seed=0)
     found = train_own.finish(args, bars_task(20), load_profile("ideal"), figures)
     assert found.payload == {}
     assert "next:" in found.words
