@@ -16,7 +16,6 @@ from pans.firmware_sim.device.upload import PatternMemory
 from pans.firmware_sim.device.view import View
 from pans.firmware_sim.device.walking import PatternLight
 from pans.firmware_sim.program import Program, States
-from pans.firmware_sim.scene.detector_kernels import click_thresholds
 from pans.firmware_sim.scene.detector_model import (
     CLICK_STREAM,
     LOWER_CROSSTALK_STREAM,
@@ -131,6 +130,8 @@ class LightService:
 
     def _file(self, model: DetectorModel, probability: F64, photons: F64, mean: F64 | None = None) -> U64:
         """The words of a file: probability float64 (objects, columns + 1), photons float64 (objects,), mean float64 (objects, columns)."""
+        from pans.firmware_sim.scene.detector_kernels import click_thresholds  # loads the compiler
+
         after = model.afterpulse_probability
         self._check_size(probability.size * (2 if after else 1) + (0 if mean is None else mean.size))
         parts = [_header(self._view, model, probability, mean), click_thresholds(probability).ravel()]
@@ -149,6 +150,8 @@ class LightService:
 def _header(view: View, model: DetectorModel, probability: F64, mean: F64 | None) -> U64:
     real = np.array([model.law.dark_per_exposure, model.dead_fraction, model.afterpulse_probability], np.float64)
     keys = [stream_key(view.seed, stream) for stream in (CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM)]
+    from pans.firmware_sim.scene.detector_kernels import click_thresholds  # loads the compiler
+
     crosstalk = int(click_thresholds(np.array(model.crosstalk_probability)))
     n_objects, columns = probability.shape[0], probability.shape[1] - 1
     parallel = int(MODES[view.profile.mode] == PARALLEL)
