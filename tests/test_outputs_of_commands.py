@@ -28,6 +28,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "report": ("report b.pans -o OUT", "OUT", "b.pans"),
     "replay": ("replay r.pansrec --pictures OUT", "OUT", "r.pansrec"),
     "bench": ("bench ingest --quick --plot OUT", "OUT", None),
+    "compare": ("compare r.pansrec r.pansrec -o OUT", "OUT", "r.pansrec"),
     "profile": ("profile new OUT.toml", "OUT.toml", None),
     "train": ("train fashion-mnist --features 2 --epochs 1 -o OUT", "OUT", None),
     "train checkpoint": ("train fashion-mnist --features 2 --epochs 1 -o OUT", "OUT.checkpoint", None),
@@ -38,7 +39,18 @@ COMMANDS = {  # words, what is there already, what else is read
     "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
     "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }
-WRITES_NO_FILE = {"verify", "info", "simulate", "devices", "doctor", "baseline", "fuzz", "completion", "runs"}
+WRITES_NO_FILE = {
+    "verify",
+    "info",
+    "simulate",
+    "devices",
+    "doctor",
+    "baseline",
+    "fuzz",
+    "completion",
+    "runs",
+    "conform",
+}
 CHECKED_ELSEWHERE = {"demo", "sweep"}  # tests/runtime/commands/test_run_files.py, and below
 
 

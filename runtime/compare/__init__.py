@@ -3,8 +3,8 @@
 Owns the tests and their words. It reads recordings, folders of runs and summaries; it never runs anything and never changes a file.
 
 >>> from pans.runtime.compare import mcnemar_exact
->>> mcnemar_exact(1, 9)
-0.021484375
+>>> round(mcnemar_exact(1, 9), 6)
+0.021484
 """
 
 from typing import TYPE_CHECKING

@@ -66,7 +66,7 @@ _HEAD = """\
 def profile_template(name: str, base: str) -> str:
     """Return the commented TOML of a profile called `name` with the figures of the profile `base` (a shipped name or a file).
 
-    >>> print(profile_template("my-lab", "dmd-spad").split("\\n")[5])
+    >>> print(profile_template("my-lab", "dmd-spad").split("\\n")[4])
     [profile]
     """
     tables, _ = read_toml(profile_text(base), base)

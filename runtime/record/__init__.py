@@ -8,6 +8,7 @@ that survives a power cut; never judges what is in it (report) and never runs a 
 Traceback (most recent call last):
     ...
 pans.runtime.errors.UsageError: none.pansrec: cannot be read: No such file or directory
+  remedy: check the path and its permissions
 """
 
 from typing import TYPE_CHECKING

@@ -52,7 +52,7 @@ def test_faults_are_named_with_or_without_a_strength() -> None:
     ("text", "complaint"),
     [
         ("lose", "there is no fault 'lose'"),
-        ("loss:2", "a probability from 0 to 1, found '2'"),
+        ("loss:2", "a probability, allowed: 0 to 1, found '2'"),
         ("loss:nan", "a probability"),
         ("stall:600", "needs a length and how often"),
         ("stall:5s/600ms", "less than its period"),
@@ -83,7 +83,7 @@ def test_faults_come_from_a_file_too(tmp_path: Path) -> None:
     path.write_text("loss = 1\n")
     with pytest.raises(ConfigError, match="one table"):
         parse_faults(str(path))
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(UsageError, match="cannot be read"):
         parse_faults(str(tmp_path / "none.toml"))
 
 

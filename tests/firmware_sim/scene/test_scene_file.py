@@ -103,7 +103,7 @@ def test_class_folders_are_pictures_too(folder: Path) -> None:
     assert scene.what.objects.images.shape == (4, 3, 4)
     assert scene.what.objects.labels.tolist() == [0, 0, 1, 1]
     image.new("L", (5, 3), 0).save(folder / "pictures" / "dim" / "2.png")
-    with pytest.raises(ConfigError, match=r"scene.toml:2:1: .*5 x 3 pixels, the first image has 4 x 3"):
+    with pytest.raises(ConfigError, match=r"scene.toml:2:1: .*5 x 3 pixels, the first image \(0.png\) has 4 x 3"):
         open_scene(folder / "scene.toml")
 
 

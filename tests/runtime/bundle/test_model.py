@@ -234,8 +234,8 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path, monkeypatch: p
 
 
 def test_missing_files_are_a_matter_of_usage(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.pans", tmp_path):
-        with pytest.raises(UsageError, match="cannot be read"):
+    for path, why in ((tmp_path / "none.pans", "there is no such bundle"), (tmp_path, "cannot be read")):
+        with pytest.raises(UsageError, match=why):
             load_bundle(path)
 
 

@@ -41,7 +41,7 @@ def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     ("words", "wanted"),
     [
         (["pans", "ver"], {"verify"}),
-        (["pans", "help", "comp"], {"completion"}),
+        (["pans", "help", "comp"], {"compare", "completion"}),
         (["pans", "run", "--on"], {"--on-dark"}),
         (["pans", "run", "--on-dark", ""], {"warn", "tables", "mask", "abstain"}),
         (["pans", "-q", "bench", "li"], {"link"}),

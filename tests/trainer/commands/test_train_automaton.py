@@ -96,7 +96,7 @@ def refusal(capsys, *words):
 
 def test_refusals(images, tmp_path, capsys):
     out = ["-o", str(tmp_path / "x.pans")]
-    assert "one budget" in refusal(capsys, images, *SHORT, *out)
+    assert "one budget" in refusal(capsys, images, *SHORT, "--as-is", *out)
     assert "--features, --head: not of an automaton" in refusal(
         capsys, images, *SHORT, "--photons", "3", "--features", "4", "--head", "conv", *out
     )
@@ -108,7 +108,7 @@ def test_refusals(images, tmp_path, capsys):
         assert f"{option} is {value}, allowed: 0 to" in words
     teacher = ["--teacher", str(tmp_path / "x.npz")]
     assert "no soft targets are wanted" in refusal(capsys, images, *SHORT, "--photons", "3", *teacher, *out)
-    assert "--features is missing" in refusal(capsys, images, *out)
+    assert "--features is missing" in refusal(capsys, images, "--as-is", *out)
     fiber = refusal(capsys, "fiber", *SHORT, "--photons", "3", *out)
     assert "the light is the scene's own" in fiber
     assert not list(tmp_path.glob("*.pans*"))

@@ -161,9 +161,10 @@ def test_a_picture_bundle_runs_and_its_pictures_are_recomputed(tmp_path, capsys)
     )
     assert replayed["ssim_mean"] == pytest.approx(expected.ssim_mean, abs=6 * expected.ssim_std + 1e-6)
     assert main(["verify", found["recording"]]) == 0
-    pytest.importorskip("matplotlib")
     assert main(["report", found["recording"], "-o", str(tmp_path / "run.html")]) == 0
-    assert "The rows of W, coherent" in (tmp_path / "run.html").read_text()
+    page = (tmp_path / "run.html").read_text()
+    assert "row 0" in page
+    assert "modulus of W" in page
 
 
 def test_ssim_is_that_of_the_trainer():

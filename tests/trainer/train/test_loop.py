@@ -128,7 +128,9 @@ def test_with_several_shots_in_the_loss_restarts_are_judged_by_them_too(task):
         scores = run.head((words.unsqueeze(0) + words.unsqueeze(1)).flatten(0, 1) / 2)
         losses = cross_entropy(scores.unsqueeze(0), target.unsqueeze(1))  # (n, pairs)
     pairs = (chances.unsqueeze(1) * chances.unsqueeze(2)).flatten(1)
-    assert whole == pytest.approx(float((pairs * losses).sum() / len(p)), rel=0.03)
+    assert whole == pytest.approx(
+        float((pairs * losses).sum() / len(p)), rel=0.05
+    )  # drawn once for each of few objects
     assert whole < 0.97 * zero
 
 
