@@ -69,7 +69,9 @@ CASES = {
     "export": Case("export r.pansrec --format csv -o out/csv", ("out/csv/about.json", "out/csv/clicks.csv")),
     "export hdf5": Case("export r.pansrec --format photon-hdf5 -o r.h5", ("r.h5",), "h5py"),
     "bundle": Case("bundle --patterns p.npy --table t.npy --classes a,b -o old.pans --force", ("old.pans",)),
-    "train": Case("train scene.npz --features 13 --epochs 3 --hidden 4 --batch 16 -o t.pans", ("t.pans",), "torch"),
+    "train": Case(
+        "train scene.npz --as-is --features 13 --epochs 3 --hidden 4 --batch 16 -o t.pans", ("t.pans",), "torch"
+    ),
 }
 FAULTS = (
     (Fault.FAIL_ONCE, errno.EIO),
