@@ -92,6 +92,7 @@ class Follower:
         self._begun = False
         self._status: Status | None = None  # the latest of this stream
         self._told_end: int | None = None  # tick of the first STATUS that told of the end
+        self._told_wrong = False  # whether that one has been found to contradict the plan
 
     # -- what subclasses do --------------------------------------------------------------------------------------------
 
@@ -162,7 +163,7 @@ class Follower:
             output = joined(output, self._give_up())
             self.tracker.restart()
             self.marks.clear()
-        self._begun, self.completed, self._told_end, self._status = True, False, None, None
+        self._begun, self.completed, self._told_end, self._told_wrong, self._status = True, False, None, False, None
         self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
         return output
 
@@ -257,13 +258,15 @@ class Follower:
         missing = min(status.next_exposure, self.end_exposure) > self.tracker.next_exposure
         if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
             self._told_end = status.tick
-            return Output([], [], None)
+            wrong = None if self._told_wrong else self._rules.of_status(status, self.start_tick, self.end_exposure)
+            self._told_wrong |= wrong is not None  # told now: what it overtook may complete the plan, and nothing would judge it
+            return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
         return self._finish(status)
 
     def _finish(self, status: Status) -> Output:
         """Close the stream; what `status` claims beyond the plan or beyond what is believed is no gap but a contradiction."""
         self.completed = True
-        wrong = self._rules.of_status(status, self.start_tick, self.end_exposure)
+        wrong = None if self._told_wrong else self._rules.of_status(status, self.start_tick, self.end_exposure)
         end = min(status.next_exposure, self.end_exposure)
         unexplained = self.tracker.counters.unexplained_drops
         gap = self.tracker.finish(end, status.drops)

@@ -109,6 +109,17 @@ def test_blocks_that_a_status_overtook_still_count() -> None:
     assert decider.asked == [[1, 0, 0]]
 
 
+def test_a_claim_that_overtook_the_last_block_is_judged_all_the_same() -> None:
+    core, _ = make(n_cycles=1)
+    (told,) = core.step(completed(10**12)).events
+    assert told.event()["what"] == "claimed_exposures"
+    assert core.step(completed(10**12)).events == []  # the same once more
+    assert core.step(cycle(0, 0, [0, 1, 0, 0])).decisions[0].flags == 0
+    core.step(completed(4, tick=10**6 + 1))
+    assert core.completed
+    assert core.contradictions == {"claimed_exposures": 1}
+
+
 def test_what_comes_after_the_end_was_settled_is_dropped_and_counted() -> None:
     core, decider = make(n_cycles=1)
     core.step(completed(4))
