@@ -259,7 +259,7 @@ class Follower:
         if missing and (self._told_end is None or status.tick <= self._told_end):  # the same one may come twice
             self._told_end = status.tick
             wrong = None if self._told_wrong else self._rules.of_status(status, self.start_tick, self.end_exposure)
-            self._told_wrong |= wrong is not None  # told now: what it overtook may complete the plan, and nothing would judge it
+            self._told_wrong |= wrong is not None  # judged now: what it overtook may complete the plan
             return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
         return self._finish(status)
 
