@@ -47,6 +47,7 @@ def browser(folder: Path) -> Iterator[Any]:
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(driver_program))
+    driver.set_page_load_timeout(60)  # a page that takes longer hangs
     try:
         yield driver
     finally:

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import termios
+import time
 import urllib.request
 from collections import Counter, deque
 from pathlib import Path
@@ -198,8 +199,9 @@ def test_without_a_terminal_there_are_plain_lines(
                 return pictures.popleft()
 
         shown._snapshots = Pictures()  # type: ignore[assignment]
-        while len(pictures) > 9_990:
-            pass
+        deadline = time.monotonic() + 30
+        while len(pictures) > 9_990 and time.monotonic() < deadline:
+            time.sleep(0.01)
     lines = capfd.readouterr().err.splitlines()
     assert (
         lines[0]
