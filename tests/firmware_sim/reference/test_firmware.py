@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from c_device import needs_compiler
+from tree import ROOT
 
 from pans.firmware_sim.engine.build import FOLDER, core_sources
 
@@ -79,7 +80,7 @@ def test_the_core_allocates_nothing_and_calls_no_system() -> None:
 
 
 def test_the_document_states_the_sizes() -> None:
-    text = (FOLDER.parents[1] / "docs/how-to/reference-instrument.md").read_text()
+    text = (ROOT / "docs" / "how-to" / "reference-instrument.md").read_text()
     for target, (_, words, _) in TARGETS.items():
         assert target in text
         assert all(word in text for word in words)
