@@ -1,6 +1,7 @@
-"""A headless chromium for tests of pages: widths, light and dark, console errors, and axe-core where it is there.
+"""A headless chromium for tests of pages: widths, light and dark, console errors, axe-core, and the Tab key.
 
-`AXE_CORE` names axe-core's archive (axe-core-*.tgz) or its axe.min.js; without it accessibility is not checked, with a warning.
+axe-core is the one that axe-core-python (extra `browser`) brings; `AXE_CORE` names another: an archive (axe-core-*.tgz) or an axe.min.js.
+Without both, accessibility is not checked, with a warning.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import tarfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -98,9 +101,12 @@ def console(driver: Any) -> list[str]:
 
 def axe_source() -> str | None:
     """Return axe-core's script, None where it is not there."""
-    place = Path(os.environ.get("AXE_CORE", ""))
-    if not place.is_file():
-        return None
+    named = os.environ.get("AXE_CORE")
+    if named is None:
+        if find_spec("axe_core_python") is None:
+            return None
+        return files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+    place = Path(named)
     if place.suffix != ".tgz":
         return place.read_text(encoding="utf-8")
     with tarfile.open(place) as archive:
@@ -110,10 +116,10 @@ def axe_source() -> str | None:
 
 
 def serious(driver: Any) -> list[str]:
-    """Return axe-core's serious and critical findings; none, with a warning, where AXE_CORE does not name it."""
+    """Return axe-core's serious and critical findings; none, with a warning, where there is no axe-core."""
     source = axe_source()
     if source is None:
-        warnings.warn("AXE_CORE does not name axe-core: accessibility is not checked", stacklevel=2)
+        warnings.warn("neither axe-core-python nor AXE_CORE: accessibility is not checked", stacklevel=2)
         return []
     driver.execute_cdp_cmd("Page.setBypassCSP", {"enabled": True})
     driver.execute_script(source)
@@ -127,3 +133,31 @@ def serious(driver: Any) -> list[str]:
         if one["impact"] in ("serious", "critical")
         for node in one["nodes"] or [{"html": ""}]
     ]
+
+
+def unreachable(driver: Any) -> list[str]:
+    """Return what can be used but is not reached with the Tab key, or does not show that it has the focus."""
+    count: int = driver.execute_script(
+        """
+        document.activeElement.blur();
+        const usable = "a[href], button, summary, input, select, textarea, [tabindex='0']";
+        const seen = [...document.querySelectorAll(usable)].filter(one => one.checkVisibility() && !one.disabled);
+        window.waiting = new Set(seen);
+        window.unseen = [];
+        document.addEventListener("focusin", event => {
+          const one = event.target, style = getComputedStyle(one);
+          window.waiting.delete(one);
+          const unseen = style.outlineStyle === "none" && style.boxShadow === "none";
+          if (unseen) window.unseen.push("no focus is seen: " + one.outerHTML.slice(0, 120));
+        });
+        return window.waiting.size;
+        """
+    )
+    for _ in range(count + 1):
+        for kind in ("rawKeyDown", "keyUp"):
+            key = {"type": kind, "key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+            driver.execute_cdp_cmd("Input.dispatchKeyEvent", key)
+    found: list[str] = driver.execute_script(
+        "return [...window.waiting].map(one => 'not reached: ' + one.outerHTML.slice(0, 120)).concat(window.unseen);"
+    )
+    return found

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import browser, clipped, console, look, serious
+from browser import browser, clipped, console, look, serious, unreachable
 from commands import fixed_run, json_of, words_of
 
 from pans.runtime.cli import main
@@ -132,4 +132,5 @@ def test_the_page_in_a_browser(runs: Path, tmp_path: Path) -> None:
             look(driver, width, dark=dark)
             assert clipped(driver) == []
             assert serious(driver) == []
+            assert unreachable(driver) == []
         assert console(driver) == []

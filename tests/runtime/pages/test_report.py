@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from automata import automaton_bundle, random_automaton
-from browser import browser, clipped, console, look, picture, serious
+from browser import browser, clipped, console, look, picture, serious, unreachable
 from commands import fixed_run, page_of, words_of
 
 from pans.runtime.bundle.model import load_bundle, write_bundle
@@ -174,6 +174,7 @@ def test_the_page_in_a_browser(demo: Path, tmp_path: Path, dark: bool) -> None:
             )
             assert set(driver.execute_script(shown)) == {form, "scroll"}
             assert serious(driver) == []
+            assert unreachable(driver) == []
         assert console(driver) == []
 
 
