@@ -87,11 +87,12 @@ class Measurement(Timetable):
         self._batch_first = 0
         self._before_batch = np.zeros(1, np.uint8)
         self.next_tick: int | None = None
+        self._mark_is_next = False
         self._schedule()
 
     def emit(self) -> StreamMessage:
         """Return the message that is due at `next_tick` and move on to the next one."""
-        if self._mark_tick is not None and self._mark_tick == self.next_tick:
+        if self._mark_is_next:
             mark = self._light.mark
             message: StreamMessage = Mark(*mark[:4], mark.tick + self._start_tick, *mark[5:])
             self._light.take_mark()
@@ -130,12 +131,13 @@ class Measurement(Timetable):
             self._cycle_tick += self._program.cycle_ticks
 
     def _schedule(self) -> None:
-        """A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first."""
+        """A block is due at its end, a mark at its tick; a block that ends where a mark is due goes first (protocol.md, section 5)."""
         if self._n_cycles is not None and self._cycle >= self._n_cycles:
             self.next_tick = None
             return
         end = self._cycle_tick + self._block_ends[self._block]
-        self.next_tick = end if self._mark_tick is None or end <= self._mark_tick else self._mark_tick
+        self._mark_is_next = self._mark_tick is not None and self._mark_tick < end
+        self.next_tick = self._mark_tick if self._mark_is_next else end
 
     def _message(self, first: int, count: int) -> ClickBlock:
         program = self._program

@@ -22,7 +22,6 @@ from pans.runtime.wire.messages import Frame, MessageType, Opcode
 
 MODES = ("sequential", "parallel", "device-driven", "host-driven")
 NONCE = 7
-STREAM = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler on this machine"
 )
@@ -74,10 +73,7 @@ class Pair:
         self.command(Opcode.ARM, pack_arm(Arm(self.tick + 5000, cycles, lease_ms)))
 
     def differences(self) -> list[str]:
-        """What the two have not said alike; the texts of refusals and of WELCOME are each device's own.
-
-        Of a block and a mark that are due at the same tick either may go first, so that these are compared without their sequence number.
-        """
+        """What the two have not said alike; the texts of refusals and of WELCOME are each device's own."""
         ours, theirs = (said(heard) for heard in self.heard)
         return [
             f"{kind:#04x}: {len(ours[kind])} and {len(theirs[kind])} messages, {first_difference(ours[kind], theirs[kind])}"
@@ -95,8 +91,6 @@ def said(heard: list[Frame]) -> defaultdict[int, list[bytes]]:
             payload = payload[:14]
         elif frame.type == MessageType.WELCOME:
             payload = payload[:8]
-        elif frame.type in STREAM:
-            payload = payload[4:]
         found[frame.type].append(payload)
     return found
 
