@@ -233,6 +233,13 @@ class Bench:
         self.listen(STEP_S)
         return start, self.stream(), closing
 
+    def start(self, layout: Layout) -> None:
+        """Upload, grant and arm without end; return when the device is RUNNING."""
+        self.upload(layout)
+        self.grant()
+        self.arm(0)
+        self.until_state(DeviceState.RUNNING)
+
     def wait_idle(self, within_s: float) -> Any:
         """Return the first STATUS that says IDLE."""
         return self.until_state(DeviceState.IDLE, within_s)

@@ -283,10 +283,7 @@ def books(bench: Bench) -> None:
 @rule("5.8", "STOP sends the exposures that have ended in a shorter block, and counts them.")
 def broken_off(bench: Bench) -> None:
     layout = bench.layout(block_exposures=3)
-    bench.upload(layout)
-    bench.grant()
-    bench.arm(0)
-    bench.until_state(DeviceState.RUNNING)
+    bench.start(layout)
     bench.listen(4.3 * layout.cycle_ticks / layout.tick_hz)
     bench.done(Opcode.STOP)
     status = bench.until_state(DeviceState.IDLE)

@@ -184,11 +184,7 @@ def flood(bench: Bench) -> None:
 
 @rule("6.6", "Answers are in time while the stream runs: a PING within 250 ms.")
 def probes_in_a_run(bench: Bench) -> None:
-    layout = bench.layout(block_exposures=1)
-    bench.upload(layout)
-    bench.grant()
-    bench.arm(0)
-    bench.until_state(DeviceState.RUNNING)
+    bench.start(bench.layout(block_exposures=1))
     answered = 0
     for _ in range(16):
         try:
