@@ -63,3 +63,14 @@ def keep_freed_memory() -> None:
 def new_generator(seed: int) -> torch.Generator:
     """Return a generator of random numbers on the chosen device."""
     return torch.Generator(device=torch.get_default_device()).manual_seed(seed)
+
+
+def product_dtype() -> torch.dtype:
+    """Return the type of training's matrix products: bfloat16 where the device multiplies it fast, else float32.
+
+    Grey values and one-bit patterns are exact in it, sums are float32; final figures are always float32 or wider.
+    """
+    if torch.get_default_device().type == "cuda":
+        return torch.bfloat16
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return torch.bfloat16 if supported is not None and supported() else torch.float32

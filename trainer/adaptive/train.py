@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
-from pans.trainer.device import new_generator
+from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
@@ -393,14 +393,3 @@ class _Run:
         self.machine = machine_from(state["machine"])
         self.saved_tuning = state["tuning"]
         self.answers = None if state["answers"] is None else state["answers"].numpy()
-
-
-def product_dtype() -> torch.dtype:
-    """Return the type of training's matrix products: bfloat16 where the device multiplies it fast, else float32.
-
-    Grey values and one-bit patterns are exact in it, sums are float32; final figures are always float32 or wider.
-    """
-    if torch.get_default_device().type == "cuda":
-        return torch.bfloat16
-    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return torch.bfloat16 if supported is not None and supported() else torch.float32

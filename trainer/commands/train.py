@@ -96,45 +96,8 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         choices=(*ENCODERS, AUTOMATON),
         help="how light meets the object (default: what the task's is); automaton: each pattern follows from the clicks before it",
     )
-    parser.add_argument(
-        "--exposures", type=int, metavar="T", help="of an automaton: exposures per decision (default: by the budget)"
-    )
-    parser.add_argument(
-        "--states", type=int, metavar="S", help="of an automaton: most states per exposure (default: by the budget)"
-    )
-    parser.add_argument(
-        "--patterns",
-        type=int,
-        metavar="P",
-        help="of an automaton: most different patterns, which states share (default: the projector's memory)",
-    )
-    parser.add_argument(
-        "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"
-    )
-    parser.add_argument(
-        "--teacher",
-        type=Path,
-        metavar="FILE.npz",
-        help="of an automaton: the network's answers are read from there; where nothing is, they are made and kept there",
-    )
-    parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
-    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
-    parser.add_argument(
-        "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
-    )
-    parser.add_argument(
-        "--head", choices=HEADS, help="digital back end (default mlp; picture where the task asks for it)"
-    )
-    light = parser.add_mutually_exclusive_group()
-    light.add_argument(
-        "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
-    )
-    light.add_argument("--photons", type=float, metavar="B", help="photoelectrons per decision to aim for")
-    parser.add_argument(
-        "--budget",
-        choices=tuple(BUDGETS),
-        help="how strictly --photons and --clicks hold during training (default firm)",
-    )
+    _add_of_automata(parser)
+    _add_of_fixed(parser)
     defaults = {field.name: field.default for field in fields(Options)}
     for name, metavar, words in NUMBERS:
         flag, default = "--" + name.replace("_", "-"), defaults.get(name)
@@ -159,6 +122,52 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
     add_force(parser)
+
+
+def _add_of_automata(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--exposures", type=int, metavar="T", help="of an automaton: exposures per decision (default: by the budget)"
+    )
+    parser.add_argument(
+        "--states", type=int, metavar="S", help="of an automaton: most states per exposure (default: by the budget)"
+    )
+    parser.add_argument(
+        "--patterns",
+        type=int,
+        metavar="P",
+        help="of an automaton: most different patterns, which states share (default: the projector's memory)",
+    )
+    parser.add_argument(
+        "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"
+    )
+    parser.add_argument(
+        "--teacher",
+        type=Path,
+        metavar="FILE.npz",
+        help="of an automaton: the network's answers are read from there; where nothing is, they are made and kept there",
+    )
+
+
+def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
+    """Optics, estimator and head; the budget of light, which automata have too."""
+    parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
+    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
+    parser.add_argument(
+        "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
+    )
+    parser.add_argument(
+        "--head", choices=HEADS, help="digital back end (default mlp; picture where the task asks for it)"
+    )
+    light = parser.add_mutually_exclusive_group()
+    light.add_argument(
+        "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
+    )
+    light.add_argument("--photons", type=float, metavar="B", help="photoelectrons per decision to aim for")
+    parser.add_argument(
+        "--budget",
+        choices=tuple(BUDGETS),
+        help="how strictly --photons and --clicks hold during training (default firm)",
+    )
 
 
 def _train(args: argparse.Namespace) -> int:
