@@ -1,42 +1,38 @@
 """From a trained automaton to a bundle, with the proof that the bundle walks as the model does, and what it is expected to achieve.
 
-Owns the bundle's facts, the comparison and the figures of the held-out objects; never trains. `export_automaton` writes the file, reads it
-back and raises when the file's walks differ from the model's. All figures are exact expectations, SIMULATED through the profile.
+Owns the bundle's facts and the comparison; never trains, and takes the figures of the held-out objects from the package evaluate.
+`export_automaton` writes the file, reads it back and raises when the file's walks differ from the model's. All figures are exact
+expectations, SIMULATED through the profile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import reachable_automaton
 from pans.runtime.bundle.model import Bundle, Shown, load_bundle, make_bundle, with_expected, write_bundle
 from pans.runtime.bundle.walks import walk_nodes
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.expectation import ExpectedWalk, expected_walk
+from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PansError
-from pans.runtime.instrument.click_law import click_law, object_transmission
+from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
-from pans.trainer.adaptive.posteriors import calibration_error
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.model.exposure import exposure_us_of
+from pans.trainer.evaluate.accuracy import law_of
+from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
 from .writer import origin, programs
 
 COMPARED_OBJECTS = 100
 TOLERANCE = 1e-5  # of chances and of relative light: posteriors are stored in float32
-FIRST = 200  # the held-out objects that the paper judges by
-AT_ONCE = 1000
 SAMPLED_WALKS = 1000
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,24 +73,15 @@ def export_automaton(
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
     difference = compare_walks(bundle, trained, task, profile)
-    walked = measure_walks(bundle, task.test, profile, trained.options.dark)
-    measured = walked.figures()
-    expected = {
-        "profile": profile.name,
-        "task": task.name,
-        "split": "test",
-        "objects": len(task.test),
-        "accuracy": measured.accuracy_mean,
-        "clicks": measured.clicks_mean,
-        "photons": measured.photons_mean,
-        "illumination": measured.illumination,
-        "exposures": measured.exposures_mean,
-    }
+    dark = trained.options.dark
+    found = measured_walks(walks_of(bundle, profile, task.test.images, task.test.labels, dark=dark))
+    first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
+    expected = expected_figures(found, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
         write_bundle(with_expected(bundle, expected), unchecked)
         written, digest = load_bundle(unchecked)
         compare_decider(written, trained.options.seed)
-    return ExportedAutomaton(written, digest, measured, walked.figures(FIRST), difference)
+    return ExportedAutomaton(written, digest, walk_figures(found), first, difference)
 
 
 def bundle_of(
@@ -125,67 +112,14 @@ def bundle_of(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Walked:
-    """Per object: clicks, photons, illumination, exposures (n, 4), the chance of a right decision (n,); per leaf its
-    posterior."""
-
-    light: F64
-    right: F64
-    labels: NDArray[np.int64]
-    leaf_of: list[F64]
-    posteriors: NDArray[np.float32]
-
-    def figures(self, count: int | None = None) -> WalkFigures:
-        """Return the means over the first `count` objects, or all."""
-        right, n = self.right[:count], len(self.right[:count])
-        clicks, photons, illumination, exposures = (float(mean) for mean in self.light[:count].mean(axis=0))
-        error = float(right.std(ddof=1) / n**0.5) if n > 1 else 0.0
-        calibration = _calibration(self, n)
-        return WalkFigures(n, float(right.mean()), error, clicks, photons, illumination, exposures, calibration)
-
-
-def _calibration(walked: Walked, n: int) -> float:
-    arrived = np.zeros(walked.posteriors.shape)
-    first = 0
-    for leaves in walked.leaf_of:
-        part = leaves[: max(0, n - first)]
-        labels = walked.labels[first : first + len(part)]
-        arrived += part.T @ (labels[:, None] == np.arange(walked.posteriors.shape[1])).astype(np.float64)
-        first += len(leaves)
-    return calibration_error(walked.posteriors.astype(np.float64), arrived)
-
-
-def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> Walked:
+def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> WalkFigures:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
-    automaton = bundle.automaton
-    assert automaton is not None
-    posteriors = automaton.posteriors[automaton.n_states :]
-    decided = posteriors.argmax(axis=1)
-    light, right, leaves = [], [], []
-    for first in range(0, len(objects), AT_ONCE):
-        part = objects.images[first : first + AT_ONCE]
-        found = _expected(bundle, part, profile, dark, profile.detector.afterpulse_probability)
-        labels = objects.labels[first : first + AT_ONCE]
-        light.append(np.stack([found.clicks, found.photons, found.illumination, found.exposures], axis=1))
-        right.append((found.leaves * (decided == labels[:, None])).sum(axis=1))
-        leaves.append(found.leaves)
-    return Walked(np.concatenate(light), np.concatenate(right), objects.labels, leaves, posteriors)
+    return walk_figures(measured_walks(walks_of(bundle, profile, objects.images, objects.labels, dark=dark)))
 
 
-def _expected(
-    bundle: Bundle, images: NDArray[np.uint8], profile: Profile, dark: float | None, afterpulse: float = 0.0
-) -> ExpectedWalk:
-    assert bundle.automaton is not None
-    law = click_law(
-        profile, max(profile.exposure.min_us, exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1)))
-    )
-    if dark is not None:
-        law = type(law)(dark, law.read_noise_e, law.threshold_e)
-    flat = images.reshape(len(images), -1)
-    transmission = object_transmission(profile, flat)
-    levels, scale = bundle.pattern_levels, bundle.photons_per_level
-    return expected_walk(bundle.automaton, levels, transmission, law, scale, afterpulse=afterpulse)
+def walk_figures(found: MeasuredWalks) -> WalkFigures:
+    """Return of the figures of `pans evaluate` those that an export names; every walk must have decided."""
+    return WalkFigures(**{field.name: getattr(found, field.name) for field in fields(WalkFigures)})
 
 
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
@@ -194,8 +128,10 @@ def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile
     Both without afterpulses, which no training knows.
     """
     objects = task.test.first(COMPARED_OBJECTS)
-    found = _expected(bundle, objects.images, profile, trained.options.dark)
     assert bundle.automaton is not None
+    law = law_of(bundle, profile, dark=trained.options.dark)
+    seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
+    found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level)
     of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
     wanted, photons = trained.chances(objects)
     difference = float(np.abs(of_class - wanted).max())

@@ -41,8 +41,8 @@ def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any]
         seconds = _train(asked, path, task, options)
     bundle, digest = load_bundle(path)
     assert bundle.automaton is not None
-    walked = measure_walks(bundle, task.test, load_profile(PROFILE))
-    whole, first = asdict(walked.figures()), asdict(walked.figures(FIRST_OBJECTS))
+    profile = load_profile(PROFILE)
+    whole, first = (asdict(measure_walks(bundle, task.test.first(count), profile)) for count in (None, FIRST_OBJECTS))
     facts: Row = {"sha256": digest, "states": bundle.automaton.n_states, "patterns_shown": len(bundle.pattern_levels)}
     seconds = bundle.provenance.get("training_seconds") if seconds is None else seconds
     return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}

@@ -53,7 +53,7 @@ def profile_of(name, **changes):
 
 
 def test_learns_the_bars_within_its_budget(task, trained):
-    found = measure_walks(export_bundle(trained, task), task.test, IDEAL).figures()
+    found = measure_walks(export_bundle(trained, task), task.test, IDEAL)
     assert found.accuracy_mean > 0.7  # four classes: 0.25 by chance
     assert found.photons_mean < 4.0 * 1.05
     assert trained.held_back.photons == pytest.approx(0.99 * 4.0, rel=0.06)  # of 66 objects
@@ -106,8 +106,8 @@ def test_an_interrupted_training_ends_at_the_same_automaton(task, trained, tmp_p
 def test_a_price_per_exposure_ends_walks_early(task, trained):
     found = train_automaton(task, IDEAL, replace(SMALL, exposure_price=0.03))
     bundle = export_bundle(found, task)
-    walked = measure_walks(bundle, task.test, IDEAL).figures()
-    whole = measure_walks(export_bundle(trained, task), task.test, IDEAL).figures()
+    walked = measure_walks(bundle, task.test, IDEAL)
+    whole = measure_walks(export_bundle(trained, task), task.test, IDEAL)
     assert whole.exposures_mean == pytest.approx(6.0)
     assert walked.exposures_mean < 5.5
     assert walked.exposures_mean == pytest.approx(found.held_back.exposures, rel=0.1)  # of 66 objects
@@ -203,7 +203,7 @@ def test_contrast_and_read_noise_of_a_profile_are_trained_through(task):
     trained = train_automaton(task, profile, SMALL)
     bundle = export_bundle(trained, task, profile)
     compare_walks(bundle, trained, task, profile)
-    found = measure_walks(bundle, task.test, profile).figures()
+    found = measure_walks(bundle, task.test, profile)
     assert found.accuracy_mean > 0.6
     assert found.clicks_mean == pytest.approx(trained.held_back.clicks, rel=0.1)
 
