@@ -167,7 +167,11 @@ def status(words: list[str]) -> int:
         return int(end.code or 0)
 
 
-@pytest.mark.parametrize("page", pages("tutorial", "how-to", "reference", "explanation"), ids=lambda page: f"{page.parent.name}/{page.stem}")
+@pytest.mark.parametrize(
+    "page",
+    pages("tutorial", "how-to", "reference", "explanation"),
+    ids=lambda page: f"{page.parent.name}/{page.stem}",
+)
 def test_no_sentence_of_a_page_is_too_long(page: Path) -> None:
     long = [sentence for sentence in sentences(page) if len(sentence.split()) > MOST_WORDS]
     assert not long, "\n".join(long)

@@ -23,8 +23,8 @@ BEYOND = {"2.8", "4.20"}  # no link can show them
 SOUND = ("1.1", "2.1", "4.1", "5.2", "6.1")  # rules that none of the faults touches
 # Faults in copies of the C sources: file, what stands there, what takes its place; and the rules that must find each.
 FAULTS = {
-    "the lease lasts a hundred times as long": (
-        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + 100 * ticks;", {"4.16", "4.17", "4.18"},
+    "the lease lasts a fifth longer": (
+        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks + ticks / 5;", {"4.16"},
     ),
     "a repeated command is carried out": (
         "device.c", "if (id == d->ack.last + 1) {", "if (id == d->ack.last + 1 || id == d->ack.last) {", {"4.2"},
@@ -36,6 +36,10 @@ FAULTS = {
         "return true;",
         {"1.2", "1.3"},
     ),
+    "the lease lasts a fifth less": (
+        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks - ticks / 5;", {"4.16"},
+    ),
+    "drops are counted twice": ("stream.c", "s->drops += exposures;", "s->drops += 2 * exposures;", {"5.7"}),
     "the window is ignored": (
         "stream.c",
         "return s->held != 0 && ahead != 0 && ahead < 0x80000000u;",

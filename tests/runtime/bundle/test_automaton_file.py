@@ -7,6 +7,7 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,17 @@ import pytest
 from automata import automaton_bundle, diamond, early_leaf, random_automaton
 from bundles import made_bundle
 
-from pans.runtime.bundle import Automaton, Bundle, bundle_bytes, load_bundle, parse_bundle, with_expected, write_bundle
+from pans.runtime.bundle import (
+    Automaton,
+    Bundle,
+    automaton_file,
+    bundle_bytes,
+    facts,
+    load_bundle,
+    parse_bundle,
+    with_expected,
+    write_bundle,
+)
 from pans.runtime.bundle.automaton_file import PARTS
 from pans.runtime.errors import DamagedFileError
 
@@ -197,3 +208,17 @@ def test_every_byte_counts() -> None:
         changed[at] ^= 4
         with pytest.raises(DamagedFileError):
             parse_bundle(bytes(changed), "here")
+
+
+@pytest.mark.parametrize("place", [automaton_file, facts])
+def test_patterns_beyond_the_budget_are_refused_before_they_are_unpacked_and_after(
+    place: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bundle = automaton_bundle(random_automaton(3))
+    data, cells = bundle_bytes(bundle), bundle.pattern_levels.size
+    for name, limit in (("PATTERN_CELLS_MAX", cells - 1), ("PATTERNS_MAX", len(bundle.pattern_levels) - 1)):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, name, limit)
+            with pytest.raises(DamagedFileError, match=str(limit)):
+                parse_bundle(data, "x")
+    parse_bundle(data, "x")

@@ -14,8 +14,10 @@ import pytest
 from bundles import made_bundle
 from heads import affine_head
 
+from pans.runtime.bundle import facts, onnx_file
 from pans.runtime.bundle import format as bundle_format
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle, word_means, write_bundle
+from pans.runtime.bundle.onnx_check import check_head
 from pans.runtime.errors import DamagedFileError, UsageError
 
 
@@ -195,6 +197,39 @@ def test_limits_come_before_allocation(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(bundle_format, "FILE_MAX_BYTES", 100)
     with pytest.raises(UsageError, match="allowed"):
         bundle_bytes(small_bundle())
+
+
+HEADED = small_bundle(head_onnx=random_head(2, 2)[0], table=None)
+BUDGETS = {  # of the format: a limit that a sound bundle is just beyond, and what is said of it
+    ("FEATURES_MAX", 1): (HEADED, "2 patterns, allowed: 1 to 1"),
+    ("PIXELS_MAX", 2): (HEADED, "3 pixels, allowed: 1 to 2"),
+    ("CLASSES_MAX", 1): (HEADED, "2 classes, allowed: 2 to 1"),
+    ("TABLE_FEATURES_MAX", 1): (small_bundle(), "a table for 2 patterns, allowed at most 1"),
+    ("HEAD_MAX_BYTES", 50): (HEADED, r"the head has \d+ bytes, allowed: 1 to 50"),
+    ("GOLDEN_MAX", 3): (HEADED, r"\d+ golden vectors, allowed: 1 to 3"),
+    ("GOLDEN_MEANS_MAX", 7): (HEADED, r"golden_means holds \d+ numbers, allowed at most 7"),
+    ("GOLDEN_SCORES_MAX", 7): (HEADED, r"golden_scores holds \d+ numbers, allowed at most 7"),
+    ("GOLDEN_WORK_MAX", 15): (HEADED, r"\d+ multiply-adds for the golden vectors, allowed: 15"),
+}
+
+
+@pytest.mark.parametrize(("name", "limit"), BUDGETS)
+def test_what_is_beyond_a_budget_is_refused(name: str, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    bundle, words = BUDGETS[name, limit]
+    data = bundle_bytes(bundle)
+    parse_bundle(data, "x")
+    monkeypatch.setattr(facts, name, limit)
+    with pytest.raises(DamagedFileError, match=words):
+        parse_bundle(data, "x")
+
+
+def test_a_model_beyond_its_bytes_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    head = random_head(2, 2)[0]
+    monkeypatch.setattr(onnx_file, "MODEL_MAX_BYTES", len(head))
+    check_head(head, 2, 2)
+    monkeypatch.setattr(onnx_file, "MODEL_MAX_BYTES", len(head) - 1)
+    with pytest.raises(ValueError, match=f"{len(head)} bytes, allowed: 1 to {len(head) - 1}"):
+        check_head(head, 2, 2)
 
 
 @pytest.mark.parametrize(

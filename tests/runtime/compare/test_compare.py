@@ -38,6 +38,10 @@ def test_the_same_objects_are_paired_and_counted(runs: Path, capsys: pytest.Capt
     assert rows["accuracy"]["difference"] == pytest.approx((better - worse) / 80)
     assert rows["clicks_mean"]["significant"]
     assert rows["clicks_mean"]["first"] == pytest.approx(first["clicks"].mean())
+    least = min((row for row in found["findings"] if row["p"] is not None), key=lambda row: row["p"])
+    tested = sum(row["p"] is not None for row in found["findings"])
+    assert tested > 1
+    assert least["p_corrected"] == pytest.approx(min(1.0, tested * least["p"]))  # Holm's first step is Bonferroni's
     changed = {row["name"]: (row["first"], row["second"]) for row in found["changes"]}
     assert changed["config.shots"] == ("1", "4")
     assert not any(name.startswith(("bundle", "profile")) for name in changed)
@@ -57,6 +61,11 @@ def test_samples_where_nothing_says_that_the_objects_are_the_same(runs: Path) ->
     first, second = read_side(runs / "a"), read_side(runs / "b")
     assert first.decisions is not None
     assert compare(first, second).paired
+    told = {"created_utc": "2036-01-01T00:00:00", "part": {"number": 2}}
+    told["profile"] = {**second.header["profile"], "toml": "# other words"}
+    later = replace(second, header={**second.header, **told})
+    names = {change.name for change in compare(first, later).changes}
+    assert names == {"device_url", "device.name", "device.seed", "device.serial"}  # no date, no hash of its own
     assert "80 and 80 distinct objects" in compare(first, second, "different").findings[0].method
     real = replace(first, header={**first.header, "device_url": "serial:/dev/ttyACM0"})
     assert "--objects same" in compare(real, second).why
