@@ -1,7 +1,7 @@
 """What bundles and recordings have in common on disk: strict JSON, reading within limits, chained blocks.
 
 Owns the byte framing and its limits; never knows what a part or a block means. Readers take bytes or an open file and
-raise DamagedFileError; files are created by outputs.py.
+raise DamagedFileError; files are created by outputs.py. Whoever shows how far a long file has been read is within `watching_blocks`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import os
 import stat
 import struct
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +23,9 @@ MIB = 1 << 20
 FILE_MAX_BYTES = 64 * MIB  # of a bundle: its arrays, its sessions and the program stay below 400 MiB together
 JSON_DEPTH_MAX = 64  # our own headers need about six
 JSON_VALUES_MAX = 1 << 18  # values take up to 250 bytes each once they are read
+
+BlockWatcher = Callable[[str, int, int, int], None]
+_watchers: list[BlockWatcher] = []
 
 
 def canonical_json(value: Any) -> bytes:
@@ -242,7 +246,19 @@ def read_block(file: BinaryIO, index: int, chain: int, limits: Mapping[int, int]
     payload_crc = zlib.crc32(payload, header_crc)
     if _CRC.unpack(tail)[0] != payload_crc:
         raise DamagedFileError(f"{place}: altered (its payload of {length} bytes does not fit its checksum)")
+    for watcher in _watchers:
+        watcher(where, id(file), file.tell(), os.fstat(file.fileno()).st_size)
     return Block(index, kind, payload, file.tell(), payload_crc)
+
+
+@contextmanager
+def watching_blocks(watcher: BlockWatcher) -> Iterator[None]:
+    """Call `watcher` after every block that is read within the context: (file, number of the pass over it, bytes so far, size in bytes)."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
 
 
 def _only_zeros_follow(file: BinaryIO) -> bool:

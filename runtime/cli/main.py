@@ -21,6 +21,7 @@ from .finding import find_commands, load_command, missing_extra
 from .first_sign import first_sign
 from .overview import overview
 from .parser import parser_of
+from .reading_bar import reading_bar
 from .talk import begin, fail, has_answered, note
 
 _REMEDIES = {
@@ -80,7 +81,8 @@ def _logged(command: Command, args: argparse.Namespace, words: Sequence[str]) ->
     """Run the command; its log has the words at the begin, and at the end the exit code or the error."""
     LOGGER.info("begins: %s", shlex.join(["pans", *words]))
     try:
-        code = command.run(args)
+        with reading_bar():
+            code = command.run(args)
     except BaseException as error:
         LOGGER.error("ends by an error: %s: %s", type(error).__name__, error)
         raise
