@@ -78,3 +78,4 @@ class RunResult:
     states_shown: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # exposures of each state
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
+    page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too

@@ -32,6 +32,7 @@ from pans.runtime.link.scene_fit import check_scene
 from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
+from pans.runtime.timing.page_faults import ThreadCounts
 
 from .config import RunConfig, RunResult
 from .continuous import INTERRUPTED, REFUSED, Stop
@@ -90,10 +91,11 @@ def run_live(
             busy_core(None if link.virtual else config.core) as awake,
             arm_realtime(wanted, [] if reader is None else [reader]) as granted,
         ):
-            run.realtime = granted | awake
+            run.realtime, counts = granted | awake, ThreadCounts()
             try:
                 if observers.prepared is not None:
                     observers.prepared(run)
+                counts.restart()
                 run.arm()
                 _until_ended(run, recovery, prepare, observers)
             except KeyboardInterrupt as interrupt:
@@ -102,6 +104,7 @@ def run_live(
                 run.drop_recorder()
                 raise
             finally:  # whatever went wrong: light off first
+                run.page_faults = counts.since()
                 run.stop()
         return _result(run, profile)
     finally:
@@ -169,6 +172,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         decoder=dict(run.decoded),
         clock={} if fit is None else {"drift_ppm": fit.drift_ppm, "uncertainty_us": fit.uncertainty_ns / 1000},
         realtime=run.realtime,
+        page_faults=run.page_faults,
         device=device,
         slot_jitter_us=run.core.jitter_ticks * run.plan.tick_us,
         wrong_patterns=int(tallies[WRONG_PATTERNS]),

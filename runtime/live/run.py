@@ -77,6 +77,7 @@ class LiveRun:
             self.driver = HostDriver(core, WalkPlace(plan, plan.automaton))
         self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
+        self.page_faults: dict[str, int] = {}  # of the loop's thread while armed
         self.ended = ""
         self.link_lost = False
         self.reconnects = 0

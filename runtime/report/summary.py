@@ -68,6 +68,7 @@ class Summary:
     link: dict[str, int]
     contradictions: dict[str, int]  # what the evidence excludes, by what is wrong; malformed messages too
     realtime: dict[str, Any]
+    page_faults: dict[str, int]  # of the loop's thread while armed, and how often its core was taken away
     device: dict[str, Any]
     armed_after_s: float
     seconds: float
@@ -142,6 +143,7 @@ def summarise(
         link=result.decoder,
         contradictions=contradictions_of(result),
         realtime=result.realtime,
+        page_faults=result.page_faults,
         device=_plain_device(result.device),
         armed_after_s=result.armed_after_s,
         seconds=result.seconds,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.outputs import write_file
 from pans.runtime.safe_text import markdown
+from pans.runtime.timing.page_faults import fault_words
 
 from .summary import Summary
 from .words import flow_rows, is_unresolved, walk_rows
@@ -111,6 +112,7 @@ def _timing(summary: Summary) -> list[str]:
         f"drift {summary.clock.get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary.slot_jitter_us:.1f} us",
         f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {markdown(summary.ended)}",
         f"- real-time set-up: {granted}",
+        f"- page faults of the loop while armed: {fault_words(summary.page_faults)}",
     ]
     return head + table + tail
 

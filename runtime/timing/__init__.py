@@ -16,6 +16,7 @@ from .clock import ClockModel
 from .cpu import busy_core
 from .evidence import Evidence
 from .ledger import LatencyHistogram, TimingLedger, arm_realtime, frozen_heap
+from .page_faults import ThreadCounts
 
 __all__ = [
     "ClockModel",
@@ -24,6 +25,7 @@ __all__ = [
     "LateAttribution",
     "LatencyHistogram",
     "MissingAttribution",
+    "ThreadCounts",
     "TimingLedger",
     "arm_realtime",
     "busy_core",

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from commands import fixed_run, json_of
 
-MEASURED = ("armed_after_s", "realtime", "recording", "report")  # of this machine and this run
+MEASURED = ("armed_after_s", "realtime", "page_faults", "recording", "report")  # of this machine and this run
 
 
 def of_a_flow(folder: Path) -> tuple[str, ...]:
