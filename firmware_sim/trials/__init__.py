@@ -57,6 +57,9 @@ TRIALS: Mapping[str, TrialEntry] = {
         ".kills", "hosts that are killed: the light goes off, and what was acted upon is on record", "3 min"
     ),
     "light-level": TrialEntry(".light_level", "the light watch on simulated decisions", "1 min"),
+    "pace": TrialEntry(
+        ".pace", "real pace: objects at 1000/s, the demo beside a busy core, automata to 100 kHz", "15 min"
+    ),
     "soak": TrialEntry(".soak", "half an hour of real time with faults on, watched from outside", "30 min"),
 }
 

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from pans.firmware_sim.ports.faulty import FaultyDevice, Schedule
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.shell import open_port, serve
+from pans.firmware_sim.probes.processes import say, sleep_until
 from pans.firmware_sim.testing import N_PATTERNS, small_bundle
 from pans.runtime.bundle.model import Bundle, bundle_bytes
 from pans.runtime.core.decision import Output
@@ -32,8 +33,6 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
 from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
 from pans.runtime.record import Recorder
-
-from .processes import say, sleep_until
 
 HOST_CORE, INSTRUMENT_CORE = 0, 1
 HOG_PRIORITY = 60  # above all that runs here but the process that keeps the script

@@ -26,13 +26,13 @@ from pathlib import Path
 from typing import Any
 
 from pans.firmware_sim.options import option
+from pans.firmware_sim.probes.processes import Child, has_real_time, sleep_until
+from pans.firmware_sim.probes.scheduling_probe import SchedulingProbe
 from pans.runtime.errors import UsageError
 from pans.runtime.record import read_recording
 
 from . import Report, Trial, figures_text
 from .cause_processes import HOST_CORE, INSTRUMENT_CORE, Injection
-from .processes import Child, has_real_time, sleep_until
-from .scheduling_probe import SchedulingProbe
 
 KINDS = ("link", "device", "host", "gc", "disk", "inference")
 NAMED_RIGHTLY = 0.95
@@ -100,11 +100,14 @@ def run_all(script: list[Injection], listen: str, folder: Path, seed: int) -> tu
     """Make every cause of `script`; return the start time, what the host says of its run, and its recording."""
     plan_file, recording = folder / "script.json", folder / "causes.pansrec"
     plan_file.write_text(json.dumps(script))
-    children, probes = [Child("cause_processes", "instrument", plan_file, listen, seed)], list[SchedulingProbe]()
+    children, probes = (
+        [Child(f"{__package__}.cause_processes", "instrument", plan_file, listen, seed)],
+        list[SchedulingProbe](),
+    )
     try:
         url = children[0].said()["url"]
-        children.append(Child("cause_processes", "host", url, plan_file, recording))
-        children.append(Child("cause_processes", "hog", plan_file))
+        children.append(Child(f"{__package__}.cause_processes", "host", url, plan_file, recording))
+        children.append(Child(f"{__package__}.cause_processes", "hog", plan_file))
         for core in (HOST_CORE, INSTRUMENT_CORE):
             probes.append(SchedulingProbe(core, PROBE_PRIORITY, PROBE_EVERY_US, PROBE_LATE_US))
         host = children[1].said()

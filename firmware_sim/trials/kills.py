@@ -29,6 +29,7 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.ports.shell import TcpPort, serve
+from pans.firmware_sim.probes.processes import PATIENCE_S, wait_until
 from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
@@ -43,7 +44,6 @@ from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
 
 from . import Report, Trial, figures_text
-from .processes import PATIENCE_S, wait_until
 
 LEASE_MS = 200
 WALL_SLACK_MS = 50.0  # the simulator is woken by the operating system; in device ticks there is no slack

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from pans.firmware_sim.options import option
+from pans.firmware_sim.probes.processes import start_command, wait_until
 from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 from pans.runtime.record import read_recording, replay
@@ -29,7 +30,6 @@ from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
 
 from . import Report, Trial, figures_text
-from .processes import start_command, wait_until
 
 PROFILE, SCENE, BUNDLE = "oled-qcmos", "fashion200", "fashion10.pans"
 FAULTS = (

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -38,6 +38,7 @@ BUSY_PROCESSES = 2
 BUSY = "while True: sum(range(10000))"
 SAMPLE_EVERY_S = 0.5
 RECOVER_S = 30.0
+NO_TURNS: Mapping[str, float] = {}
 
 
 def bench_loop(options: BenchOptions) -> list[Row]:
@@ -70,7 +71,7 @@ def _run(asked: _Asked, seconds: float, load: bool) -> Row:
     bundle, slot_us, realtime, drive = asked
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
-        profile = _profile(bundle, slot_us, path)
+        profile = slot_profile(bundle, slot_us, path)
         plan = build_plan(profile, bundle, drive=drive)
         core = Core(plan, make_decider(bundle), 1, 0)
         others = _children()
@@ -188,11 +189,18 @@ def _children() -> set[int]:
     return found
 
 
-def _profile(bundle: Bundle, slot_us: float, path: Path) -> Profile:
-    """The ideal profile with the bundle's levels, and with light that makes one exposure last a slot; written to `path`."""
+def slot_profile(bundle: Bundle, slot_us: float, path: Path, turns_us: Mapping[str, float] = NO_TURNS) -> Profile:
+    """Return the ideal profile with the bundle's levels and with light that makes one exposure last `slot_us`; written to `path`.
+
+    `turns_us` are keys of [timing]: how long the host or the device has for its turn between two exposures.
+    """
     peak_hz = bundle.photons_per_level * (bundle.levels - 1) / (slot_us * 1e-6)
     text = load_profile("ideal").text
-    for old, new in (("10_000.0\n", f"{peak_hz!r}\n"), ("levels = 65_536", f"levels = {bundle.levels}")):
+    lines = "".join(f"{name} = {turn_us!r}\n" for name, turn_us in turns_us.items())
+    if "host_turn_us" in turns_us:
+        text = text.replace("host_turn_us = 1000.0\n", "", 1)
+    changes = (("10_000.0\n", f"{peak_hz!r}\n"), ("levels = 65_536", f"levels = {bundle.levels}"))
+    for old, new in (*changes, ("[timing]\n", f"[timing]\n{lines}")):
         text = text.replace(old, new, 1)
     path.write_text(text)
     return parse_profile(text, str(path))

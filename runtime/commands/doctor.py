@@ -10,7 +10,7 @@ from dataclasses import asdict
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
 
-from .doctor_checks import examine, schemes, serial_ports, udev_rule, usb_devices
+from .doctor_checks import Finding, examine, schemes, serial_ports, udev_rule, usb_devices
 
 
 def _configure_devices(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +31,9 @@ def _configure_doctor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--udev", action="store_true", help="print the udev rule that gives access to instruments, and end"
     )
+    parser.add_argument(
+        "--realtime", action="store_true", help="measure for about 10 s what each real-time setting brings here"
+    )
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -38,6 +41,8 @@ def _doctor(args: argparse.Namespace) -> int:
         emit(args, {"udev": udev_rule()}, udev_rule().rstrip())
         return EXIT_FINE
     findings = examine()
+    if args.realtime:
+        return _realtime(args, findings)
     lines = []
     for finding in findings:
         mark = "ok" if finding.ok else "FAIL" if finding.needed else "note"
@@ -47,6 +52,18 @@ def _doctor(args: argparse.Namespace) -> int:
     broken = [finding.check for finding in findings if finding.needed and not finding.ok]
     lines.append(f"{'cannot run: ' + ', '.join(broken) if broken else 'ready to run'}")
     emit(args, {"findings": [asdict(finding) for finding in findings], "ready": not broken}, "\n".join(lines))
+    return EXIT_ALERT if broken else EXIT_FINE
+
+
+def _realtime(args: argparse.Namespace, findings: list[Finding]) -> int:
+    from .doctor_realtime import findings_of, measure, payload_of, settings_of, table_text
+
+    machine, found = measure()
+    rows = settings_of(machine, found)
+    broken = [finding.check for finding in findings if finding.needed and not finding.ok]
+    told = [asdict(finding) for finding in [*findings, *findings_of(rows)]]
+    payload = {"findings": told, "ready": not broken, "realtime": payload_of(rows, found)}
+    emit(args, payload, table_text(rows, found))
     return EXIT_ALERT if broken else EXIT_FINE
 
 
@@ -62,6 +79,7 @@ DOCTOR = Command(
     _doctor,
     examples=(
         "pans doctor",
+        "pans doctor --realtime",
         "pans doctor --udev | sudo tee /etc/udev/rules.d/70-pans.rules",
     ),
 )

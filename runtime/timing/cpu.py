@@ -11,13 +11,18 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 from pans.runtime.errors import UsageError
+
+from .machine import read_machine
+
+LOOK_EVERY_S = 0.0005  # whether the spinner spins
 
 
 def check_core(core: int | None) -> None:
@@ -26,9 +31,24 @@ def check_core(core: int | None) -> None:
         return
     if not hasattr(os, "sched_setaffinity"):
         raise UsageError(f"--core {core}: this system cannot pin threads to cores", remedy="leave --core out")
-    allowed = sorted(os.sched_getaffinity(0))
+    allowed = usable_cores()
     if core not in allowed:
         raise UsageError(f"--core {core}, allowed: {', '.join(map(str, allowed))}")
+
+
+def usable_cores() -> list[int]:
+    """Return the cores on which this process may run or can be bound to: isolated ones are not in its mask, and yet allowed."""
+    mask = os.sched_getaffinity(0)
+    return sorted(mask | {core for core in read_machine().isolated if _can_be_bound(core, mask)})
+
+
+def _can_be_bound(core: int, mask: set[int]) -> bool:
+    try:
+        os.sched_setaffinity(0, {core})
+    except OSError:  # a container's cpuset leaves it out
+        return False
+    os.sched_setaffinity(0, mask)
+    return True
 
 
 @contextmanager
@@ -52,40 +72,44 @@ def busy_core(core: int | None) -> Iterator[dict[str, Any]]:
 
 
 class _Spinner:
-    """A thread of idle priority on `core` that spins in compiled code without the interpreter's lock."""
+    """A thread of idle priority on `core` that spins in compiled code without the interpreter's lock.
+
+    It gets its priority only while it spins and loses it before it ends: a thread of idle priority that holds the interpreter's lock on a
+    core that others want would stop this process for seconds.
+    """
 
     def __init__(self, core: int) -> None:
-        from .cpu_kernels import spin  # numba, for those who ask
+        from .cpu_kernels import ENDED, SPINS, spin  # numba, for those who ask
 
-        self._ended = np.ones(1, np.int64)
-        spin(self._ended)  # compiled before it is waited for
-        self._ended[0] = 0
-        self._started = threading.Event()
-        self.answer = ""
-
-        def run() -> None:
-            self.answer = _idle_on(core)
-            self._started.set()
-            if self.answer == "granted":
-                spin(self._ended)
-
-        self._thread = threading.Thread(target=run, name="pans-awake", daemon=True)
+        self._state = np.zeros(2, np.int64)
+        self._state[ENDED] = 1
+        spin(self._state)  # compiled before it is waited for
+        self._state[:] = 0
+        self._ended = ENDED
+        self._thread = threading.Thread(target=spin, args=(self._state,), name="pans-awake", daemon=True)
         self._thread.start()
-        self._started.wait()
+        while not self._state[SPINS]:
+            time.sleep(LOOK_EVERY_S)
+        self.answer = _idle_on(core, self._thread.native_id)
+        if self.answer != "granted":
+            self.stop()
 
     def stop(self) -> None:
-        """End the thread."""
-        self._ended[0] = 1
+        """End the thread; idempotent."""
+        if self.answer == "granted" and self._thread.native_id is not None and self._thread.is_alive():
+            with suppress(OSError):  # not everybody may go back; it then takes a little longer
+                os.sched_setscheduler(self._thread.native_id, os.SCHED_OTHER, os.sched_param(0))
+        self._state[self._ended] = 1
         self._thread.join()
 
 
-def _idle_on(core: int) -> str:
-    """Give the calling thread idle priority on `core`: everything else goes before it."""
-    if sys.platform != "linux":
+def _idle_on(core: int, thread: int | None) -> str:
+    """Give `thread` idle priority on `core`: everything else goes before it."""
+    if sys.platform != "linux" or thread is None:
         return "this system has no SCHED_IDLE"
     try:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        os.sched_setaffinity(0, {core})
+        os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+        os.sched_setaffinity(thread, {core})
     except OSError as error:
         return f"refused: {error.strerror}"
     return "granted"

@@ -12,6 +12,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
+ENDED, SPINS = 0, 1  # places in the state of a spin
 _X86 = platform.machine() in ("x86_64", "AMD64")
 
 
@@ -31,7 +32,8 @@ def _pause(typing_context: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def spin(ended):  # type: ignore[no-untyped-def]
-    """Wait until ended[0], int64, is not 0."""
-    while ended[0] == 0:
+def spin(state):  # type: ignore[no-untyped-def]
+    """Wait until state[ENDED], int64, is not 0; state[SPINS] is 1 from the beginning on."""
+    state[SPINS] = 1
+    while state[ENDED] == 0:
         _pause()

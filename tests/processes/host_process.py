@@ -27,10 +27,10 @@ from tree import ROOT
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.ports.shell import TcpPort, serve
+from pans.firmware_sim.probes.processes import wait_until
 from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.firmware_sim.trials.kills import LightLog
-from pans.firmware_sim.trials.processes import wait_until
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.decide import Verdict
 from pans.runtime.instrument.profile import load_profile

@@ -13,9 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pans.firmware_sim.trials import figures_text
-from pans.firmware_sim.trials.flow import Job, broken_bars, carry_out, report
-from pans.firmware_sim.trials.flow_attribution import (
+from pans.firmware_sim.probes.attribution import (
     CATCH_UP,
     MACHINE,
     ON_TIME_SHARE,
@@ -29,8 +27,10 @@ from pans.firmware_sim.trials.flow_attribution import (
     verdict_of,
     worked_off,
 )
-from pans.firmware_sim.trials.processes import real_time_programs
-from pans.firmware_sim.trials.scheduling_probe import MAX_GAPS, Gap, ProbeLog, SchedulingProbe
+from pans.firmware_sim.probes.processes import real_time_programs
+from pans.firmware_sim.probes.scheduling_probe import MAX_GAPS, Gap, ProbeLog, SchedulingProbe
+from pans.firmware_sim.trials import figures_text
+from pans.firmware_sim.trials.flow import Job, broken_bars, carry_out, report
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.record.format import TIMING_DTYPE

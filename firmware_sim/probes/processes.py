@@ -1,6 +1,6 @@
 """The processes of a trial: how they are started, spoken to and ended, and what the system tells about them.
 
-Owns child processes and the readings of /proc; never knows what a child does. A child is a module of this package that is started with
+Owns child processes and the readings of /proc; never knows what a child does. A child is a module of ours that is started with
 `-m`, says one JSON object per line and may be told one line at a time. Commands of the package are started by `start_command`.
 """
 
@@ -40,11 +40,11 @@ def start_command(words: list[str], errors: Path, core: int | None = None) -> su
 
 
 class Child:
-    """A module of this package in a process of its own, from construction to `end` or `kill`."""
+    """A module in a process of its own, named with its package, from construction to `end` or `kill`."""
 
     def __init__(self, module: str, *words: object) -> None:
         self.name = " ".join(map(str, (module, *words[:1])))
-        command = [sys.executable, "-m", f"{__package__}.{module}", *map(str, words)]
+        command = [sys.executable, "-m", module, *map(str, words)]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=one_thread(), text=True
         )

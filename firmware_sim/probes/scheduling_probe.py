@@ -65,7 +65,7 @@ class SchedulingProbe:
     ) -> None:
         self.core = core
         late_us = every_us if late_us is None else late_us
-        self._child = Child("scheduling_probe", core, priority, every_us, late_us)
+        self._child = Child(f"{__package__}.scheduling_probe", core, priority, every_us, late_us)
         self.pid = self._child.process.pid
         self._child.said()  # it is ready
 
