@@ -114,6 +114,7 @@ def _wait(
     began = time.monotonic()
     pids = [process.pid for process in (host, simulator) if process is not None]
     samples: list[tuple[float, ...]] = []
+    told = 0.0
     while host.poll() is None:
         elapsed = time.monotonic() - began
         if elapsed > seconds + LONGER_S:
@@ -123,7 +124,8 @@ def _wait(
         except OSError:  # it has just ended
             break
         others |= real_time_programs(probes | set(pids))
-        if len(samples) % round(PROGRESS_S) == 0:
+        if elapsed > told + PROGRESS_S:
+            told = elapsed
             say(f"{elapsed:6.0f} s")
         time.sleep(min(1.0, max(seconds / 10, 0.05)))
     host.wait()

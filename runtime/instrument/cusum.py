@@ -74,6 +74,13 @@ class Alarm(NamedTuple):
         return float(self.clicks.sum()) / (self.exposures * len(self.clicks))
 
 
+def read_only(words: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return a view that cannot be written to, as those of a message are: to numba, an array that can is a type of its own."""
+    view = words.view()
+    view.flags.writeable = False
+    return view
+
+
 class ChannelWatch:
     """Follows the dark rates of `n_channels`; all memory is allocated here, before arming.
 
@@ -114,7 +121,9 @@ class ChannelWatch:
 
     def update_words(self, words: npt.NDArray[np.uint8]) -> list[Alarm]:
         """Take dark exposures in the order of time, words uint8 (n, bytes), bit c is channel c; exact for each exposure."""
-        n = take_words(words, self.exposures, self.clicks, self._state, self._channel_of, self._at_zero, self._room)
+        n = take_words(
+            read_only(words), self.exposures, self.clicks, self._state, self._channel_of, self._at_zero, self._room
+        )
         self.exposures += len(words)
         return self._alarms(int(n))
 
@@ -148,7 +157,6 @@ class ChannelWatch:
     def warm_up(self) -> None:
         """Compile or load the kernels, without counting anything."""
         self.update_words(np.zeros((0, 1), np.uint8))
-        self.update_words(np.frombuffer(b"", np.uint8).reshape(0, 1))  # a view of a message is a type of its own
         self.update(0, np.zeros(self.n_channels, np.int64))
 
     def restart(self) -> None:
@@ -202,6 +210,13 @@ def _design(rate: float, ratio: float, arl: float, guard: float) -> CusumDesign:
 
 
 @numba.njit(cache=True, nogil=True)
+def _put(zero, row, clicks):  # type: ignore[no-untyped-def]
+    """zero[row] = clicks, channel by channel: numba takes seconds to compile the assignment of a slice."""
+    for channel in range(clicks.size):
+        zero[row, channel] = clicks[channel]
+
+
+@numba.njit(cache=True, nogil=True)
 def _silence(state, row, until, zero, clicks):  # type: ignore[no-untyped-def]
     """Take the silent trials before number `until`; return the trial at which the threshold was passed, else -1."""
     n = until - state[row, LAST]
@@ -219,7 +234,7 @@ def _silence(state, row, until, zero, clicks):  # type: ignore[no-untyped-def]
     else:
         state[row, SUM] = 0
         state[row, SINCE] = until
-        zero[row] = clicks
+        _put(zero, row, clicks)
     state[row, LAST] = until
     return -1
 
@@ -229,10 +244,11 @@ def _note(alarms, n, test, exposure, trials, state, zero, clicks):  # type: igno
     """Write down an alarm and start the test again from 0."""
     if n < alarms.shape[0]:
         alarms[n, 0], alarms[n, 1], alarms[n, 2] = test, exposure, state[test, SINCE] // trials
-        alarms[n, 3:] = clicks - zero[test]
+        for channel in range(clicks.size):
+            alarms[n, 3 + channel] = clicks[channel] - zero[test, channel]
     state[test, SUM] = 0
     state[test, SINCE] = state[test, LAST]
-    zero[test] = clicks
+    _put(zero, test, clicks)
     return n + 1
 
 
@@ -254,17 +270,22 @@ def _click(state, row, trial, trials, zero, clicks, alarms, n):  # type: ignore[
     state[row, SUM] = total
     if total <= 0:
         state[row, SUM], state[row, SINCE] = 0, trial + 1
-        zero[row] = clicks
+        _put(zero, row, clicks)
     elif total >= state[row, THRESHOLD]:
         n = _note(alarms, n, row, trial // trials + 1, trials, state, zero, clicks)
     return n
+
+
+# A number that is written into a kernel is a type of its own to numba, and every kernel it is handed to is compiled once more for it:
+# what other calls hand over as a variable is made one.
 
 
 @numba.njit(cache=True, nogil=True)
 def take_words(words, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
     """Take exposures `first`..., words uint8 (n, bytes); returns the number of alarms. Rows 2c and 2c+1 of `state` are channel c's tests,
     the others the pool's, whose trials are counted channel by channel. clicks int64 (channels,) are totals, updated."""
-    channels, found = clicks.size, 0
+    channels, found = clicks.size, np.int64(0)
+    n_tests = 2 + channel_of.size - 2 * channels  # of one channel and of the pool
     for t in range(words.shape[0]):
         for byte in range(words.shape[1]):
             rest = np.int64(words[t, byte])
@@ -276,23 +297,20 @@ def take_words(words, first, clicks, state, channel_of, zero, alarms):  # type: 
                 channel = 8 * byte + bit
                 if channel >= channels:
                     break
-                trial = (first + t) * channels + channel
-                for row in (2 * channel, 2 * channel + 1):
-                    found = _catch_up(state, row, first + t, 1, zero, clicks, alarms, found)
-                for row in range(2 * channels, channel_of.size):
-                    found = _catch_up(state, row, trial, channels, zero, clicks, alarms, found)
-                clicks[channel] += 1
-                for row in (2 * channel, 2 * channel + 1):
-                    found = _click(state, row, first + t, 1, zero, clicks, alarms, found)
-                for row in range(2 * channels, channel_of.size):
-                    found = _click(state, row, trial, channels, zero, clicks, alarms, found)
-    return _end(first + words.shape[0], channels, state, channel_of, zero, clicks, alarms, found)
-
-
-@numba.njit(cache=True, nogil=True)
-def _end(until, channels, state, channel_of, zero, clicks, alarms, found):  # type: ignore[no-untyped-def]
+                pooled = (first + t) * channels + channel
+                for clicked in range(2):  # the silence before it, then the click
+                    clicks[channel] += clicked
+                    for test in range(n_tests):
+                        row = 2 * channel + test if test < 2 else 2 * channels + test - 2
+                        trials = np.int64(1) if test < 2 else channels
+                        trial = first + t if test < 2 else pooled
+                        if clicked:
+                            found = _click(state, row, trial, trials, zero, clicks, alarms, found)
+                        else:
+                            found = _catch_up(state, row, trial, trials, zero, clicks, alarms, found)
+    until = first + words.shape[0]
     for row in range(channel_of.size):
-        trials = 1 if channel_of[row] >= 0 else channels
+        trials = np.int64(1) if channel_of[row] >= 0 else channels
         found = _catch_up(state, row, until * trials, trials, zero, clicks, alarms, found)
     return found
 
@@ -300,19 +318,21 @@ def _end(until, channels, state, channel_of, zero, clicks, alarms, found):  # ty
 @numba.njit(cache=True, nogil=True)
 def take_counts(exposures, block, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
     """Take a block of counts, int64 (channels,), as one step of every sum; returns the number of alarms."""
-    channels, found = clicks.size, 0
-    clicks += block
+    channels, found, total = clicks.size, np.int64(0), np.int64(0)
+    for channel in range(channels):
+        clicks[channel] += block[channel]
+        total += block[channel]
     until = first + exposures
     for row in range(channel_of.size):
         own = channel_of[row] >= 0
-        trials = 1 if own else channels
-        n_clicks = block[channel_of[row]] if own else block.sum()
+        trials = np.int64(1) if own else channels
+        n_clicks = block[channel_of[row]] if own else total
         silent = exposures * trials - n_clicks
         state[row, SUM] += n_clicks * state[row, CLICK_STEP] + silent * state[row, SILENT_STEP]
         state[row, LAST] = until * trials
         if state[row, SUM] <= 0:
             state[row, SUM], state[row, SINCE] = 0, until * trials
-            zero[row] = clicks
+            _put(zero, row, clicks)
         elif state[row, SUM] >= state[row, THRESHOLD]:
             found = _note(alarms, found, row, until, trials, state, zero, clicks)
     return found

@@ -126,7 +126,8 @@ def run_length(rate: float, click_step: int, silent_step: int, threshold: int) -
         return 1.0 / up_rate if up_rate > 0 else math.inf
     if threshold > STATES_MAX:
         raise ValueError(f"a test of {threshold} states, allowed {STATES_MAX}")
-    alarm, length = _cycle(up_rate, up, down, threshold, _TOLERANCE, _SWEEPS_MAX)
+    room = np.zeros(threshold), np.zeros(threshold)
+    alarm, length = _cycle(up_rate, up, down, *room, _TOLERANCE, _SWEEPS_MAX)
     return length / alarm if alarm > 0 else math.inf
 
 
@@ -149,13 +150,12 @@ def _threshold(rate: float, click: int, silent: int, arl: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cycle(up_rate, up, down, threshold, tolerance, sweeps_max):  # type: ignore[no-untyped-def]
+def _cycle(up_rate, up, down, alarm, length, tolerance, sweeps_max):  # type: ignore[no-untyped-def]
     """Return (probability of an alarm, mean length) of one cycle from 0, by Gauss-Seidel sweeps along the frequent step.
 
     alarm(s) = a alarm(s + up) + (1 - a) alarm(s - down), length(s) = 1 + the same; at 0 and below, and at the threshold, the
-    cycle is over."""
-    alarm, length = np.zeros(threshold), np.zeros(threshold)
-    down_rate = 1.0 - up_rate
+    cycle is over. alarm and length float64 (threshold,) begin as zeros."""
+    threshold, down_rate = alarm.size, 1.0 - up_rate
     last_alarm, last_length = -1.0, -1.0
     for _ in range(sweeps_max):
         for index in range(1, threshold):

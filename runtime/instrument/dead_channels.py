@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from pans.runtime.intervals import wilson_interval
 
-from .cusum import FLOOR_RATE
+from .cusum import FLOOR_RATE, read_only
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
@@ -88,14 +88,14 @@ class DeadChannelTest:
 
     def warm_up(self) -> None:
         """Compile or load the kernels, without counting anything."""
-        for words in (np.zeros((0, 1), np.uint8), np.frombuffer(b"", np.uint8).reshape(0, 1)):  # two types to numba
-            note_silence(words, self.silent.copy(), self.clicking.copy(), self._proofs)
+        words = read_only(np.zeros((0, 1), np.uint8))
+        note_silence(words, self.silent.copy(), self.clicking.copy(), self._proofs)
         spare = [np.zeros_like(self._row) for _ in range(5)]
         note_object(spare[0], spare[1], spare[2], self._then.copy(), self._compared, spare[3], spare[4])
 
     def take_exposures(self, words: U8) -> None:
         """Take the exposures of a block, lit or dark: words uint8 (n, bytes), bit c is channel c."""
-        self._any_due |= bool(note_silence(words, self.silent, self.clicking, self._limits))
+        self._any_due |= bool(note_silence(read_only(words), self.silent, self.clicking, self._limits))
 
     def take_counts(self, exposures: int, clicks: I64) -> None:
         """Take exposures of which only the clicks of each channel are known, int64 (n,)."""
