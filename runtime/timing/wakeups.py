@@ -102,7 +102,7 @@ class Sender:
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         count = max(1, round(seconds / (sum(PAUSE_S) / 2 + 60e-6)))  # a sleep takes about 60 us longer than asked for
-        file, clock, late = self._child.stdout.fileno(), time.perf_counter_ns, []
+        file, clock, late = self._child.stdout.fileno(), time.perf_counter_ns, list[int]()
         waiting = select.poll()
         waiting.register(file, select.POLLIN)
         self._child.stdin.write(f"{count}\n".encode())
