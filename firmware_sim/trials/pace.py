@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,20 +116,18 @@ def demo_rows(settings: Settings) -> Iterator[dict[str, Any]]:
     with _busy(core):
         for number in range(settings.times):
             with tempfile.TemporaryDirectory() as scratch:
-                words = [
-                    "demo",
-                    "--trials",
-                    str(settings.trials),
-                    "--seed",
-                    str(settings.seed + number),
-                    *settings.more,
-                ]
+                words = ["demo", "--trials", str(settings.trials), "--seed", str(settings.seed + number)]
                 # the demo's two processes go where the scheduler puts them, as they do for a user
                 watched = Watched(None, False, settings.canary_us, 0.0, FINISHED)
-                outcome = run_watched(None, lambda url, words=words: words, watched, Path(scratch))
+                outcome = run_watched(None, partial(_same, [*words, *settings.more]), watched, Path(scratch))
                 row = _row(f"demo {number + 1} beside a busy core {core}", "pty", outcome, DEMO_DEADLINE_US)
                 row |= _kept(outcome)
             yield row | {"broken": demo_broken(row)}
+
+
+def _same(words: list[str], url: str) -> list[str]:
+    """The words of a command that opens a device of its own."""
+    return words
 
 
 def walk_rows(settings: Settings, links: tuple[str, ...]) -> Iterator[dict[str, Any]]:
