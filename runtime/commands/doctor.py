@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
 
 from .doctor_checks import Finding, examine, schemes, serial_ports, udev_rule, usb_devices
 
@@ -34,12 +34,19 @@ def _configure_doctor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--realtime", action="store_true", help="measure for about 10 s what each real-time setting brings here"
     )
+    parser.add_argument(
+        "--warm",
+        action="store_true",
+        help="compile all kernels into the cache, on all cores, so that a first run need not",
+    )
 
 
 def _doctor(args: argparse.Namespace) -> int:
     if args.udev:
         emit(args, {"udev": udev_rule()}, udev_rule().rstrip())
         return EXIT_FINE
+    if args.warm:
+        return _warm(args)
     findings = examine()
     if args.realtime:
         return _realtime(args, findings)
@@ -67,6 +74,15 @@ def _realtime(args: argparse.Namespace, findings: list[Finding]) -> int:
     return EXIT_ALERT if broken else EXIT_FINE
 
 
+def _warm(args: argparse.Namespace) -> int:
+    from .warm import warm, words_of
+
+    say("pans: compiling the kernels of a run: once per machine and version")
+    found = warm()
+    emit(args, {"warm": found}, words_of(found))
+    return EXIT_FINE if all(row["ok"] for row in found["jobs"]) else EXIT_ALERT
+
+
 DEVICES = Command(
     "list ports and USB devices, and whether they can be opened",
     _configure_devices,
@@ -80,6 +96,7 @@ DOCTOR = Command(
     examples=(
         "pans doctor",
         "pans doctor --realtime",
+        "pans doctor --warm",
         "pans doctor --udev | sudo tee /etc/udev/rules.d/70-pans.rules",
     ),
 )
