@@ -75,7 +75,7 @@ def _realtime(args: argparse.Namespace, findings: list[Finding]) -> int:
 
 
 def _warm(args: argparse.Namespace) -> int:
-    from .warm import warm, words_of
+    from pans.runtime.operate.warm import warm, words_of
 
     say("pans: compiling the kernels of a run: once per machine and version")
     found = warm()

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from pans.runtime.cli import main
-from pans.runtime.commands.warm import JOBS, Job, _carried_out, _compiled, words_of
 from pans.runtime.errors import PansError
+from pans.runtime.operate.warm import JOBS, Job, _carried_out, _compiled, words_of
 
 WATCHED = ("pans.runtime.record", "pans.runtime.instrument", "pans.runtime.decide", "pans.runtime.wire")
 
@@ -60,7 +60,7 @@ def test_processes_run_side_by_side_and_a_failure_is_told(tmp_path: Path) -> Non
 
 
 def test_a_job_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pans.runtime.commands.warm.PATIENCE_S", 0.2)
+    monkeypatch.setattr("pans.runtime.operate.warm.PATIENCE_S", 0.2)
     began = time.monotonic()
     with pytest.raises(PansError, match="slow: not compiled within"):
         list(_carried_out([Job("slow", ("-c", "import time; time.sleep(60)"))], 1))

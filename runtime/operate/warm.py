@@ -2,7 +2,7 @@
 
 Owns the jobs and their order; what a kernel is, the packages know. Jobs of the first wave compile the large kernels; then the ordinary
 commands run once in simulation, which compiles whatever they need besides. A job runs in a process of its own: `python -m
-pans.runtime.commands.warm JOB`. Times are those of this machine and its load.
+pans.runtime.operate.warm JOB`. Times are those of this machine and its load.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def warm(processes: int = 0) -> dict[str, Any]:
     known = len(_compiled(folder))
     rows = []
     with tempfile.TemporaryDirectory(prefix="pans-warm-") as scratch:
-        first = [Job(name, ("-m", "pans.runtime.commands.warm", name)) for name in JOBS]
+        first = [Job(name, ("-m", "pans.runtime.operate.warm", name)) for name in JOBS]
         for wave in (first, commands_once(Path(scratch))):
             for row in _carried_out(wave, processes):
                 rows.append(row)
