@@ -22,6 +22,7 @@ from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.html_card import html_card
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
+from pans.runtime.operate.first_start import compiled_beside
 
 from .job import Job, recording_header, what_was_run
 from .run_files import check_run_files, claimed, gone_if_refused
@@ -116,8 +117,8 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
-            with _monitor_of(job) as monitor:
-                return _run_job(job, started_ns or time.perf_counter_ns(), _Beside(stop, watchdog, monitor))
+            with compiled_beside() as compiled, _monitor_of(job) as monitor:
+                return _run_job(job, started_ns or time.perf_counter_ns(), _Beside(stop, watchdog, monitor, compiled))
         except PansError:
             raise
         except Exception as error:
@@ -132,6 +133,7 @@ class _Beside(NamedTuple):
     stop: Stop
     watchdog: Watchdog | None
     monitor: Monitor
+    compiled: Callable[[], None]  # waits until the largest kernels are
 
 
 def _monitor_of(job: Job) -> Monitor:
@@ -272,6 +274,7 @@ def _watched(
     from pans.runtime.watch import Attendants
 
     dark, monitor = ready.dark, beside.monitor
+    beside.compiled()
     monitor.begin(ready.bundle, recorder, _facts(job, ready, link))
     with Attendants(job.continuous, recorder, beside.watchdog, beside.stop) as seen:
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.errors import PlanError
+from pans.runtime.wire.frame import read_only
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock
 
 from .plan import ADAPTIVE_PATTERN, Plan
@@ -224,7 +225,7 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     """Return what the windows of `plan` need and, of an automaton, its walks; PlanError if they cannot be followed."""
     automaton = plan.automaton
     if automaton is None:
-        none = np.zeros((0, 2), np.uint32), np.zeros(0, np.int64)
+        none = read_only(np.zeros((0, 2), np.uint32)), np.zeros(0, np.int64)
         return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, np.zeros(0, np.int64))
     slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
     if shots != 1 or automaton.successors.shape[1] != 2:
@@ -235,7 +236,7 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
     if not automaton.n_slots <= slots <= n_features:
         raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for clicks of {n_features}")
     nodes, shown = np.zeros(len(last), np.int64), np.zeros(automaton.n_states, np.int64)
-    return Walks(automaton.successors, nodes, np.full(len(last), slots, np.int64), last, shown)
+    return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown)
 
 
 def _visit_maps(plan: Plan, shots: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:

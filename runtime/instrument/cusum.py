@@ -20,6 +20,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.wire.frame import read_only
+
 from .cusum_design import RATE_MAX, CusumDesign, design_cusum
 
 I64 = npt.NDArray[np.int64]
@@ -72,13 +74,6 @@ class Alarm(NamedTuple):
         if self.channel != ALL_CHANNELS:
             return float(self.clicks[self.channel]) / self.exposures
         return float(self.clicks.sum()) / (self.exposures * len(self.clicks))
-
-
-def read_only(words: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return a view that cannot be written to, as those of a message are: to numba, an array that can is a type of its own."""
-    view = words.view()
-    view.flags.writeable = False
-    return view
 
 
 class ChannelWatch:

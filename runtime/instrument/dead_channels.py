@@ -27,8 +27,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.intervals import wilson_interval
+from pans.runtime.wire.frame import read_only
 
-from .cusum import FLOOR_RATE, read_only
+from .cusum import FLOOR_RATE
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]

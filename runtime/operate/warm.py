@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 
@@ -44,21 +42,31 @@ class Job:
 
 def compile_core() -> None:
     """The steps of sequential streams, fixed patterns and walks alike."""
+    _compile_steps(WALKING, WALKING_PROFILE)
+
+
+def compile_still() -> None:
+    """The back ends of fixed patterns."""
+    _compile_steps(STILL, STILL_PROFILE)
+
+
+def _compile_steps(name: str, profile: str) -> None:
     from pans.runtime.bundle.model import load_bundle
     from pans.runtime.core.plan import build_plan
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.instrument.profile import load_profile
 
-    for name, profile in ((WALKING, WALKING_PROFILE), (STILL, STILL_PROFILE)):
-        bundle, _ = load_bundle(name)
-        decider = make_decider(bundle)
-        plan = build_plan(load_profile(profile), bundle, automaton=getattr(decider, "automaton", None))
-        Core(plan, decider, 1, 0).warm_up()
+    bundle, _ = load_bundle(name)
+    decider = make_decider(bundle)
+    plan = build_plan(load_profile(profile), bundle, automaton=getattr(decider, "automaton", None))
+    Core(plan, decider, 1, 0).warm_up()
 
 
 def compile_link() -> None:
     """Decoding, the decision log, the watch over dark counts, the core that is kept awake."""
+    import numpy as np
+
     from pans.runtime.instrument.cusum import ChannelWatch
     from pans.runtime.instrument.dead_channels import DeadChannelTest
     from pans.runtime.record import Recorder
@@ -78,6 +86,8 @@ def compile_link() -> None:
 
 def compile_flow() -> None:
     """The steps of objects in flow."""
+    import numpy as np
+
     from pans.runtime.bundle.model import BackEnd, Shown, make_bundle
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
@@ -103,7 +113,12 @@ def compile_flow() -> None:
         core.warm_up()
 
 
-JOBS: Mapping[str, Callable[[], None]] = {"core": compile_core, "link": compile_link, "flow": compile_flow}
+JOBS: Mapping[str, Callable[[], None]] = {
+    "core": compile_core,
+    "link": compile_link,
+    "flow": compile_flow,
+    "still": compile_still,  # when the steps are compiled
+}
 
 
 def commands_once(folder: Path) -> list[Job]:
@@ -153,7 +168,7 @@ def _carried_out(jobs: Sequence[Job], processes: int) -> Iterator[dict[str, Any]
         while waiting or running:
             while waiting and len(running) < processes:
                 job = waiting.pop(0)
-                running.append((job, time.perf_counter(), _start(job)))
+                running.append((job, time.perf_counter(), start(job)))
             for one in [one for one in running if one[2].poll() is not None]:
                 running.remove(one)
                 yield _row(*one)
@@ -167,7 +182,8 @@ def _carried_out(jobs: Sequence[Job], processes: int) -> Iterator[dict[str, Any]
             process.communicate()
 
 
-def _start(job: Job) -> subprocess.Popen[str]:
+def start(job: Job) -> subprocess.Popen[str]:
+    """Start a job's process; its errors can be read."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     words = [sys.executable, *job.words]
     return subprocess.Popen(
@@ -184,10 +200,9 @@ def _row(job: Job, began: float, process: subprocess.Popen[str]) -> dict[str, An
 
 
 def cache_folder() -> Path:
-    """Return where numba keeps compiled kernels: NUMBA_CACHE_DIR, or the package's own folders."""
-    from numba.core import config
-
-    return Path(config.CACHE_DIR) if config.CACHE_DIR else Path(__file__).parents[2]
+    """Return where numba keeps compiled kernels: NUMBA_CACHE_DIR, or the package's own folders. Needs no numba."""
+    named = os.environ.get("NUMBA_CACHE_DIR", "")
+    return Path(named) if named else Path(__file__).parents[1]
 
 
 def _compiled(folder: Path) -> list[Path]:

@@ -7,12 +7,14 @@ framing.py and bulk.py do.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from .schema import HEADER, MalformedMessage
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class Frame(NamedTuple):
@@ -68,3 +70,16 @@ class DecoderCounters:
     short_frames: int = 0
     oversized_frames: int = 0
     bytes_discarded: int = 0
+
+
+def read_only(array: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
+    """Return a view that cannot be written to, as those of a message are.
+
+    To the compiler an array that can be written to is another type, for which it compiles every kernel that the array reaches once more.
+
+    >>> read_only(np.zeros(2)).flags.writeable
+    False
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,75 @@
+"""The first run on a machine: another process compiles the largest kernels while this one does everything else.
+
+Owns the question whether they are compiled, the stamp that answers it, and the other process; what is compiled is warm.py's. A stamp in
+the cache of kernels holds what they were made from: the sources, the versions, the processor. Where no stamp can be written, nothing is
+done, and each process compiles for itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+
+from .warm import JOBS, PATIENCE_S, Job, cache_folder, start
+
+LARGEST = "core"  # the job of the other process
+BESIDE = "link"  # what this process compiles meanwhile
+PACKAGES = ("core", "decide", "wire", "turn")  # whose sources the largest kernels are made from
+
+
+@contextmanager
+def compiled_beside() -> Iterator[Callable[[], None]]:
+    """Begin to compile beside this process, if that has not been done; yield what waits until it is done."""
+    stamp = _stamp()
+    if stamp is None or stamp.exists():
+        yield lambda: None
+        return
+    process = start(Job(LARGEST, ("-m", "pans.runtime.operate.warm", LARGEST)))
+
+    def wait() -> None:
+        JOBS[BESIDE]()
+        with suppress(subprocess.TimeoutExpired):  # then this process compiles, as it would have without the other
+            process.communicate(timeout=PATIENCE_S)
+            if process.returncode == 0:
+                note_compiled()
+
+    try:
+        yield wait
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def note_compiled() -> None:
+    """Remember that the largest kernels are in the cache."""
+    stamp = _stamp()
+    if stamp is not None:
+        with suppress(OSError):
+            for old in stamp.parent.glob(stamp.name.rpartition("-")[0] + "-*"):
+                old.unlink()
+            stamp.touch()
+
+
+def _stamp() -> Path | None:
+    """Return the stamp's path, None where nothing can be kept."""
+    folder = cache_folder() if os.environ.get("NUMBA_CACHE_DIR") else cache_folder() / "__pycache__"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return None
+        digest = hashlib.sha256(f"{sys.version}{version('numba')}{platform.processor()}{platform.machine()}".encode())
+        for package in PACKAGES:
+            for path in sorted((Path(__file__).parents[1] / package).glob("*.py")):
+                facts = path.stat()
+                digest.update(f"{path.name}{facts.st_size}{facts.st_mtime_ns}".encode())
+    except OSError:
+        return None
+    return folder / f"pans-compiled-{digest.hexdigest()[:16]}"
