@@ -18,6 +18,7 @@ from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.runtime.bench.rows import BenchOptions, Row, cpu_time
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.dead_time import DeadTime
 from pans.runtime.instrument.profile import load_profile
 
 from .bench_flow import flow_rows
@@ -28,7 +29,7 @@ EFFECTS: dict[str, DetectorModel] = {
     "plain thresholded Poisson": PLAIN,
     "+ dark counts": replace(PLAIN, law=ClickLaw(dark_per_exposure=0.01)),
     "+ read noise and threshold (qCMOS)": replace(PLAIN, law=ClickLaw(0.01, 0.3, 0.5)),
-    "+ dead time of a tenth of the exposure": replace(PLAIN, dead_fraction=0.1),
+    "+ dead time of a tenth of the exposure": replace(PLAIN, law=ClickLaw(dead_time=DeadTime(0.1))),
     "+ afterpulsing 1 %": replace(PLAIN, afterpulse_probability=0.01),
     "+ crosstalk 0.2 %": replace(PLAIN, crosstalk_probability=0.002),
     "+ afterpulsing and crosstalk": replace(PLAIN, afterpulse_probability=0.01, crosstalk_probability=0.002),
@@ -36,12 +37,12 @@ EFFECTS: dict[str, DetectorModel] = {
 
 
 def bench_sim(options: BenchOptions) -> list[Row]:
-    """Return the rows of clicks by effect, of approximations with their error, and of the optics by how much of a pattern is lit."""
+    """Return the rows of clicks by effect, and of the optics by how much of a pattern is lit."""
     rows = [_click_row(name, model, options.quick) for name, model in EFFECTS.items()]
     base = rows[0]["ns"]
     for row in rows:
         row["of_plain"] = round(row["ns"] / base, 2)
-    return [*rows, _dead_time_row(), *_optics_rows(options), *flow_rows(options.quick)]
+    return [*rows, *_optics_rows(options), *flow_rows(options.quick)]
 
 
 def _click_row(name: str, model: DetectorModel, quick: bool) -> Row:
@@ -79,21 +80,6 @@ def _click_row(name: str, model: DetectorModel, quick: bool) -> Row:
         "bits_wrong": int((found != wanted).sum()),
         "mean_clicks": round(float(found.mean()), 5),
         "runs": spent.runs,
-    }
-
-
-def _dead_time_row() -> Row:
-    """The mean-count form of dead time against an event-by-event detector that starts each exposure alive."""
-    rng = np.random.default_rng(2)
-    worst = 0.0
-    for mean in (0.1, 0.5, 1.0, 3.0):
-        model = replace(PLAIN, dead_fraction=0.1)
-        found = float(first_click_probability(model, np.array([mean]))[0])
-        clicked = float((rng.poisson(mean, 2_000_000) > 0).mean())  # alive at the start: the first photon always counts
-        worst = max(worst, abs(found - clicked))
-    return {
-        "name": "SIMULATED dead time as a mean count: largest error of p, if every exposure began alive",
-        "p_error": round(worst, 4),
     }
 
 

@@ -27,6 +27,7 @@ from pans.firmware_sim.scene.detector_model import (
 )
 from pans.firmware_sim.scene.light import LightTable
 from pans.firmware_sim.scene.still import Scene
+from pans.runtime.instrument.dead_time import STEP, counted_table
 from pans.runtime.wire.automata import MaskChunk
 from pans.runtime.wire.commands import MODES, PARALLEL, PatternChunk
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN
@@ -140,6 +141,8 @@ class LightService:
         if mean is not None:
             parts.append(np.ascontiguousarray(mean).view(np.uint64).ravel())
         parts += [np.ascontiguousarray(photons).view(np.uint64), self._scene.labels.astype(np.int64).view(np.uint64)]
+        if model.law.dead_time.reach:
+            parts.append(counted_table(model.law.dead_time).view(np.uint64))
         return np.concatenate(parts)
 
     def _check_size(self, words: int) -> None:
@@ -148,7 +151,7 @@ class LightService:
 
 
 def _header(view: View, model: DetectorModel, probability: F64, mean: F64 | None) -> U64:
-    real = np.array([model.law.dark_per_exposure, model.dead_fraction, model.afterpulse_probability], np.float64)
+    real = np.array([model.law.dark_per_exposure, model.afterpulse_probability, STEP], np.float64)
     keys = [stream_key(view.seed, stream) for stream in (CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM)]
     from pans.firmware_sim.scene.detector_kernels import click_thresholds  # loads the compiler
 
@@ -164,6 +167,7 @@ def _header(view: View, model: DetectorModel, probability: F64, mean: F64 | None
         crosstalk,
         bool(model.afterpulse_probability),
         mean is not None,
+        counted_table(model.law.dead_time).size if model.law.dead_time.reach else 0,
     ]
     header = np.zeros(HEADER_WORDS, np.uint64)
     header[: len(whole)] = np.array([int(number) for number in whole], np.uint64)

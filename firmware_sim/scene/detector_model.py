@@ -3,18 +3,18 @@
 Owns the click probability with the effects that the profile declares, the streams of random numbers and their keys; never draws one.
 What is not declared costs nothing.
 
-Sources: thresholded Poisson law and qCMOS threshold in pans.runtime.instrument.click_law; non-paralysable dead time n / (1 + n tau).
+Sources: thresholded Poisson law, qCMOS threshold and dead time in pans.runtime.instrument.click_law.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, dead_fraction
+from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
 from pans.runtime.instrument.profile import Profile
 
 GOLDEN = 0x9E3779B97F4A7C15  # the increment of splitmix64: 2^64 over the golden ratio, odd
@@ -31,17 +31,15 @@ class DetectorModel:
     """What turns lambda into clicks at one exposure time; zeros switch an effect off."""
 
     law: ClickLaw
-    dead_fraction: float = 0.0
     afterpulse_probability: float = 0.0
     crosstalk_probability: float = 0.0
 
 
 def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
-    """Collect the profile's effects for this exposure: dead time where it matters, crosstalk where there are neighbours."""
+    """Collect the profile's effects for this exposure: crosstalk only where there are neighbours."""
     detector = profile.detector
     return DetectorModel(
         law=click_law(profile, exposure_us),
-        dead_fraction=dead_fraction(profile, exposure_us),
         afterpulse_probability=detector.afterpulse_probability,
         crosstalk_probability=detector.crosstalk_probability if profile.mode == "parallel" else 0.0,
     )
@@ -49,11 +47,7 @@ def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
 
 def first_click_probability(model: DetectorModel, photoelectrons: NDArray[np.float64]) -> NDArray[np.float64]:
     """Click probability before memory effects, float64 of the shape of `photoelectrons` (lambda, without dark counts)."""
-    if not model.dead_fraction:
-        return click_probability(model.law, photoelectrons)
-    mean = photoelectrons + model.law.dark_per_exposure
-    counted = mean / (1.0 + mean * model.dead_fraction)
-    return click_probability(replace(model.law, dark_per_exposure=0.0), counted)
+    return click_probability(model.law, photoelectrons)
 
 
 @lru_cache(maxsize=64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
-from pans.runtime.instrument.click_law import ClickLaw, dead_fraction
+from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import jeffreys_interval
@@ -53,9 +53,7 @@ class Design:
 
 def count_model(profile: Profile, exposure_us: float) -> CountModel:
     """What the profile says of the detector beyond light and dark counts, for this exposure."""
-    detector = profile.detector
-    law = ClickLaw(0.0, detector.read_noise_e, detector.threshold_e)
-    return CountModel(law, dead_fraction(profile, exposure_us))
+    return CountModel(replace(click_law(profile, exposure_us), dark_per_exposure=0.0))
 
 
 def calibration_exposure_us(profile: Profile) -> float:

@@ -1,9 +1,10 @@
 """The click law: the probability that one exposure clicks, given the photoelectrons that reach the detector.
 
 Owns the formulas and their stable forms; never samples clicks (the simulator does) and never models what links exposures
-(dead time, afterpulsing). All calls return float64 arrays of the shape of their input.
+(afterpulsing; dead time counts by its mean effect, dead_time.py). All calls return float64 arrays of the shape of their input.
 
-With mu = photoelectrons + dark_per_exposure, Poisson counts k are read with Gaussian noise sigma against a threshold theta:
+With mu = photoelectrons + dark_per_exposure (of which dead time leaves the counted mean), Poisson counts k are read with Gaussian
+noise sigma against a threshold theta:
 `1 - p = exp(-mu) * sum_k c_k mu^k`, `c_k = Phi((theta - k)/sigma)/k!`. Without read noise and with theta in (0, 1] this is
 the thresholded Poisson law of the paper, `p = 1 - exp(-mu)`.
 """
@@ -16,20 +17,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from .dead_time import NO_DEAD_TIME, DeadTime, counted_mean
 from .profile import Profile
+from .profile_schema import FREE_RUNNING, PARALYSABLE
 
 F64 = NDArray[np.float64]
-DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, saturation is lost in a permille of lambda
+DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, no probability changes by more than 3e-7
 _TINY = 1e-300  # Phi below this is negligible at any mean that a float can hold, and would soon be subnormal
 
 
 @dataclass(frozen=True, slots=True)
 class ClickLaw:
-    """Dark photoelectrons per exposure, read noise and threshold in photoelectrons."""
+    """Dark photoelectrons per exposure, read noise and threshold in photoelectrons, dead time in exposures."""
 
     dark_per_exposure: float = 0.0
     read_noise_e: float = 0.0
     threshold_e: float = 0.5
+    dead_time: DeadTime = NO_DEAD_TIME
 
     def __post_init__(self) -> None:
         if not 0 <= self.dark_per_exposure < math.inf:
@@ -43,18 +47,24 @@ class ClickLaw:
 def click_law(profile: Profile, exposure_us: float) -> ClickLaw:
     """The law of one exposure of `exposure_us` microseconds on this profile's detector."""
     detector = profile.detector
-    return ClickLaw(detector.dark_rate_hz * exposure_us * 1e-6, detector.read_noise_e, detector.threshold_e)
+    dark = detector.dark_rate_hz * exposure_us * 1e-6
+    return ClickLaw(dark, detector.read_noise_e, detector.threshold_e, dead_time_of(profile, exposure_us))
 
 
-def dead_fraction(profile: Profile, exposure_us: float) -> float:
-    """The part of an exposure for which a click blinds the detector; 0 where that changes no clicks worth speaking of.
+def dead_time_of(profile: Profile, exposure_us: float) -> DeadTime:
+    """The dead time in exposures of `exposure_us` microseconds, the readout being the pause; none where it changes nothing.
 
-    A detector with a threshold asks for the first click alone, which nothing before it in the exposure can suppress. What counts is a
-    click of the exposure before: where the readout between them outlasts the dead time, and below a permille of the exposure, it is 0.
+    It changes nothing below a permille of the exposure, and of a gated detector where the readout outlasts it.
     """
-    dead_us = profile.detector.dead_time_ns * 1e-3
-    fraction = dead_us / exposure_us
-    return fraction if fraction > DEAD_TIME_MATTERS and dead_us > profile.exposure.readout_us else 0.0
+    detector = profile.detector
+    pause, dead = profile.exposure.readout_us / exposure_us, detector.dead_time_ns * 1e-3 / exposure_us
+    found = DeadTime(
+        min(dead, 1 + pause),  # a profile allows as much; what is rounded to ticks may be a little shorter
+        pause,
+        detector.between_exposures == FREE_RUNNING,
+        detector.dead_time_kind == PARALYSABLE,
+    )
+    return found if dead > DEAD_TIME_MATTERS and found.reach else NO_DEAD_TIME
 
 
 def survival_coefficients(law: ClickLaw) -> F64:
@@ -130,7 +140,7 @@ def _mean(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
     if mu.size and not (mu.min() >= law.dark_per_exposure and mu.max() < math.inf):  # also false for nan
         low, high = mu.min() - law.dark_per_exposure, mu.max() - law.dark_per_exposure
         raise ValueError(f"photoelectrons must be finite and at least 0, found {low:g} to {high:g}")
-    return mu
+    return counted_mean(law.dead_time, mu)
 
 
 def _above(law: ClickLaw, k: int) -> float:

@@ -4,7 +4,7 @@ Owns the likelihood of known drives (lit levels of a pattern on a clear field), 
 by what 95 % allow; never shows a pattern (calibration_run.py) and never writes a file (calibration.py). The estimate is of
 photoelectrons per level and exposure: flux, transmission and efficiency together; clicks cannot tell them apart.
 
-Model: an exposure of drive s has mean `mu = s theta + delta`, counted as `mu / (1 + mu f)` where dead time matters; it stays
+Model: an exposure of drive s has mean `mu = s theta + delta`, of which dead time leaves the counted mean (dead_time.py); it stays
 silent with the click law's probability, times (1 - p_ap) after a click, times what crosstalk leaves. Afterpulsing, crosstalk,
 dead time, read noise and threshold are the profile's; they are not fitted. Intervals by profile likelihood: right to second
 order, one-sided at 0 and at saturation, where Wald's break down."""
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pans.runtime.intervals import CHI2_95, chi2_quantile, chi2_tail
 
 from .click_law import ClickLaw, survival_coefficients
+from .dead_time import counted_mean, counted_slope
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -71,22 +72,21 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CountModel:
-    """What of the detector is taken as known: the law without its dark counts, and dead time as a fraction of the exposure."""
+    """What of the detector is taken as known: the law without its dark counts."""
 
     law: ClickLaw
-    dead_fraction: float = 0.0
 
     def log_miss(self, mean: F64) -> F64:
         """Log probability that `mean` photoelectrons (any shape, up to some hundreds) leave the exposure silent."""
-        counted = mean / (1.0 + self.dead_fraction * mean)
+        counted = counted_mean(self.law.dead_time, mean)
         return -counted if self._plain else np.log(_series(_survival(self.law)[0], counted)) - counted
 
     def log_miss_slope(self, mean: F64) -> F64:
         """Its derivative."""
-        inner = 1.0 / (1.0 + self.dead_fraction * mean) ** 2
+        inner = counted_slope(self.law.dead_time, mean)
         if self._plain:
             return -inner
-        counted = mean / (1.0 + self.dead_fraction * mean)
+        counted = counted_mean(self.law.dead_time, mean)
         powers, slopes = _survival(self.law)
         return (_series(slopes, counted) / _series(powers, counted) - 1.0) * inner
 

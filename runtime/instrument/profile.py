@@ -19,7 +19,7 @@ from pans.runtime.errors import ConfigError
 from pans.runtime.html_card import html_card
 
 from .checked_toml import read_toml
-from .profile_schema import ProfileCheck
+from .profile_schema import GATED, NON_PARALYSABLE, ProfileCheck
 
 MAX_PROFILE_BYTES = 1 << 20
 
@@ -67,6 +67,8 @@ class Detector:
     read_noise_e: float = 0.0
     threshold_e: float = 0.5
     dead_time_ns: float = 0.0
+    dead_time_kind: str = NON_PARALYSABLE
+    between_exposures: str = GATED
     afterpulse_probability: float = 0.0
     crosstalk_probability: float = 0.0
 
@@ -133,7 +135,7 @@ class Profile:
             "patterns per second at most": shows.pattern_rate_max_hz,
             "detector": f"{clicks.kind}, {clicks.channels} channels, efficiency {clicks.efficiency:g}",
             "dark rate (Hz)": clicks.dark_rate_hz,
-            "dead time (ns)": clicks.dead_time_ns,
+            "dead time (ns)": f"{clicks.dead_time_ns:g}, {clicks.dead_time_kind}, {clicks.between_exposures} between exposures",
             "exposure (us)": f"{self.exposure.min_us:g} to {self.exposure.max_us:g}, readout {self.exposure.readout_us:g}",
             "decision deadline (us)": self.timing.decision_deadline_us,
             "to be measured": self.measure,

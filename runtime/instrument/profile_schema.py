@@ -17,6 +17,8 @@ from pans.runtime.wire.fields import MAX_STATES
 from .checked_toml import Key, KeyPath, Position, found, near, position_of, type_remedy
 
 MODES = ("sequential", "parallel")
+NON_PARALYSABLE, PARALYSABLE = "non-paralysable", "paralysable"
+GATED, FREE_RUNNING = "gated", "free-running"
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
 
 
@@ -52,6 +54,8 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "read_noise_e": Key("number", 0, 3, required=False),  # beyond 3 e- a single photon is not visible at all
         "threshold_e": Key("number", 0, 10, above=True, required=False),
         "dead_time_ns": Key("number", 0, 1e9, required=False),
+        "dead_time_kind": Key("text", required=False, choices=(NON_PARALYSABLE, PARALYSABLE)),
+        "between_exposures": Key("text", required=False, choices=(GATED, FREE_RUNNING)),
         "afterpulse_probability": _PROBABILITY,
         "crosstalk_probability": _PROBABILITY,
     },

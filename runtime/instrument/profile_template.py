@@ -37,6 +37,8 @@ MEANINGS = {
     "detector.read_noise_e": "Gaussian noise of a readout; 0 for detectors that count events",
     "detector.threshold_e": "a readout of at least this is a click",
     "detector.dead_time_ns": "blind time after a click; at most min_us + readout_us",
+    "detector.dead_time_kind": "paralysable: a photon that is lost makes the dead time begin again",
+    "detector.between_exposures": "gated: off between exposures; free-running: on, and blinded by what it detects there",
     "detector.afterpulse_probability": "that a click causes another one in the next exposure",
     "detector.crosstalk_probability": "that a click causes one in a neighbouring channel",
     "exposure.min_us": "shortest exposure; at least 10 ticks of the clock",

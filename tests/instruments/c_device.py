@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import shutil
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,10 +35,15 @@ def small_scene() -> SceneFile:
 
 
 class Pair:
-    """The simulator's instrument and the C core, which hear the same bytes at the same ticks; `heard` is what each said."""
+    """The simulator's instrument and the C core, which hear the same bytes at the same ticks; `heard` is what each said.
 
-    def __init__(self, mode: str, *, seed: int = 3, buffer: int = 256) -> None:
+    `dead` is the dead time of their detectors, in exposures.
+    """
+
+    def __init__(self, mode: str, *, seed: int = 3, buffer: int = 256, dead: float = 0.0) -> None:
         self.profile, self.bundle, self.plan = small_setup(mode)
+        blinded = {"dead_time_ns": 1000 * dead * self.plan.exposure_us, "between_exposures": "free-running"}
+        self.profile = replace(self.profile, detector=replace(self.profile.detector, **blinded))
         scene = small_scene()
         options = SimOptions("ideal", seed=seed, buffer=buffer)
         self.devices = (

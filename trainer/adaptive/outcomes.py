@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
+from pans.trainer.model.detection import counted_mean
 
 MEAN_MAX = 100.0  # beyond it no detector of a profile stays dark, and high powers of the mean leave float32
 NEGLIGIBLE = 1e-8  # c_k k!: the chance to miss that many photoelectrons, below which the term is left out
@@ -28,17 +29,19 @@ def kept_coefficients(law: ClickLaw) -> tuple[float, ...]:
 def no_click(light: Tensor, law: ClickLaw) -> tuple[Tensor, Tensor]:
     """Return the probability of no click, and how fast it falls with `light` (photoelectrons): both of the shape of `light`.
 
-    The fall is -d/d(light), which is the slope of the click probability. With the plain law both are the same tensor.
+    The fall is -d/d(light), which is the slope of the click probability. With the plain law and no dead time both are the same tensor.
     """
     coefficients = kept_coefficients(law)
-    if coefficients == (1.0,):
+    blinded = law.dead_time.reach > 0
+    if coefficients == (1.0,) and not blinded:
         dark = torch.exp(-(light + law.dark_per_exposure)) if law.dark_per_exposure else torch.exp(-light)
         return dark, dark
-    mean = (light + law.dark_per_exposure).clamp(max=MEAN_MAX)
+    mean, slope = counted_mean((light + law.dark_per_exposure).clamp(max=MEAN_MAX), law.dead_time)
     missed = torch.zeros_like(mean)
     change = torch.zeros_like(mean)
     for coefficient in reversed(coefficients):  # Horner, of the polynomial and of its derivative
         change = change * mean + missed
         missed = missed * mean + coefficient
     empty = torch.exp(-mean)
-    return empty * missed, empty * (missed - change)
+    fall = empty * (missed - change)
+    return empty * missed, fall * slope if blinded else fall

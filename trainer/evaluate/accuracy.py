@@ -9,7 +9,7 @@ The spread over repeated trials (shot noise) and the spread over objects (a diff
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,7 @@ def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | Non
     else:
         exposure_us = bundle.analyser.exposure_us
     law = click_law(profile, exposure_us)
-    return law if dark is None else ClickLaw(dark, law.read_noise_e, law.threshold_e)
+    return law if dark is None else replace(law, dark_per_exposure=dark)
 
 
 def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:

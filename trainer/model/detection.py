@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
+from pans.runtime.instrument.dead_time import INTERVALS, STEP, DeadTime, counted_table
 
 _MU_MAX = 100.0  # beyond it no detector of a profile stays dark, and high powers of mu leave float64
 _NEGLIGIBLE = 1e-13  # chance of missing that many photoelectrons, below which the term is left out
@@ -50,7 +51,7 @@ def click_probability(photoelectrons: Tensor, law: Law, slope: float = 1.0) -> T
     """
     if not isinstance(law, ClickLaw):
         return law(photoelectrons.double() * slope).to(photoelectrons.dtype)
-    mu = (photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX)
+    mu, _ = counted_mean((photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX), law.dead_time)
     coefficients = survival_coefficients(law).tolist()
     kept = [c for k, c in enumerate(coefficients) if c * math.factorial(k) > _NEGLIGIBLE]
     if kept == [1.0]:
@@ -59,6 +60,21 @@ def click_probability(photoelectrons: Tensor, law: Law, slope: float = 1.0) -> T
     for coefficient in reversed(kept):
         survival = survival * mu + coefficient
     return (1.0 - torch.exp(-mu) * survival).to(photoelectrons.dtype)
+
+
+def counted_mean(mean: Tensor, dead_time: DeadTime) -> tuple[Tensor, Tensor]:
+    """Return what dead time leaves of `mean`, and the derivative by it: both of its shape and dtype, the first differentiable.
+
+    The same as `pans.runtime.instrument.dead_time.counted_mean` and `counted_slope`.
+    """
+    if not dead_time.reach:
+        return mean, torch.ones_like(mean)
+    table = torch.tensor(counted_table(dead_time), dtype=mean.dtype, device=mean.device)
+    place = (torch.log1p(mean) / STEP).clamp(max=INTERVALS)
+    left = place.detach().long().clamp(max=INTERVALS - 1)
+    rise = table[left + 1] - table[left]
+    ratio = table[left] + rise * (place - left)
+    return mean * ratio, ratio + rise / STEP * mean / (1 + mean)
 
 
 class _StraightThrough(torch.autograd.Function):

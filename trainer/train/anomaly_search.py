@@ -18,6 +18,7 @@ Clicks are held by a weight per start that grows with their excess; photons are 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -61,7 +62,7 @@ def search(task: Task, profile: Profile, options: Options, size: int) -> Trained
     views = [x @ fields[turn] for turn in turns(task.image_shape)]
     law = click_law(profile, profile.exposure.min_us)
     if options.dark is not None:
-        law = type(law)(options.dark, law.read_noise_e, law.threshold_e)
+        law = replace(law, dark_per_exposure=options.dark)
     shown, target = torch.cat([view[:n_fit] for view in views]), labels[:n_fit].repeat(len(views))
     weights = descend(shown, target, law, options)
     wrong = judge(weights, views[0][n_fit:], labels[n_fit:], law, options.clicks)

@@ -3,7 +3,7 @@
  * The file is an array of 64-bit words in the machine's order: the header, thresholds (objects, columns + 1), if there is afterpulsing the same
  * after a click, then the expected photoelectrons of every pattern (objects, columns) as doubles where the host names states, the
  * photoelectrons of one shot on each object, and the classes. A column is a pattern, a channel or a state; the last one is dark. A
- * threshold is the probability times 2^53, rounded up.
+ * threshold is the probability times 2^53, rounded up. Where dead time matters, the table of counted over true means closes the file.
  *
  * The generator is a counter: the number of an exposure depends on the seed, its number and the channel alone. Its finaliser is that of Steele,
  * Lea and Flood, "Fast splittable pseudorandom number generators" (2014); it draws what the Python simulator draws.
@@ -20,7 +20,7 @@
 
 #include "posix.h"
 
-enum { MAGIC_AT, OBJECTS, COLUMNS, PARALLEL, KEY, KEY_BELOW, KEY_ABOVE, CROSSTALK, HAS_PRIMED, HAS_MEAN, DARK, DEAD, AFTERPULSE, HEADER_WORDS = 16 };
+enum { MAGIC_AT, OBJECTS, COLUMNS, PARALLEL, KEY, KEY_BELOW, KEY_ABOVE, CROSSTALK, HAS_PRIMED, HAS_MEAN, COUNTED, DARK, AFTERPULSE, STEP, HEADER_WORDS = 16 };
 
 #define MAGIC 0x31474C534E4150u /* "PANSLG1" */
 #define GOLDEN 0x9E3779B97F4A7C15u
@@ -97,7 +97,7 @@ static void take_file(struct light *light, const char *path)
     map_file(light, path);
     const uint64_t *word = light->mapped;
     uint64_t objects = word[OBJECTS], columns = word[COLUMNS], table = objects * (columns + 1);
-    uint64_t words = HEADER_WORDS + table * (1 + word[HAS_PRIMED]) + objects * columns * word[HAS_MEAN] + 2 * objects;
+    uint64_t words = HEADER_WORDS + table * (1 + word[HAS_PRIMED]) + objects * columns * word[HAS_MEAN] + 2 * objects + word[COUNTED];
     if (word[MAGIC_AT] != MAGIC || objects == 0 || words * 8 != light->mapped_bytes)
         die("not a file of light", path);
     light->header = word;
@@ -110,6 +110,7 @@ static void take_file(struct light *light, const char *path)
     word += objects * columns * light->header[HAS_MEAN];
     light->photons = (const double *)word;
     light->truth = (const int64_t *)(word + objects);
+    light->counted = (const double *)(word + 2 * objects);
 }
 
 static void send_states(const struct pans_task *task)
@@ -157,11 +158,21 @@ void light_expose(struct light *light, const struct pans_exposure *exposure)
         memset(light->before, 0, light->header[PARALLEL] ? light->header[COLUMNS] : 1);
 }
 
-/* The probability times 2^53 of an exposure with the light on for a part of it: the thresholded Poisson law, dead time as the simulator has it. */
+/* What dead time leaves of the mean: its table, as runtime/instrument/dead_time.py makes it, read at log(1 + mean). */
+static double counted(const struct light *light, double mean)
+{
+    uint64_t entries = light->header[COUNTED];
+    if (entries == 0)
+        return mean;
+    double at = fmin(log1p(mean) / real(light->header[STEP]), (double)(entries - 1));
+    uint64_t left = at < (double)(entries - 1) ? (uint64_t)at : entries - 2;
+    return mean * (light->counted[left] + (light->counted[left + 1] - light->counted[left]) * (at - (double)left));
+}
+
+/* The probability times 2^53 of an exposure with the light on for a part of it: the thresholded Poisson law. */
 static uint64_t limit_of(const struct light *light, double photoelectrons, bool after_click)
 {
-    double mean = photoelectrons + real(light->header[DARK]);
-    double p = -expm1(-(mean / (1.0 + mean * real(light->header[DEAD]))));
+    double p = -expm1(-counted(light, photoelectrons + real(light->header[DARK])));
     if (after_click)
         p = 1.0 - (1.0 - p) * (1.0 - real(light->header[AFTERPULSE]));
     return (uint64_t)ceil(p * 9007199254740992.0);

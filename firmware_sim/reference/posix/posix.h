@@ -33,7 +33,7 @@ struct port {
 /* The light of a measurement, as the simulator wrote it to a file: see light.c. */
 struct light {
     const uint64_t *header, *limit, *primed;
-    const double *mean, *photons;
+    const double *mean, *photons, *counted;
     const int64_t *truth;
     void *mapped;
     size_t mapped_bytes;

@@ -62,6 +62,25 @@ def test_what_the_host_names_is_the_same_on_both() -> None:
     assert pair.differences() == []
 
 
+def clicks_of_short_light(dead: float) -> list[bytes]:
+    """The C core's clicks in 200 exposures that are lit for a part, of detectors with a dead time; the simulator's are the same."""
+    pair = Pair("host-driven", dead=dead)
+    pair.open()
+    for _ in range(5):
+        pair.arm(cycles=15)
+        for exposure in range(60):
+            pair.command(Opcode.SHOW, pack_show(Show(exposure, 1, exposure % 4, 3, 4)), ticks=1)
+        pair.after(pair.profile.clock.tick_hz)
+    assert pair.differences() == []
+    blocks = [wire.decode_clicks(frame.payload) for frame in pair.heard[1] if frame.type == MessageType.CLICKS]
+    assert sum(int((block.patterns == 1).sum()) for block in blocks) > 150
+    return [block.bits.tobytes() for block in blocks]
+
+
+def test_dead_time_and_light_for_a_part_of_an_exposure_are_the_same_on_both() -> None:
+    assert clicks_of_short_light(0.0) != clicks_of_short_light(0.9)
+
+
 @pytest.mark.parametrize("mode", ["sequential", "parallel"])
 def test_a_shut_window_holds_back_and_drops_alike(mode: str) -> None:
     pair = Pair(mode, buffer=9)

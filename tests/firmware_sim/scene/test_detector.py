@@ -7,10 +7,12 @@ from dataclasses import replace
 import naive_detector as naive
 import numpy as np
 import pytest
+from naive_dead_time import share_of_clicks
 
 from pans.firmware_sim.scene.detector import sample_clicks, uniform_numbers
 from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
+from pans.runtime.instrument.dead_time import DeadTime
 from pans.runtime.instrument.profile import load_profile
 
 N = 200_000
@@ -145,16 +147,10 @@ def test_only_declared_effects_are_modelled() -> None:
     assert detector_model(load_profile("ideal"), 1000.0) == DetectorModel(ClickLaw())
     spad = detector_model(load_profile("dmd-spad"), 50.0)
     assert spad.afterpulse_probability == 0.005
-    assert spad.dead_fraction == 0  # 24 ns of 50 us
+    assert spad.law.dead_time == DeadTime()  # 24 ns of 50 us
     fast = detector_model(load_profile("wdm-snspd"), 1.0)
-    assert fast.dead_fraction == pytest.approx(6.7e-3)
+    assert fast.law.dead_time.dead == pytest.approx(6.7e-3)
     assert fast.crosstalk_probability == 0.001
-    led = load_profile("microled-spad")
-    assert (
-        detector_model(led, 2.3).dead_fraction == 0
-    )  # 35 ns of 2.3 us, but half a microsecond of readout comes between
-    unread = replace(led, exposure=replace(led.exposure, readout_us=0.01))
-    assert detector_model(unread, 2.3).dead_fraction == pytest.approx(0.035 / 2.3)
 
 
 def test_crosstalk_needs_neighbours() -> None:
@@ -163,7 +159,10 @@ def test_crosstalk_needs_neighbours() -> None:
     assert detector_model(profile, 1000.0).crosstalk_probability == 0
 
 
-def test_dead_time_saturates_the_rate() -> None:
-    model = DetectorModel(ClickLaw(0.1), dead_fraction=0.5)
-    p = first_click_probability(model, np.array([0.0, 1.9, 1e6]))
-    np.testing.assert_allclose(p, -np.expm1(-np.array([0.1 / 1.05, 2.0 / 2.0, 2.0])), rtol=1e-5)
+def test_clicks_with_dead_time_come_as_often_as_those_of_single_photons() -> None:
+    blinded = DetectorModel(ClickLaw(0.1, dead_time=DeadTime(0.8, 0.2)))
+    p = first_click_probability(blinded, np.array([1.9]))
+    clicks = sample_clicks(blinded, np.broadcast_to(p, (N, 1)), 5, 0, no_clicks(1))
+    wanted, error = share_of_clicks(2.0, 0.8, 0.2, False, False, N, 3)
+    assert abs(clicks.mean() - wanted) < 5 * np.hypot(error, five_sigma(wanted, N) / 5)
+    assert wanted < -np.expm1(-2.0) - 0.05

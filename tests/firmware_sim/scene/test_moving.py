@@ -36,7 +36,7 @@ from pans.firmware_sim.scene import cells as cells_module
 from pans.firmware_sim.scene import shifts
 from pans.firmware_sim.scene.cells import CellFlow
 from pans.firmware_sim.scene.changes import Changes
-from pans.firmware_sim.scene.detector_model import detector_model
+from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model, first_click_probability
 from pans.firmware_sim.scene.exposure_times import Exposures
 from pans.firmware_sim.scene.marks import MARK_PHOTONS
 from pans.firmware_sim.scene.moving import Cells, Change, SceneFile, Tape
@@ -46,6 +46,8 @@ from pans.firmware_sim.scene.shifts import ShiftTable, shift_table
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.scene.tape import BarTable, TapeFlow
 from pans.runtime.errors import ConfigError
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.dead_time import DeadTime
 from pans.runtime.instrument.profile import ObjectModulator, load_profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm
@@ -353,7 +355,7 @@ def test_another_run_meets_other_cells() -> None:
 
 
 def test_changes_add_up_as_declared() -> None:
-    model = detector_model(FLOW, 2.0)
+    model = detector_model(replace(FLOW, detector=replace(FLOW.detector, dead_time_ns=0.0)), 2.0)
     changes = Changes(
         (
             Change("dark", 1.0, 2.0, -1, 100.0),
@@ -377,10 +379,18 @@ def test_changes_add_up_as_declared() -> None:
             [0.6 * 0.3 + dark, 0.6 * 0.3 + dark, np.nan],
         ]
     )
-    dead_time = model.dead_fraction
-    wanted = np.nan_to_num(-np.expm1(-mean / (1 + mean * dead_time)))
+    wanted = np.nan_to_num(-np.expm1(-mean))
     np.testing.assert_allclose(changes.probability(model, light, times, 2e-6), wanted, rtol=1e-12)
     assert not Changes((), 3)
+
+
+def test_dead_time_counts_after_all_that_changed() -> None:
+    blinded = DetectorModel(ClickLaw(0.01, dead_time=DeadTime(0.5)))
+    brighter = Changes((Change("burst", 0.0, 1.0, -1, 1e6), Change("dark", 0.0, 1.0, -1, 20.0)), 1)
+    found = brighter.probability(blinded, np.array([[1.0]]), np.array([0.5]), 2e-6)
+    wanted = first_click_probability(blinded, np.array([[1.0 + 2.0 + 0.19]]))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    assert found[0, 0] < -np.expm1(-3.2) - 0.03
 
 
 def test_a_dead_channel_is_silent_in_spite_of_crosstalk() -> None:

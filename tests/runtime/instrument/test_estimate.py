@@ -25,6 +25,7 @@ from pans.runtime.instrument.calibration import (
     save_calibration,
 )
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
+from pans.runtime.instrument.dead_time import DeadTime
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread, log_likelihood
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.intervals import CHI2_95
@@ -65,7 +66,7 @@ def test_noisy_law_is_that_of_clicks(mean: float) -> None:
     assert NOISY.log_miss_slope(at + step) == pytest.approx(slope, rel=1e-4)
 
 
-@pytest.mark.parametrize("model", [PLAIN, NOISY, CountModel(ClickLaw(), dead_fraction=0.02)])
+@pytest.mark.parametrize("model", [PLAIN, NOISY, CountModel(ClickLaw(dead_time=DeadTime(0.3)))])
 def test_maximum_and_interval_against_a_grid(model: CountModel) -> None:
     counts = counts_of([0.0, 50.0, 80.0, 110.0], [9, 130, 160, 178], [3000, 200, 200, 200])
     fit = fit_light(counts, model)

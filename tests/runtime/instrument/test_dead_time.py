@@ -1,0 +1,149 @@
+"""Dead time: the law against a detector simulated photon by photon, its table, and the same numbers in torch (fixed seeds)."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from naive_dead_time import share_of_clicks
+
+from pans.runtime.instrument import dead_time as law_module
+from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law, click_probability
+from pans.runtime.instrument.dead_time import DeadTime, counted_mean, counted_slope
+from pans.runtime.instrument.profile import load_profile
+
+MEANS = (0.2, 1.0, 3.0, 8.0, 20.0)
+KINDS = tuple(itertools.product((False, True), repeat=2))  # free-running, paralysable
+WORST = 0.002
+
+
+def settings() -> list[tuple[DeadTime, float]]:
+    """Contiguous exposures and pauses of a third and four fifths of the dead time, every kind, dim to bright."""
+    found = []
+    for dead, part, (free, paralysable) in itertools.product(
+        (0.02, 0.1, 0.3, 0.5, 0.8, 1.0, 1.2), (0, 0.3, 0.8), KINDS
+    ):
+        fits = dead <= 1 + part * dead and (part > 0 or not free)
+        found += [(DeadTime(dead, part * dead, free, paralysable), mean) for mean in MEANS if fits]
+    return found
+
+
+def off(dead_time: DeadTime, mean: float, exposures: int, seed: int) -> tuple[float, float]:
+    """By how much the law misses the simulated share, and the standard error of that share."""
+    kind = (dead_time.dead, dead_time.pause, dead_time.free_running, dead_time.paralysable)
+    share, error = share_of_clicks(mean, *kind, exposures, seed)
+    return abs(float(click_probability(ClickLaw(dead_time=dead_time), mean)) - share), error
+
+
+def test_the_law_against_every_photon() -> None:
+    for number, (dead_time, mean) in enumerate(settings()[::7]):
+        found, error = off(dead_time, mean, 400_000, number)
+        assert error < 0.0012
+        assert found < WORST, (dead_time, mean)
+
+
+@pytest.mark.slow
+def test_the_law_against_every_photon_on_the_whole_grid() -> None:
+    grid = settings()
+    assert len(grid) >= 200
+    found = [off(*one, 4_000_000, number) for number, one in enumerate(grid)]
+    assert max(error for _, error in found) < 0.0004
+    assert max(wrong for wrong, _ in found) < WORST
+
+
+@pytest.mark.parametrize(("mean", "dead", "share"), [(3.0, 0.1, 0.949), (1.0, 0.5, 0.594)])
+def test_the_figures_of_an_audit_by_other_code(mean: float, dead: float, share: float) -> None:
+    """Simulated elsewhere, contiguous; n / (1 + n tau) as a mean gives 0.900 and 0.487."""
+    assert abs(float(click_probability(ClickLaw(dead_time=DeadTime(dead)), mean)) - share) < WORST
+
+
+@pytest.mark.parametrize(
+    "dead_time",
+    [DeadTime(0.0, 0.4, True, True), DeadTime(0.3, 0.3), DeadTime(0.3, 0.5, False, True), ClickLaw().dead_time],
+)
+def test_a_pause_that_outlasts_it_leaves_nothing(dead_time: DeadTime) -> None:
+    mean = np.array([0.0, 0.5, 1e7])
+    assert np.array_equal(counted_mean(dead_time, mean), mean)
+    assert np.array_equal(counted_slope(dead_time, mean), np.ones(3))
+
+
+CASES = (
+    *(DeadTime(0.5, 0.0, False, kind) for kind in (False, True)),
+    DeadTime(0.02, 0.01),
+    DeadTime(0.9, 0.2),
+    DeadTime(1.1, 0.2, True),
+    DeadTime(1.1, 0.2, True, True),
+    DeadTime(0.004, 0.0, False, True),
+)
+
+
+@pytest.mark.parametrize("dead_time", CASES)
+def test_the_table_is_fine_enough(dead_time: DeadTime) -> None:
+    mean = np.exp(np.random.default_rng(1).uniform(-6, 4, 40))
+    mean.sort()
+    exact = (law_module._paralysable if dead_time.paralysable else law_module._non_paralysable)(dead_time, mean)
+    silent = np.exp(-counted_mean(dead_time, mean))
+    np.testing.assert_allclose(silent, np.exp(-exact), atol=2e-5)
+    np.testing.assert_allclose(-np.expm1(-exact[:8]), 1 - silent[:8], rtol=1e-4)
+
+
+@pytest.mark.parametrize("dead_time", CASES)
+def test_the_slope_is_the_derivative(dead_time: DeadTime) -> None:
+    mean = np.exp(np.random.default_rng(2).uniform(-4, 3, 50))
+    difference = (counted_mean(dead_time, mean * (1 + 1e-6)) - counted_mean(dead_time, mean)) / (mean * 1e-6)
+    np.testing.assert_allclose(counted_slope(dead_time, mean), difference, atol=2e-3)
+
+
+def test_more_light_clicks_more_unless_it_paralyses() -> None:
+    mean = np.geomspace(1e-3, law_module.LARGEST_MEAN, 400)
+    for dead_time in CASES:
+        p = click_probability(ClickLaw(dead_time=dead_time), mean)
+        assert (np.diff(p) >= -1e-5).all() or dead_time.paralysable
+        assert (p <= click_probability(ClickLaw(), mean) + 1e-12).all()
+    assert p[-1] < 1e-6  # the last of them is paralysed
+
+
+def test_both_chances_agree() -> None:
+    law = ClickLaw(0.01, dead_time=DeadTime(0.5))
+    mean = np.array([0.0, 1e-6, 0.7, 30.0])
+    click, miss = both_chances(law, mean)
+    np.testing.assert_allclose(click + miss, 1.0)
+    np.testing.assert_allclose(click, click_probability(law, mean))
+
+
+@pytest.mark.parametrize("wrong", [{"dead": -0.1}, {"dead": 1.1}, {"pause": -1.0}, {"pause": np.inf}, {"dead": np.nan}])
+def test_what_no_detector_has_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="found"):
+        DeadTime(**wrong)
+
+
+def test_a_profile_says_what_its_detector_does() -> None:
+    led = load_profile("microled-spad")  # 35 ns, and half a microsecond of readout
+    assert click_law(led, 2.3).dead_time == DeadTime()
+    free = replace(led, detector=replace(led.detector, between_exposures="free-running", dead_time_kind="paralysable"))
+    readout = led.exposure.readout_us / 2.3
+    found = click_law(free, 2.3).dead_time
+    assert (found.dead, found.pause) == pytest.approx((0.035 / 2.3, readout))
+    assert found.free_running
+    assert found.paralysable
+    longest = replace(free, detector=replace(free.detector, dead_time_ns=1000 * (2.3 + led.exposure.readout_us)))
+    assert click_law(longest, 2.2999).dead_time.dead == pytest.approx(1 + led.exposure.readout_us / 2.2999)
+    assert click_law(load_profile("dmd-spad"), 50.0).dead_time == DeadTime()  # 24 ns: below a permille
+
+
+def test_torch_has_the_same_numbers_and_their_derivative() -> None:
+    torch = pytest.importorskip("torch")
+    from pans.trainer.adaptive.outcomes import no_click
+    from pans.trainer.model import detection
+
+    for dead_time in CASES:
+        law = ClickLaw(0.02, dead_time=dead_time)
+        light = torch.tensor([0.0, 0.1, 1.0, 7.0, 60.0], dtype=torch.float64, requires_grad=True)
+        p = detection.click_probability(light, law)
+        np.testing.assert_allclose(p.detach(), click_probability(law, light.detach().numpy()), rtol=1e-9)
+        p.sum().backward()
+        silent, fall = no_click(light.detach(), law)
+        np.testing.assert_allclose(silent, 1 - p.detach(), atol=1e-12)
+        np.testing.assert_allclose(fall, light.grad, atol=1e-12)
