@@ -152,10 +152,11 @@ def test_a_real_run_decides_what_the_simulator_in_python_decides(mode: str, list
     assert replay(recording, setup(mode)[1]).sha256 == recording.decisions_sha256
     stream = summary["stream"]
     assert summary["device"]["firmware"].startswith("pans-reference")
-    assert (summary["decisions"], summary["contradictions"], summary["wrong_patterns"]) == (24, {}, 0)
+    assert (summary["decisions"], summary["contradictions"]) == (24, {})
     assert (stream["lost_exposures"], stream["device_drops"], stream["malformed"]) == (0, 0, 0)
-    # a host that names states may be stopped by the machine: then its walks are other ones
+    # a host that names states may be stopped by the machine: then slots stay dark, and its walks are other ones
     if not summary.get("late_slots"):
+        assert summary["wrong_patterns"] == 0
         in_python(mode, 24, tmp_path / "python.pansrec")
         assert decided(tmp_path / "c.pansrec") == decided(tmp_path / "python.pansrec")
 

@@ -100,6 +100,7 @@ def test_reads_a_good_profile():
 def test_effects_that_are_not_declared_are_absent():
     detector = parse_profile(GOOD, "lab.toml").detector
     assert detector.read_noise_e == detector.dead_time_ns == 0.0
+    assert (detector.dead_time_kind, detector.between_exposures) == ("non-paralysable", "gated")
     assert detector.afterpulse_probability == detector.crosstalk_probability == 0.0
     bare = GOOD.replace("[object]\ncontrast = 50.0\nlevels = 256\n", "")
     assert parse_profile(bare, "lab.toml").object_modulator is None
@@ -167,6 +168,8 @@ def test_a_wrong_value_is_named_with_its_place(key, line, words):
         ("afterpulse_probability = 1.5", ["from 0 to 1", "found 1.5"]),
         ("crosstalk_probability = 0.1", ["must be 0 with 1 channel"]),
         ("dead_time_ns = 110001", ["at most exposure.min_us + exposure.readout_us = 110000 ns", "found 110001"]),
+        ('dead_time_kind = "extended"', ['must be "non-paralysable" or "paralysable"', 'found the text "extended"']),
+        ('between_exposures = "free"', ['must be "gated" or "free-running"', 'found the text "free"']),
     ],
 )
 def test_a_wrong_optional_value_is_named_too(line, words):
