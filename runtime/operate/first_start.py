@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
+from pans.runtime.errors import PansError
+
 from .warm import JOBS, PATIENCE_S, Job, cache_folder, start
 
 LARGEST = "core"  # the job of the other process
@@ -27,14 +29,14 @@ PACKAGES = ("core", "decide", "wire", "turn")  # whose sources the largest kerne
 @contextmanager
 def compiled_beside() -> Iterator[Callable[[], None]]:
     """Begin to compile beside this process, if that has not been done; yield what waits until it is done."""
-    stamp = _stamp()
-    if stamp is None or stamp.exists():
+    process = _begin()
+    if process is None:
         yield lambda: None
         return
-    process = start(Job(LARGEST, ("-m", "pans.runtime.operate.warm", LARGEST)))
 
     def wait() -> None:
-        JOBS[BESIDE]()
+        with suppress(OSError, PansError):  # it writes a file that nobody needs
+            JOBS[BESIDE]()
         with suppress(subprocess.TimeoutExpired):  # then this process compiles, as it would have without the other
             process.communicate(timeout=PATIENCE_S)
             if process.returncode == 0:
@@ -46,6 +48,15 @@ def compiled_beside() -> Iterator[Callable[[], None]]:
         if process.poll() is None:
             process.kill()
             process.communicate()
+
+
+def _begin() -> subprocess.Popen[str] | None:
+    """Start the other process; None where it is not needed or not possible."""
+    with suppress(OSError):
+        stamp = _stamp()
+        if stamp is not None and not stamp.exists():
+            return start(Job(LARGEST, ("-m", "pans.runtime.operate.warm", LARGEST)))
+    return None
 
 
 def note_compiled() -> None:
