@@ -12,10 +12,12 @@ import gc
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
+
+from .page_faults import held_heap
 
 SUB_BITS = 5  # 32 steps per octave: a quantile is at most 3.2 % above the true value
 N_BUCKETS = 64 << SUB_BITS
@@ -139,12 +141,15 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     granted["gc_off"] = "granted"
     granted["switch_interval_s"] = SWITCH_INTERVAL_S
     threads = [0, *other_threads]
+    held = ExitStack()
     if wanted:
         granted["sched_fifo"] = _request_fifo(threads)
         granted["mlockall"] = _request_mlockall()
+        granted["heap_touched"] = held.enter_context(held_heap())
     try:
         yield granted
     finally:
+        held.close()
         sys.setswitchinterval(interval)
         gc.enable()
         if not _heap.frozen:
