@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program
+from pans.runtime.wire.fields import LARGEST_TICK
 from pans.runtime.wire.messages import DARK_PATTERN
 
 I64 = NDArray[np.int64]
@@ -31,9 +32,17 @@ class Exposures:
         self.longest_period_ticks = int(np.diff(program.offsets, append=program.offsets[0] + program.cycle_ticks).max())
 
     def begins(self, first: int, count: int) -> I64:
-        """Ticks at which exposures first..first+count-1 begin, int64 (count,)."""
-        ticks = [self._long_offsets[part] + cycle * self._long_ticks for cycle, part in self._parts(first, count)]
+        """Ticks at which exposures first..first+count-1 begin, int64 (count,); LARGEST_TICK for those that the counter does not reach."""
+        parts = self._parts(first, count)
+        if parts and (parts[-1][0] + 1) * self._long_ticks > LARGEST_TICK:
+            return np.array([min(self.begin(first + k), LARGEST_TICK) for k in range(count)], np.int64)
+        ticks = [self._long_offsets[part] + cycle * self._long_ticks for cycle, part in parts]
         return ticks[0] if len(ticks) == 1 else np.concatenate(ticks)
+
+    def begin(self, exposure: int) -> int:
+        """Tick at which one exposure begins; of any size, since the next mark may lie beyond the end of the counter."""
+        cycle, slot = divmod(exposure, self._n_slots)
+        return cycle * self._cycle_ticks + int(self._offsets[slot])
 
     def begins_of(self, exposures: I64) -> I64:
         """Ticks at which `exposures` begin, int64 of the same shape."""

@@ -144,7 +144,7 @@ class StillMarks:
     def mark(self) -> Mark:
         """The next mark; its tick counts from the start of the run."""
         exposure = self._object * self._program.cycles_per_object * self._program.n_slots
-        tick = int(self._exposures.begins(exposure, 1)[0])
+        tick = self._exposures.begin(exposure)
         number = self._object % NO_OBJECT
         photons = self._photons_of(number % self._scene.n_objects)
         if self._changes:
