@@ -14,6 +14,7 @@ from pans.runtime.lazy_names import lazy_names
 
 from .calibration import Calibration, load_calibration
 from .click_law import ClickLaw, click_law, click_probability
+from .dead_time import DeadTime
 from .profile import Profile, load_profile, parse_profile, shipped_profiles
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = [
     "ChannelWatch",
     "ClickLaw",
     "DeadChannelTest",
+    "DeadTime",
     "Profile",
     "click_law",
     "click_probability",

@@ -85,6 +85,15 @@ def counted_slope(dead_time: DeadTime, mean: F64) -> F64:
 
 
 @lru_cache(maxsize=64)
+def mean_of_most_clicks(dead_time: DeadTime) -> float:
+    """Return the mean beyond which more light clicks less often, as it does where it paralyses; inf where there is none."""
+    if not (dead_time.reach and dead_time.paralysable):
+        return math.inf
+    mean = np.expm1(_MARKS)
+    return float(mean[np.argmax(mean * counted_table(dead_time))])
+
+
+@lru_cache(maxsize=64)
 def counted_table(dead_time: DeadTime) -> F64:
     """Return counted over true mean at `log(1 + mean)` = 0, STEP, 2 STEP, ... up to LARGEST_MEAN, float64 (INTERVALS + 1,), read-only."""
     mean = np.expm1(_MARKS[1:])

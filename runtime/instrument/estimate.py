@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pans.runtime.intervals import CHI2_95, chi2_quantile, chi2_tail
 
 from .click_law import ClickLaw, survival_coefficients
-from .dead_time import counted_mean, counted_slope
+from .dead_time import counted_mean, counted_slope, mean_of_most_clicks
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -72,23 +72,33 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CountModel:
-    """What of the detector is taken as known: the law without its dark counts."""
+    """What of the detector is taken as known: the law without its dark counts.
+
+    Light beyond the most clicks that a paralysed detector gives is taken as that light: clicks cannot tell the two apart.
+    """
 
     law: ClickLaw
 
     def log_miss(self, mean: F64) -> F64:
         """Log probability that `mean` photoelectrons (any shape, up to some hundreds) leave the exposure silent."""
-        counted = counted_mean(self.law.dead_time, mean)
+        counted = self._counted(mean)
         return -counted if self._plain else np.log(_series(_survival(self.law)[0], counted)) - counted
 
     def log_miss_slope(self, mean: F64) -> F64:
         """Its derivative."""
-        inner = counted_slope(self.law.dead_time, mean)
+        inner = np.where(mean < self._most, counted_slope(self.law.dead_time, np.minimum(mean, self._most)), 0.0)
         if self._plain:
             return -inner
-        counted = counted_mean(self.law.dead_time, mean)
+        counted = self._counted(mean)
         powers, slopes = _survival(self.law)
         return (_series(slopes, counted) / _series(powers, counted) - 1.0) * inner
+
+    def _counted(self, mean: F64) -> F64:
+        return counted_mean(self.law.dead_time, np.minimum(mean, self._most))
+
+    @property
+    def _most(self) -> float:
+        return mean_of_most_clicks(self.law.dead_time)
 
     @property
     def _plain(self) -> bool:

@@ -12,6 +12,7 @@ from naive_dead_time import share_of_clicks
 from pans.runtime.instrument import dead_time as law_module
 from pans.runtime.instrument.click_law import ClickLaw, both_chances, click_law, click_probability
 from pans.runtime.instrument.dead_time import DeadTime, counted_mean, counted_slope
+from pans.runtime.instrument.estimate import CountModel, Counts, fit_light
 from pans.runtime.instrument.profile import load_profile
 
 MEANS = (0.2, 1.0, 3.0, 8.0, 20.0)
@@ -69,6 +70,18 @@ def test_a_pause_that_outlasts_it_leaves_nothing(dead_time: DeadTime) -> None:
     assert np.array_equal(counted_slope(dead_time, mean), np.ones(3))
 
 
+@pytest.mark.parametrize("dead_time", [DeadTime(0.6), DeadTime(0.6, 0.2, True, True)])
+def test_a_calibration_finds_the_light_of_a_blinded_detector(dead_time: DeadTime) -> None:
+    kind = (dead_time.dead, dead_time.pause, dead_time.free_running, dead_time.paralysable)
+    n, drive = 200_000, np.array([0.4, 0.8, 1.2])
+    clicks = [round(n * share_of_clicks(mean, *kind, n, 11 + at)[0]) for at, mean in enumerate(drive.tolist())]
+    dark = np.append(clicks, 0), np.full(4, n, np.int64), np.zeros(4), np.arange(4)
+    counts = Counts(np.append(drive, 0.0), *dark)
+    found, unaware = (fit_light(counts, CountModel(ClickLaw(dead_time=one))).level for one in (dead_time, DeadTime()))
+    assert found.low - 0.005 < 1.0 < found.high + 0.005
+    assert abs(found.value - 1.0) < 0.01 < 0.04 < abs(unaware.value - 1.0)
+
+
 CASES = (
     *(DeadTime(0.5, 0.0, False, kind) for kind in (False, True)),
     DeadTime(0.02, 0.01),
@@ -103,6 +116,17 @@ def test_more_light_clicks_more_unless_it_paralyses() -> None:
         assert (np.diff(p) >= -1e-5).all() or dead_time.paralysable
         assert (p <= click_probability(ClickLaw(), mean) + 1e-12).all()
     assert p[-1] < 1e-6  # the last of them is paralysed
+
+
+def test_light_beyond_the_most_clicks_is_taken_as_that_light() -> None:
+    paralysed = DeadTime(1.1, 0.2, True, True)  # clicks in mean exp(-1.1 mean) of all exposures, at most at 1/1.1
+    assert law_module.mean_of_most_clicks(paralysed) == pytest.approx(1 / 1.1, rel=0.01)
+    assert law_module.mean_of_most_clicks(replace(paralysed, paralysable=False)) == np.inf
+    model = CountModel(ClickLaw(dead_time=paralysed))
+    miss = model.log_miss(np.array([0.5, 0.91, 3.0, 100.0]))
+    assert miss[0] > miss[1]
+    assert np.exp(miss[1:]) == pytest.approx(1 - np.exp(-1) / 1.1, abs=1e-4)
+    assert model.log_miss_slope(np.array([3.0]))[0] == 0.0
 
 
 def test_both_chances_agree() -> None:
