@@ -12,13 +12,13 @@ from pathlib import Path
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder
-from pans.trainer import frontier, paper
+from pans.trainer.claims.index import rewrite_index
+from pans.trainer.claims.known import PAGES, page_of
 from pans.trainer.paper import Asked, Made, Page, rewrite_page, write_page
 from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
-PAGES = (*paper.PAGES, *frontier.NAMES)
 SEEDS_MAX = 100
 THREADS_MAX = 1024
 NEEDS_TORCH = "pip install 'pans-runtime[train]'"
@@ -77,6 +77,7 @@ def _run(args: argparse.Namespace) -> int:
             results[name] = _measured(name, args)
             if args.out:
                 write_page(args.out, name, *results[name])
+                rewrite_index(args.out)
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
         return EXIT_INTERRUPTED
@@ -84,11 +85,6 @@ def _run(args: argparse.Namespace) -> int:
     blocks = [page.around(page.block(name, made.rows, made.pictures)) for name, (page, made) in results.items()]
     emit(args, {"rows": rows, "simulated": True}, "\n\n".join(blocks))
     return EXIT_FINE
-
-
-def page_of(name: str) -> Page:
-    """Return the page of that name, of the paper or of the frontier."""
-    return frontier.PAGES[name] if name in frontier.NAMES else paper.page_of(name)
 
 
 def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
@@ -101,6 +97,7 @@ def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
             raise UsageError(f"{path} is not there", remedy=f"measure it: pans reproduce {name} -o {args.out}")
         rewrite_page(args.out, name, page_of(name))
         rows += read_rows(args.out, name)
+    rewrite_index(args.out)
     emit(args, {"rows": rows, "simulated": True}, "\n".join(f"{args.out / name}.md" for name in names))
     return EXIT_FINE
 

@@ -27,10 +27,11 @@ from pans.runtime.outputs import replace_file
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task
+from pans.trainer.verdicts import against, claim, sampling_error, training_spread
 
 from . import plots
 from .page import Asked, Made, Row, Rows, Table, check_cached_bundle, columns, finished, kept, pages
-from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
+from .tables import ACTIVE, CLICKS_TOLERANCE, DIRECT, DIRECT_ERRORS, FIRST, FIRST_OBJECTS, SHOTS, ActiveRow
 
 PROFILE = "ideal"
 TRIALS = {FIRST_OBJECTS: 100, 10_000: 10}  # where the outcomes are too many to enumerate
@@ -149,8 +150,13 @@ def direct_at(name: str, photons: float) -> dict[str, Any]:
     """Return noise-aware direct imaging at the same photons: accuracy by interpolation in log photons, none extrapolated."""
     levels = DIRECT[name]
     inside = min(max(photons, min(levels)), max(levels))
-    accuracy = np.interp(math.log(inside), [math.log(level) for level in levels], list(levels.values()))
-    return {"accuracy_mean": float(accuracy) / 100, "photons_mean": inside}
+    accuracy, error = (_interpolated(of[name], inside) / 100 for of in (DIRECT, DIRECT_ERRORS))
+    return {"accuracy_mean": accuracy, "accuracy_se_objects": error, "photons_mean": inside}
+
+
+def _interpolated(levels: dict[float, float], photons: float) -> float:
+    """Interpolate in the logarithm of the photons."""
+    return float(np.interp(math.log(photons), [math.log(level) for level in levels], list(levels.values())))
 
 
 def passed(row: ActiveRow, figures: dict[str, Any], shots: int = 1) -> tuple[float, bool]:
@@ -200,7 +206,10 @@ def active_page(asked: Asked) -> Made:
             f"{name} d_f={row.features}: {ahead:+.2f} points, clicks {'fine' if clicks_fine else 'above +5 %'}"
         )
         printed = {key: getattr(row, key) for key in ("features", "simulation", "experiment", "clicks", "illumination")}
-        done.append({"task": name, "paper": printed, **figures})
+        direct = direct_at(
+            name, figures["all"]["1"]["photons_mean"]
+        )  # not that of the cache: the curve may have more levels now
+        done.append({"task": name, "paper": printed, **figures, "direct": direct})
     return Made(done, {"": partial(plots.accuracy_against_photons, name=name, rows=done)} if done else {})
 
 
@@ -210,17 +219,45 @@ def active_tables(rows: Rows) -> list[Table]:
     others = [other | {"moved": _moved(row, other)} for row in rows for other in row.get("other_seeds", ())]
     first = f"## First {FIRST_OBJECTS} test images, as in the paper (accuracy %, K = 1 / 2 / 3 / 5)"
     seeds = Table(columns("active_seeds"), others, "## Other seeds (accuracy %, K = 1 / 2 / 3 / 5)")
+    beside_paper = [
+        claim(f"K = {shots}: ours", "the paper's simulation", [row["beside_paper"][i] for row in shown])
+        for i, shots in enumerate(SHOTS)
+    ]
+    beside_direct = claim("Ours", "direct imaging at these photons", [row["beside_direct"] for row in shown])
     found = [
-        Table(columns("active_first"), shown, first),
-        Table(columns("active_all"), shown, "## All 10 000 test images"),
+        Table(columns("active_first"), shown, first, beside_paper),
+        Table(columns("active_all"), shown, "## All 10 000 test images, K = 1", [beside_direct]),
     ]
     return [*found, seeds] if others else found
 
 
 def _compared(row: Row) -> Row:
+    """What the tables say of a row beside the paper's simulation (per number of shots), and beside direct imaging (one shot)."""
     trials = row["all"]["1"]["trials"]
-    ahead = 100 * row[FIRST]["1"]["accuracy_mean"] - row["paper"]["simulation"][0]
-    return {"ahead": ahead, "how": f"{trials} trials" if trials else "exact"}
+    trained = [row, *row.get("other_seeds", ())]
+    direct, direct_error = (100 * row["direct"][key] for key in ("accuracy_mean", "accuracy_se_objects"))
+    beside_paper = [
+        beside(trained, FIRST, str(shots), printed, sampling_error(printed, FIRST_OBJECTS))
+        for shots, printed in zip(SHOTS, row["paper"]["simulation"])
+    ]
+    return {
+        "how": f"{trials} trials" if trials else "exact",
+        "trainings": len(trained),
+        "beside_paper": beside_paper,
+        **{f"{key}_of_paper": [found[key] for found in beside_paper] for key in ("ahead", "error", "verdict")},
+        "beside_direct": beside(trained, "all", "1", direct, direct_error),
+    }
+
+
+def beside(trained: Rows, part: str, shots: str, theirs: float, their_error: float) -> Row:
+    """Hold the first of the trainings of a row against an accuracy in %.
+
+    The errors: ours from having few objects, the spread of one training where there are several, and theirs.
+    """
+    ours = [found[part][shots] for found in trained]
+    spread = training_spread([100 * found["accuracy_mean"] for found in ours])
+    errors = (100 * ours[0]["accuracy_se_objects"], spread, their_error)
+    return against(100 * ours[0]["accuracy_mean"], theirs, *errors)
 
 
 def _moved(row: Row, other: Row) -> Row:

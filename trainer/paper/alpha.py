@@ -20,6 +20,7 @@ from pans.runtime.outputs import replace_file
 from pans.trainer.options import Options, plain_options
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.history import follow
+from pans.trainer.verdicts import against, claim
 
 from . import images, plots
 from .page import Asked, Draw, Made, Row, Rows, Table, columns, kept, pages
@@ -93,7 +94,22 @@ def growth(row: Row) -> float:
 
 def alpha_tables(rows: Rows) -> list[Table]:
     """Return one line per training, of the finished model."""
-    return [Table(columns("alpha"), [row | {"grows": growth(row)} for row in rows])]
+    unweighed = {row["features"]: row["final"] for row in rows if row["alpha"] == 0}
+    shown = [row | {"grows": growth(row), "beside": _held_against(row, unweighed.get(row["features"]))} for row in rows]
+    claims = [
+        claim(f"alpha = {alpha:g}", "alpha = 0", [row["beside"] for row in shown if row["alpha"] == alpha])
+        for alpha in ALPHAS
+        if alpha
+    ]
+    return [Table(columns("alpha"), shown, claims=claims)]
+
+
+def _held_against(row: Row, unweighed: Row | None) -> Row | None:
+    """A training beside the one without alpha; both errors are from having few objects."""
+    if unweighed is None or row["alpha"] == 0:
+        return None
+    final = row["final"]
+    return against(final["value"], unweighed["value"], final["error_objects"], unweighed["error_objects"])
 
 
 # ---- the evolution of patterns ----

@@ -13,7 +13,6 @@ SIMULATED on the profile `ideal`. Finished figures lie in the cache folder, one 
 from __future__ import annotations
 
 import json
-import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from pans.trainer.model.field_basis import principal_fields
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
+from pans.trainer.verdicts import against, claim
 
 from .page import Asked, Made, Row, Rows, Table, cached_row, columns, finished, pages
 from .passive import PROFILE, measure
@@ -155,13 +155,17 @@ def equal_tables(rows: Rows) -> list[Table]:
     """Return every row, and how far ours is ahead of the better direct way at each level."""
     ordered = sorted(rows, key=lambda row: (TASKS.index(row["task"]), row["asked"], WAYS.index(row["way"])))
     compared = [found for row in ordered if row["way"] not in DIRECT and (found := ahead(row, rows)) is not None]
-    return [Table(columns("equal"), ordered), Table(columns("ahead"), compared, "## Ahead of the better direct way")]
+    ours = [way for way in WAYS if way not in DIRECT]
+    claims = [claim(f"`{way}`", "the better direct way", [r for r in compared if r["way"] == way]) for way in ours]
+    heading = "## Beside the better direct way"
+    return [Table(columns("equal"), ordered), Table(columns("ahead"), compared, heading, claims)]
 
 
 def ahead(row: Row, rows: Rows) -> Row | None:
-    """Return a row of ours with `beside` (the better direct way at its task and level), `ahead` in points, and `error`.
+    """Return a row of ours with `beside` (the better direct way at its task and level), `ahead` in points, `error` and `verdict`.
 
-    `error` is the standard error from having few objects, of both together. None where no direct way was measured.
+    `error` is the standard error from having few objects, of both together, as if they had been drawn for each: the pairs are not kept.
+    None where no direct way was measured.
     """
     there = [
         other
@@ -171,8 +175,8 @@ def ahead(row: Row, rows: Rows) -> Row | None:
     if not there:
         return None
     best = max(there, key=lambda other: float(other["value"]))
-    error = math.hypot(row["error_objects"], best["error_objects"])
-    return row | {"beside": best["way"], "ahead": row["value"] - best["value"], "error": error}
+    compared = against(row["value"], best["value"], row["error_objects"], best["error_objects"])
+    return row | {"beside": best["way"]} | compared
 
 
 PAGES = pages({"equal-photons": (equal_page, equal_tables)})

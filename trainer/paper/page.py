@@ -23,6 +23,7 @@ from pans.runtime.cli import say
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import check_outputs, make_folder, replace_file
 from pans.trainer.options import Options, same_options
+from pans.trainer.verdicts import Claim
 
 NEEDS_PLOT = "pip install 'pans-runtime[plot]'"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
@@ -74,15 +75,15 @@ class Column:
 
     def cell(self, row: Row) -> str:
         """Return what stands in the column for `row`."""
-        found = [(at(row, path), form) for path, form in _FIELD.findall(self.template)]
+        found = [(at(row, path), form) for path, form in FIELD.findall(self.template)]
         if any(value is None for value, _ in found):
             return NOTHING
         texts = iter([_written(value, form) for value, form in found])
-        return _FIELD.sub(lambda _: next(texts), self.template)
+        return FIELD.sub(lambda _: next(texts), self.template)
 
 
-_FIELD = re.compile(r"\{([^{}:]+):?([^{}]*)\}")  # path, format
-_UNITS: dict[str, Callable[[Any], Any]] = {
+FIELD = re.compile(r"\{([^{}:]+):?([^{}]*)\}")  # path, format
+UNITS: dict[str, Callable[[Any], Any]] = {
     "": lambda value: value,
     "%": lambda value: 100 * value,
     "min": lambda value: value / 60,
@@ -93,16 +94,17 @@ def _written(value: Any, form: str) -> str:
     if isinstance(value, (list, tuple)):
         return " / ".join(_written(one, form) for one in value)
     spec, _, unit = form.partition(" ")
-    return format(_UNITS[unit](value), spec)
+    return format(UNITS[unit](value), spec)
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns over rows, below a heading (Markdown, none if empty)."""
+    """Columns over rows, below a heading (Markdown, none if empty); below them, how many rows are above, level and below."""
 
     columns: Sequence[Column]
-    rows: Iterable[Row]
+    rows: Sequence[Row]
     heading: str = ""
+    claims: Sequence[Claim] = ()
 
     def lines(self) -> list[str]:
         """Return the table as lines of Markdown."""
@@ -113,6 +115,7 @@ class Table:
             f"| {' | '.join(column.header for column in self.columns)} |",
             "| --- " * len(self.columns) + "|",
             *(f"| {' | '.join(line)} |" for line in cells),
+            *(line for claim in self.claims for line in ("", claim.line())),
         ]
 
 
@@ -126,16 +129,21 @@ class Made:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page: its title, what measures it, the tables made of its rows, and the captions of its pictures by the end of their names."""
+    """A page: its title, what measures it, the tables made of its rows, the captions of its pictures by the end of their names.
+
+    `trainings` says how many trainings stand behind a row.
+    """
 
     title: str
     measure: Callable[[Asked], Made]
     tables: Callable[[Rows], Iterable[Table]]
     captions: Mapping[str, str] = field(default_factory=dict)
+    trainings: str = ""
 
     def block(self, name: str, rows: Rows, pictures: Iterable[str]) -> str:
         """Return what is generated of the page: that it is simulated, its command, tables and pictures."""
-        lines = [f"SIMULATED. Command: `pans reproduce {name}`.", ""]
+        said = f" Trainings: {self.trainings}." if self.trainings else ""
+        lines = [f"SIMULATED. Command: `pans reproduce {name}`.{said}", ""]
         for table in self.tables(rows):
             lines += [*table.lines(), ""]
         for ending in pictures:
@@ -181,7 +189,10 @@ def pages(
 ) -> dict[str, Page]:
     """Return pages with the titles and captions of pages.toml, each by its name and what measures it and makes its tables."""
     facts = _FILE["page"]
-    return {name: Page(facts[name]["title"], *how, facts[name].get("pictures", {})) for name, how in made_by.items()}
+    return {
+        name: Page(facts[name]["title"], *how, facts[name].get("pictures", {}), facts[name].get("trainings", ""))
+        for name, how in made_by.items()
+    }
 
 
 def kept(path: Path, made_with: Row, make: Callable[[], Row], *, collect: bool) -> Row | None:

@@ -18,11 +18,12 @@ from pans.trainer.baselines.nets import EpochOfFit
 from pans.trainer.baselines.options import METHODS, BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.tasks.registry import load_task
+from pans.trainer.verdicts import against, claim
 
 from . import images, plots
 from .active import finished_row
 from .page import Asked, Column, Draw, Made, Row, Rows, Table, columns, kept, pages
-from .tables import ACTIVE, FIRST, FIRST_OBJECTS, SHOTS
+from .tables import ACTIVE, DIRECT, DIRECT_ERRORS, FIRST, FIRST_OBJECTS, SHOTS
 
 TASK = "fashion-mnist"
 LEVELS = (5.0, 10.0, 17.0, 30.0, 100.0, 300.0, 1e3, 5e3, 1e4, 1e6)
@@ -123,9 +124,9 @@ def envelope(rows: Rows) -> Rows:
     return [row | {"way": ENVELOPE} for row in best]
 
 
-def accuracy_at(rows: Rows, place: float, of: str) -> float | None:
-    """Return a curve's accuracy where its figure `of` is `place`, by interpolation in its logarithm; None outside of the curve."""
-    known = sorted((float(row[of]), float(row["accuracy_mean"])) for row in rows)
+def accuracy_at(rows: Rows, place: float, of: str, value: str = "accuracy_mean") -> float | None:
+    """Return a curve's `value` where its figure `of` is `place`, by interpolation in its logarithm; None outside of the curve."""
+    known = sorted((float(row[of]), float(row[value])) for row in rows)
     if not known or not known[0][0] <= place <= known[-1][0]:
         return None
     return float(np.interp(math.log(place), [math.log(x) for x, _ in known], [y for _, y in known]))
@@ -176,7 +177,7 @@ def curve_tables(rows: Rows) -> list[Table]:
     matrix = [Column("way", "{way}"), *(Column(level, f"{{{level}.accuracy_mean:.1f %}}") for level in levels)]
     every = [row | {"how": "" if row["trials"] else " (exact)"} for row in rows]
     return [
-        Table(matrix, by.values(), "## All 10 000 test images, accuracy % over photons"),
+        Table(matrix, list(by.values()), "## All 10 000 test images, accuracy % over photons"),
         Table(columns("curve"), every, "## Everything"),
     ]
 
@@ -184,18 +185,46 @@ def curve_tables(rows: Rows) -> list[Table]:
 def fig_2e_tables(rows: Rows) -> list[Table]:
     """Return the tables of the curves, PANS beside two of them at its own photons and its own illumination, and the commands."""
     curves = {key: [row for row in rows if row["way"] == way] for key, way in _BESIDE.items()}
+    curves["posterior"] += _levels_between(curves["posterior"])
     pans = []
     for row in (row for row in rows if row["way"] == PANS):
-        there = {
-            key: {of: accuracy_at(curve, row[of], of) for of in ("photons_mean", "illumination")}
-            for key, curve in curves.items()
-        }
+        there = {key: {of: _held_against(row, curve, of) for of in _EQUAL} for key, curve in curves.items()}
         pans.append(row | there)
     heading = "## PANS beside direct imaging by the exact posterior and the end-to-end envelope, at equal light"
-    return [*curve_tables(rows), Table(columns("at_equal_light"), pans, heading), _commands(CURVES)]
+    claims = [
+        claim("PANS", f"{way} at equal {words}", [row[key][of] for row in pans])
+        for of, words in _EQUAL.items()
+        for key, way in _BESIDE.items()
+    ]
+    return [*curve_tables(rows), Table(columns("at_equal_light"), pans, heading, claims), _commands(CURVES)]
 
 
 _BESIDE = {"posterior": POSTERIOR.way, "envelope": ENVELOPE}
+_EQUAL = {"photons_mean": "photons", "illumination": "illumination"}
+
+
+def _levels_between(measured: Rows) -> Rows:
+    """The levels of the same curve that other pages measured (tables.toml), between those of this page: interpolation needs them."""
+    if not measured:
+        return []
+    first, *_ = measured
+    of_a_photon = first["illumination"] / first["photons_mean"]
+    known = {row["photons_asked"] for row in measured}
+    return [
+        {"photons_mean": n, "illumination": n * of_a_photon, "accuracy_mean": accuracy / 100}
+        | {"accuracy_se_objects": DIRECT_ERRORS[TASK][n] / 100}
+        for n, accuracy in DIRECT[TASK].items()
+        if n not in known
+    ]
+
+
+def _held_against(row: Row, curve: Rows, of: str) -> Row | None:
+    """Hold a row against a curve where that has as much of `of`; both errors are from having few objects. None outside of the curve."""
+    there, error = (accuracy_at(curve, row[of], of, value) for value in ("accuracy_mean", "accuracy_se_objects"))
+    if there is None or error is None:
+        return None
+    ours, ours_error = 100 * row["accuracy_mean"], 100 * row["accuracy_se_objects"]
+    return {"accuracy_mean": there} | against(ours, 100 * there, ours_error, 100 * error)
 
 
 def end_to_end_tables(rows: Rows) -> list[Table]:

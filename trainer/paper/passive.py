@@ -34,11 +34,12 @@ from pans.trainer.train.anomaly_search import search
 from pans.trainer.train.barcode_search import solve, solve_patterns
 from pans.trainer.train.data import CHUNK, encoder_input
 from pans.trainer.train.loop import Trained, train
+from pans.trainer.verdicts import Claim, against, claim, sampling_error
 
 from . import images, plots
 from .page import Asked, Column, Draw, Made, Row, Rows, Table, check_cached_bundle, columns, finished, pages
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
-from .tables import PASSIVE, UNPRINTED, PassiveRow, table_of
+from .tables import PASSIVE, UNPRINTED, PassiveRow, PassiveTable, table_of
 
 PROFILE = "ideal"
 TRIALS = 5
@@ -220,12 +221,19 @@ def passive_tables(name: str, rows: Rows) -> list[Table]:
     rows = [row | _beside(name, row) for row in rows]
     balanced = [row for row in rows if "balanced" in row]
     others = [row for row in rows if row.get("data_seed")]
-    found = [Table(shown, [row for row in rows if not row.get("data_seed")])]
+    of_draw_0 = [row for row in rows if not row.get("data_seed")]
+    found = [Table(shown, of_draw_0, claims=_claims(of_draw_0))]
     if others:
-        found.append(Table(seeded, others, "## Other draws of the generator"))
+        found.append(Table(seeded, others, "## Other draws of the generator", _claims(others)))
     if balanced:
-        found.append(Table(columns("balanced"), balanced, "## Classes equally likely, without dark counts"))
+        claims = _claims([row["balanced"] for row in balanced])
+        found.append(Table(columns("balanced"), balanced, "## Classes equally likely, without dark counts", claims))
     return found
+
+
+def _claims(rows: Rows) -> list[Claim]:
+    compared = [row for row in rows if "verdict" in row]
+    return [claim("Ours", "the paper", compared)] if compared else []
 
 
 def _beside(name: str, row: Row) -> Row:
@@ -237,8 +245,16 @@ def _beside(name: str, row: Row) -> Row:
     value = printed.values[table.dark.index(row["dark"])]
     clicks = printed.clicks if row["dark"] == table.dark[0] else None
     balanced = row.get("balanced")
-    more = {"balanced": balanced | {"ahead": balanced["value"] - value}} if balanced else {}
-    return {"paper": value, "ahead": row["value"] - value, "paper_clicks": clicks} | more
+    theirs = _their_error(table, value, row)
+    more = {"balanced": balanced | against(balanced["value"], value, theirs)} if balanced else {}
+    return {"paper": value, "paper_clicks": clicks} | against(row["value"], value, row["error_objects"], theirs) | more
+
+
+def _their_error(table: PassiveTable, value: float, row: Row) -> float:
+    """The paper's sampling error, which it does not print: binomial; of SSIM that of ours, as if its objects varied as much."""
+    if table.measure == "SSIM":
+        return float(row["error_objects"]) * (row["objects"] / table.objects) ** 0.5
+    return sampling_error(value, table.objects)
 
 
 PAGES = pages({name: (passive_page, partial(passive_tables, name)) for name in (*PASSIVE, *UNPRINTED)})

@@ -78,7 +78,12 @@ _FILE: dict[str, Any] = tomllib.loads(
 ACTIVE = {name: tuple(_active(name, line) for line in lines) for name, lines in _FILE["active"].items()}
 PASSIVE = {name: _passive(name, table, printed=True) for name, table in _FILE["printed"].items()}
 UNPRINTED = {name: _passive(name, table, printed=False) for name, table in _FILE["unprinted"].items()}
-DIRECT: dict[str, dict[float, float]] = {name: dict(points) for name, points in _FILE["direct"].items()}
+DIRECT: dict[str, dict[float, float]] = {
+    name: {photons: accuracy for photons, accuracy, _ in points} for name, points in _FILE["direct"].items()
+}
+DIRECT_ERRORS: dict[str, dict[float, float]] = {
+    name: {photons: error for photons, _, error in points} for name, points in _FILE["direct"].items()
+}
 
 
 def table_of(name: str) -> PassiveTable:

@@ -39,6 +39,7 @@ from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.data import TrainingData, encoder_input
 from pans.trainer.train.head_fit import joint_distribution
 from pans.trainer.train.loop import Run, Trained, train
+from pans.trainer.verdicts import against, claim, sampling_error
 
 from .active import recipe
 from .page import Asked, Made, Row, Rows, Table, cached_row, columns, pages
@@ -287,13 +288,19 @@ def time_tables(rows: Rows) -> list[Table]:
     for row in rows:
         for key, words in (("ours", "ours"), ("paper", "the paper's recipe")):
             reached = "yes" if row[key]["reached"] else "no"
-            facts = {"features": row["features"], "goal": row["goal"], "way": words}
+            errors = [sampling_error(value, FIRST_OBJECTS) for value in (row[key]["accuracy"], row["goal"])]
+            compared = against(row[key]["accuracy"], row["goal"], *errors)
+            facts = {"features": row["features"], "goal": row["goal"], "way": words, "beside": compared}
             ways.append(row[key] | facts | {"reached": reached})
         theirs, tried = row["paper"]["seconds"], sum(schedule["seconds"] for schedule in row["schedules"])
         than = "" if row["paper"]["reached"] else "more than "
         over = {"over_ours": theirs / row["ours"]["seconds"], "over_all": theirs / tried}
         ratios.append({"features": row["features"], "than": than, "tried": tried} | over)
-    return [Table(columns("raced"), ways), Table(columns("ratios"), ratios)]
+    claims = [
+        claim(f"Last epoch, {words}:", "the goal", [row["beside"] for row in ways if row["way"] == words])
+        for words in ("ours", "the paper's recipe")
+    ]
+    return [Table(columns("raced"), ways, claims=claims), Table(columns("ratios"), ratios)]
 
 
 PAGES = pages({"estimators": (estimators_page, estimators_tables), "time": (time_page, time_tables)})

@@ -39,7 +39,12 @@ def figures_of(row, accuracy, clicks, photons=20.0, direct=0.5):
     one = {"accuracy_mean": accuracy, "accuracy_std": 0.01, "accuracy_se_objects": 0.02, "clicks_mean": clicks}
     one |= {"photons_mean": photons, "illumination": 80.0, "objects": 200, "trials": 0, "shots": 1}
     of_part = {str(shots): one for shots in (1, 2, 3, 5)}
-    return {"first_200": of_part, "all": of_part, "direct": {"accuracy_mean": direct}, "cpu_seconds": 60.0}
+    return {
+        "first_200": of_part,
+        "all": of_part,
+        "direct": {"accuracy_mean": direct, "accuracy_se_objects": 0.004},
+        "cpu_seconds": 60.0,
+    }
 
 
 @pytest.mark.parametrize(("name", "row"), [(name, row) for name, rows in ACTIVE.items() for row in rows])
@@ -86,19 +91,29 @@ def test_the_tables_put_ours_beside_the_papers_row_and_another_seed():
     paper = {key: getattr(row, key) for key in ("features", "simulation", "experiment", "clicks", "illumination")}
     first, whole, moved = active.active_tables([ours | {"features": 4, "paper": paper, "other_seeds": seeds}])
     k = "60.00 / 60.00 / 60.00 / 60.00"
-    assert first.lines()[-1].startswith(
-        f"| 4 | 60.28 / 64.15 / 65.38 / 67.03 | 58.33 / 61.83 / 64.85 / 68.67 | {k} | -0.28 | 2.16"
+    ahead = "-0.28 / -4.15 / -5.38 / -7.03"
+    # 2 points from our objects, 0.71 between two trainings that differ by 1, and the paper's on 200 images: 3.46, 3.39, 3.36, 3.32
+    error = "4.06 / 4.00 / 3.98 / 3.94"
+    assert first.lines()[4].startswith(
+        f"| 4 | 60.28 / 64.15 / 65.38 / 67.03 | 58.33 / 61.83 / 64.85 / 68.67 | {k} | {ahead} | {error} | "
+        "level / level / level / level | 2 | 2.16"
     )
-    assert whole.lines()[-1] == f"| 4 | {k} | 1.00 | 2.00 | 2.10 | 20.0 | 80.0 | exact | 1.0 |"
+    assert first.lines()[6] == "K = 1: ours against the paper's simulation: 0 above, 1 level, 0 below, of 1."
+    # 2 points, 0.71 between trainings, 0.4 of direct imaging
+    assert whole.lines()[4] == (
+        f"| 4 | {k} | 1.00 | 2.00 | 2.10 | 20.0 | 80.0 | -20.00 | 2.16 | below | 2 | exact | 1.0 |"
+    )
     assert moved.lines()[-1].endswith("| 2.20 | +1.00 | +1.00 | +1.00 | +1.00 |")
     assert len(active.active_tables([ours | {"features": 4, "paper": paper}])) == 2  # no other seed, no table of it
 
 
 def test_direct_imaging_is_interpolated_and_never_extrapolated():
     assert active.direct_at("mnist", 5)["accuracy_mean"] == pytest.approx(0.5443)
-    between = active.direct_at("mnist", np.sqrt(5 * 10))["accuracy_mean"]
-    assert between == pytest.approx((0.5443 + 0.7254) / 2)
-    assert active.direct_at("mnist", 1e4) == {"accuracy_mean": pytest.approx(0.9642), "photons_mean": 300}
+    between = active.direct_at("mnist", np.sqrt(100 * 300))
+    assert between["accuracy_mean"] == pytest.approx((0.9529 + 0.9642) / 2)
+    assert between["accuracy_se_objects"] == pytest.approx((0.0021 + 0.0019) / 2)
+    most = {"accuracy_mean": pytest.approx(0.9642), "accuracy_se_objects": pytest.approx(0.0019), "photons_mean": 300}
+    assert active.direct_at("mnist", 1e4) == most
 
 
 def test_a_row_is_trained_measured_and_resumed(bars, tmp_path):

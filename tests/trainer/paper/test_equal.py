@@ -69,9 +69,13 @@ def test_ours_is_held_against_the_better_direct_way():
     assert equal.ahead(rows[0], rows[:3])["ahead"] == 10
     every, leads = equal.equal_tables(rows)
     assert [line.split(" | ")[2] for line in every.lines()[2:]] == list(equal.WAYS)
-    assert leads.lines()[-2:] == [
-        "| fiber | 3 | PANS | network | -1.00 | 1.41 |",  # both with an error of 1 point: 1.41 together
-        "| fiber | 3 | equal light | network | -21.00 | 1.41 |",
+    assert leads.lines()[-6:] == [
+        "| fiber | 3 | PANS | network | -1.00 | 1.41 | level |",  # both with an error of 1 point: 1.41 together
+        "| fiber | 3 | equal light | network | -21.00 | 1.41 | below |",
+        "",
+        "`PANS` against the better direct way: 0 above, 1 level, 0 below, of 1.",
+        "",
+        "`equal light` against the better direct way: 0 above, 0 level, 1 below, of 1.",
     ]
 
 

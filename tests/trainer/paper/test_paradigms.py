@@ -124,7 +124,8 @@ def test_curves_are_read_between_their_ends_only():
     assert paradigms.accuracy_at([], 5.0, "photons_mean") is None
 
 
-def test_pans_stands_beside_the_others_at_its_own_light():
+def test_pans_stands_beside_the_others_at_its_own_light(monkeypatch):
+    monkeypatch.setitem(paradigms.DIRECT, paradigms.TASK, {})  # no levels but those of these rows
     posterior = paradigms.POSTERIOR.way
     direct = [row(posterior, n, a, 784) for n, a in ((10.0, 0.5), (1000.0, 0.9))]
     best = [row(paradigms.ENVELOPE, n, a, 6) for n, a in ((5.0, 0.3), (30.0, 0.45), (5000.0, 0.83))]
@@ -139,11 +140,12 @@ def test_pans_stands_beside_the_others_at_its_own_light():
         f"| {paradigms.ENVELOPE} | 30.0 | - | 45.0 | - | 83.0 |",
     ]
     assert everything[-1].startswith("| PANS | 32 | - | 90.00 | 1.00 | 0.40 | 90.00 |")
-    assert [line.split(" | ")[1:5] for line in beside[4:]] == [
-        ["70.0", "20", "56.0", "41.6"],
-        ["72.0", "200", "76.0", "59.1"],
-        ["90.0", "2000", "-", "76.2"],  # beyond the curve
+    assert [line.split(" | ")[1:9] for line in beside[4:7]] == [  # both errors are 0.4 points
+        ["70.0", "20", "56.0", "+14.0 ± 0.6", "above", "41.6", "+28.4 ± 0.6", "above"],
+        ["72.0", "200", "76.0", "-4.0 ± 0.6", "below", "59.1", "+12.9 ± 0.6", "above"],
+        ["90.0", "2000", "-", "-", "-", "76.2", "+13.8 ± 0.6", "above"],  # beyond the curve
     ]
+    assert beside[8] == f"PANS against {posterior} at equal photons: 1 above, 0 level, 1 below, of 2."
     assert f"| {paradigms.CLEAN.way} | `{paradigms.CLEAN.command()}` |" in commands
 
 

@@ -77,14 +77,21 @@ def test_every_printed_accuracy_has_its_spread():
 
 
 def test_points_meet_where_the_curves_of_more_patterns_reach():
-    curves = {3: [(3, 50.0), (6, 60.0), (9, 62.0), (15, 64.0)], 6: [(6, 65.0), (12, 61.0), (18, 66.0), (30, 70.0)]}
+    curves = {
+        3: [(3, 50.0, 3.0), (6, 60.0, 0.3), (9, 62.0, 3.0), (15, 64.0, 0.3)],
+        6: [(6, 65.0, 0.4), (12, 61.0, 0.04), (18, 66.0, 0.04), (30, 70.0, 0.1)],
+    }
     found = shots.duels(curves)
     assert [(duel.shots, duel.exact) for duel in found] == [(2, True), (3, False), (5, False)]  # 3 x 1 lies outside
     assert found[0].ahead == pytest.approx(5.0)
     between = 65 + (61 - 65) * np.log(9 / 6) / np.log(2)
     assert found[1].ahead == pytest.approx(between - 62)
-    assert shots._won(found[:2]) == "2 of 2 (+0.7)"
-    assert shots._won(found) == "**2 of 3 (-0.2)**"  # one comparison lost
+    assert found[0].error == pytest.approx(0.5)  # 0.3 and 0.4
+    assert found[1].error == pytest.approx(np.hypot(3.0, 0.4 + (0.04 - 0.4) * np.log(9 / 6) / np.log(2)))
+    assert [round(duel.ahead, 1) for duel in found] == [5.0, 0.7, -0.2]
+    assert shots._won(found[:2]) == "1 / 1 / 0 (+0.7)"
+    assert shots._won(found) == "1 / 2 / 0 (-0.2)"
+    assert shots._won([found[2]._replace(error=0.05)]) == "**0 / 0 / 1 (-0.2)**"  # one comparison lost
     assert shots._won([]) is None
 
 
