@@ -23,7 +23,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.live import LiveRun
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Gate, unpack_gate
-from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.frame import Messages, unpack_body
 from pans.runtime.wire.messages import ClickBlock, FrameBlock, Mark
 from pans.runtime.wire.tracker import Gap
 
@@ -32,6 +32,7 @@ from .truths import decoded, walk_truth, window_members
 
 if TYPE_CHECKING:
     from pans.firmware_sim.device.parallel import FrameRun
+    from pans.runtime.turn.engine import Turn
 
 MAX_VIOLATIONS = 20
 MAX_SESSIONS = 8  # streams that are remembered
@@ -169,6 +170,15 @@ class Checker:
             (core, "end", lambda: self._on_output(end())),
         ):
             setattr(owner, name, tap)
+
+        if run.compiled is not None:
+            run.compiled.settled = self._on_settled
+
+    def _on_settled(self, turn: Turn, output: Output) -> None:
+        """What one compiled call has taken: it all follows without a gap."""
+        for span in turn.messages:
+            self._on_accept(decoded(unpack_body(turn.bytes_of(span))), None)
+        self._on_output(output)
 
     def submitted(self, session: int, command_id: int, gate: Gate) -> None:
         """The host has asked for a pulse."""

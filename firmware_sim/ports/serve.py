@@ -22,7 +22,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import ConfigError, LinkError, UsageError
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.link.base import Link, open_link
+from pans.runtime.link.base import Link, descriptor_of, open_link
 
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
@@ -177,6 +177,10 @@ class ChildLink:
         self.read = self._link.read
         self.write = self._link.write
         self.now_ns = self._link.now_ns
+
+    def fileno(self) -> int | None:
+        """Return the port's descriptor."""
+        return descriptor_of(self._link)
 
     def reopen(self) -> ChildLink:
         """Open the port of the same instrument again."""

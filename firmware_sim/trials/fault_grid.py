@@ -20,6 +20,7 @@ import numpy as np
 
 from pans.firmware_sim.checks.checkers import Checker, WatchedInstrument
 from pans.firmware_sim.checks.reconciliation import ObservedLink, reconcile
+from pans.firmware_sim.checks.twin import TapedLink, differences
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.faults import NAMES, parse_faults
@@ -33,7 +34,9 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
+from pans.runtime.live.config import AUTO, COMPILED, PYTHON
 from pans.runtime.record import Recorder, read_recording
+from pans.runtime.turn.system import offered
 from pans.runtime.wire.commands import Gate
 
 from . import Report, Trial, figures_text
@@ -56,6 +59,7 @@ GRID_ALL = (
     "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"
 )
 MEMORY_SLACK_KB = 16_384
+BOTH = "both"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,7 @@ class Settings:
     seed: int | None = option(None, "this seed only", type=int)
     jobs: int = option(os.cpu_count() or 1, "processes (default: one per core)")
     faults: str = option(",".join(CASES), f"cases, of {', '.join(CASES)}")
+    turn: str = option(BOTH, f"the loop's turn: {COMPILED}, {PYTHON} (what it read is read again, compiled) or {BOTH}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +102,13 @@ def case_faults(case: str) -> str:
     return GRID_ALL if case == "all" else f"{case}:{GRID_TIMES[case]}" if case in GRID_TIMES else case
 
 
-def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) -> GridResult:
-    """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults."""
+def run_case(
+    case: str, seed: int, frames: int, faults_text: str | None = None, turn: str = PYTHON, reads_again: bool = False
+) -> GridResult:
+    """Run one case for about `frames` stream messages and return what the checkers found; `faults_text` overrides its faults.
+
+    `turn` is the loop's; with `reads_again` the compiled turn reads the same bytes from a socket and must give the same.
+    """
     mode = MODES[seed % len(MODES)]
     profile, bundle, plan = small_setup(mode)
     checker = Checker(plan, SHOTS)
@@ -111,15 +121,24 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
 
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
-    link = ObservedLink(VirtualLink(device, clock, f"grid:{case}"))
+    link = (TapedLink if reads_again else ObservedLink)(VirtualLink(device, clock, f"grid:{case}"))
     host = GridHost(checker, plan, frames)
     per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
-    config = RunConfig(shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9)
+    config = RunConfig(
+        shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9, turn=turn
+    )
     started = time.perf_counter()
     backend = "table" if bundle.automaton is None else "automaton"
-    core = Core(plan, make_decider(bundle, shots=SHOTS, backend=backend), SHOTS, config.n_cycles)
+    decider = make_decider(bundle, shots=SHOTS, backend=backend)
+    core = Core(plan, decider, SHOTS, config.n_cycles)
     recovery = Recovery.of(link, "", 30.0)
-    observers = Observers(host.watch, host.start)
+
+    def start(run: LiveRun) -> None:
+        if isinstance(link, TapedLink):
+            link.listen(run)
+        host.start(run)
+
+    observers = Observers(host.watch, start)
     driven = {"drive": plan.drive, "confidence": 0.0}
     header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend, **driven}}
     with TemporaryDirectory() as folder:
@@ -131,6 +150,9 @@ def run_case(case: str, seed: int, frames: int, faults_text: str | None = None) 
         recording = read_recording(Path(folder) / "grid.pansrec")
         for disagreement in reconcile(link, checker.books, result, recording, bundle):
             checker.fail(disagreement)
+        if isinstance(link, TapedLink):
+            for disagreement in differences(link.tape, plan, decider, SHOTS, core, recording.decisions()):
+                checker.fail(disagreement)
     return GridResult(
         case=case,
         seed=seed,
@@ -225,13 +247,22 @@ def resident_kb() -> int:
         return 0
 
 
-def run_grid(cases: Sequence[str], seeds: int, frames: int, jobs: int) -> list[GridResult]:
+def turn_of(seed: int, turn: str) -> tuple[str, bool]:
+    """Return the loop's turn of a seed, and whether the bytes are read again: "both" takes the turns in turn."""
+    if turn == BOTH:
+        turn = COMPILED if seed // len(MODES) % 2 else PYTHON
+    # in virtual time the host drives in Python's turn
+    return (AUTO if turn == COMPILED else turn), turn == PYTHON and not offered()
+
+
+def run_grid(cases: Sequence[str], seeds: int, frames: int, jobs: int, turn: str = BOTH) -> list[GridResult]:
     """Run every case with every seed, about `frames` messages in all, on `jobs` processes; report each failure on stderr."""
     work = [(case, seed) for seed in range(seeds) for case in cases]
     each = -(-frames // len(work))
+    turns = [turn_of(seed, turn) for _, seed in work]
     results = []
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for result in pool.map(run_case, *zip(*work), [each] * len(work)):
+        for result in pool.map(run_case, *zip(*work), [each] * len(work), [None] * len(work), *zip(*turns)):
             results.append(result)
             if result.violations:
                 again = f"pans trials fault-grid --faults {result.case} --seed {result.seed} --frames {each}"
@@ -267,9 +298,10 @@ def run(settings: Settings) -> Report:
     started = time.perf_counter()
     cases = settings.faults.split(",")
     if settings.seed is not None:
-        results = [run_case(case, settings.seed, settings.frames) for case in cases]
+        turn = turn_of(settings.seed, settings.turn)
+        results = [run_case(case, settings.seed, settings.frames, None, *turn) for case in cases]
     else:
-        results = run_grid(cases, settings.seeds, settings.frames, settings.jobs)
+        results = run_grid(cases, settings.seeds, settings.frames, settings.jobs, settings.turn)
     rows = [case_row(case, [one for one in results if one.case == case]) for case in dict.fromkeys(cases)]
     failures = [result for result in results if result.violations]
     total, seconds = sum(result.frames for result in results), time.perf_counter() - started

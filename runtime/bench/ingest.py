@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.core.plan import NO_SHOT, Plan
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.record import Recorder
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.watch import resources_used
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import FrameDecoder

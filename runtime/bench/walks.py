@@ -21,13 +21,13 @@ from pans.runtime.bundle.walks import log_scores, walk_nodes
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, NO_SHOT, Plan
 from pans.runtime.core.still import Core
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.automaton import AutomatonDecider
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import UsageError
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.record.parted_recorder import repeated_setup
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.commands import Arm
 from pans.runtime.wire.frame import Messages, pack_body

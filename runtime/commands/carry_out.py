@@ -194,7 +194,9 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
         n_cycles = n_objects * plan.cycles_per_object
         core = Core(plan, decider, job.shots, n_cycles, dark.guard(plan, bundle, job.shots))
     lease_ms = job.profile.timing.lease_ms
-    config = RunConfig(job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core)
+    config = RunConfig(
+        job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core, job.turn
+    )
     header = recording_header(job, bundle_sha256, decider, n_objects, plan.drive)
     header["config"]["dark"] = dark.header()
     if flow_run is not None:
@@ -291,7 +293,7 @@ def _watched(
             seen.tell(run)
             monitor.watch(run, output)
 
-        observers = Observers(look, prepared, beside.stop)
+        observers = Observers(look, prepared, beside.stop, acts=False)
         return run_live(
             link, dark.profile, ready.bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers
         )

@@ -49,6 +49,7 @@ class Job:
     confidence: float = 0.0  # at which an automaton decides; 0: where its walk ends
     realtime: bool = True
     core: int | None = None
+    turn: str = "auto"
     reconnect_s: float = 10.0
     trace: Path | None = None
     command: str = ""

@@ -16,6 +16,7 @@ from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.live.config import AUTO, TURNS
 from pans.runtime.operate.option_file import add_option_file, prepare_options, write_options
 from pans.runtime.run_folder import RUNS
 from pans.runtime.timing.cpu import check_core
@@ -71,6 +72,12 @@ def _configure_common(parser: argparse.ArgumentParser, trials: int) -> None:
     add_walk_options(parser)
     parser.add_argument("--backend", default="auto", choices=backend_names(), help="decision back end")
     parser.add_argument("--no-realtime", action="store_true", help="do not ask for SCHED_FIFO and locked memory")
+    parser.add_argument(
+        "--turn",
+        default=AUTO,
+        choices=TURNS,
+        help="the loop's turn: one compiled call, or Python's, which decides the same (default: compiled where it can be)",
+    )
     parser.add_argument("--core", type=int, metavar="N", help="pin to core N and busy-wait; uses 100 %% of that core")
     parser.add_argument(
         "--out",
@@ -174,6 +181,7 @@ def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, deci
         confidence=args.confidence,
         realtime=not args.no_realtime,
         core=args.core,
+        turn=args.turn,
         record=record,
         reconnect_s=args.reconnect_s,
         trace=args.trace,

@@ -25,7 +25,6 @@ from .plan import Plan, build_plan
 if TYPE_CHECKING:
     from .dark_guard import DarkGuard
     from .still import Core
-    from .stream import StreamCore
 
 __all__ = [
     "NO_LABEL",
@@ -38,8 +37,7 @@ __all__ = [
     "Output",
     "Passage",
     "Plan",
-    "StreamCore",
     "build_plan",
 ]
 
-__getattr__ = lazy_names(__name__, {"Core": ".still", "DarkGuard": ".dark_guard", "StreamCore": ".stream"})
+__getattr__ = lazy_names(__name__, {"Core": ".still", "DarkGuard": ".dark_guard"})

@@ -23,7 +23,7 @@ from . import stream_kernels as kernels
 from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag, Output
 from .follower import Follower
 from .plan import Plan
-from .stream_kernels import DecisionTables, MarkArrays
+from .stream_arrays import DecisionTables, MarkArrays, WalkArrays
 from .window import DecisionWindows
 from .window_kernels import WindowArrays
 
@@ -33,6 +33,11 @@ _KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}
 _LARGEST = (1 << 62) - 1
 
 Rows = npt.NDArray[np.void]
+
+
+def rows_needed(n_windows: int, aim: int = ROWS_PER_BATCH) -> int:
+    """Return how many rows hold `aim` decisions and those of one block more."""
+    return aim + min(n_windows, CLICKS_MAX)
 
 
 class BulkSteps:
@@ -74,6 +79,16 @@ class BulkSteps:
         self._state[kernels.KIND] = _KINDS[plan.mode]
 
     @property
+    def walk(self) -> WalkArrays:
+        """What a kernel continues between `load` and `store`."""
+        return WalkArrays(self._state, self._marks, self._windows, self.tables, self._rows, self._counts)
+
+    @property
+    def decides(self) -> bool:
+        """Whether kernels give the labels, too: with a table or an automaton. Else `labelled` asks the back end for many at once."""
+        return bool(self.tables.labels.size)
+
+    @property
     def stamps(self) -> npt.NDArray[np.uint16]:
         """The patterns shown of the latest CLICKS block that a kernel looked at, and whatever stood behind them before."""
         return self._windows.stamps
@@ -104,15 +119,15 @@ class BulkSteps:
         state = self._state
         state[kernels.MESSAGE] = first
         state[kernels.STEPS] = blocks
-        self._load()
+        self.load()
         ended = kernels.ODD
         if self.core.tracker.open:
             buffer, spans = messages
             ended = kernels.walk_messages(
                 buffer, spans, state, self._marks, self._windows, self.tables, self._rows, self._counts
             )
-        self._store()
-        return int(state[kernels.MESSAGE]), self._labelled(int(state[kernels.N_ROWS])), ended == kernels.ODD
+        self.store()
+        return int(state[kernels.MESSAGE]), self.labelled(int(state[kernels.N_ROWS])), ended == kernels.ODD
 
     def step(self, frame: Frame) -> Output:
         """Let the core take a message that is not ordinary."""
@@ -130,8 +145,8 @@ class BulkSteps:
         known = self._marks.objects[slots] == objects
         return np.where(known, self._marks.photons[slots], np.float32(np.nan))
 
-    def _labelled(self, n: int) -> Rows:
-        """Rows that the kernel could not label from a table get their verdicts here, all at once."""
+    def labelled(self, n: int) -> Rows:
+        """Return the first `n` rows; those that the kernel could not label from a table get their verdicts here, all at once."""
         rows = self._rows[:n]
         if self.tables.labels.size or not n:
             return rows
@@ -145,7 +160,7 @@ class BulkSteps:
             self.core.n_abstained += int(silent.sum())
         return rows
 
-    def _load(self) -> None:
+    def load(self) -> None:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
         core, state = self.core, self._state
         state[kernels.N_ROWS], state[kernels.START_TICK] = 0, min(core.start_tick, _LARGEST)
@@ -159,7 +174,7 @@ class BulkSteps:
         )
         state[kernels.JITTER] = min(core.jitter_ticks, _LARGEST)
 
-    def _store(self) -> None:
+    def store(self) -> None:
         """Copy what the kernel did back."""
         core, state = self.core, self._state.tolist()
         if state[place.MESSAGES] or state[kernels.N_ROWS]:
@@ -184,6 +199,12 @@ class BulkSteps:
             core.marks[number] = Mark(0, number, int(marks.truths[slot]), 0, 0, float(marks.photons[slot]))
         self._told.objects[new], self._told.truths[new] = marks.objects[new], marks.truths[new]
 
+    def told(self, mark: Mark) -> None:
+        """Note that the core knows of a mark which the kernel has taken."""
+        slot = mark.object_index % kernels.MARK_SLOTS
+        self._told.objects[slot], self._told.truths[slot] = mark.object_index, mark.truth
+        self._told.photons[slot] = mark.photons
+
     def _remember(self, mark: Mark) -> None:
         slot = mark.object_index % kernels.MARK_SLOTS
         for marks in (self._marks, self._told):
@@ -204,7 +225,7 @@ def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     labels, probabilities = np.zeros(0, np.uint16), np.zeros(0, np.float32)
     radix = np.zeros(n_features, np.int64)
     found = getattr(decider, "radix", None) if plan.automaton is None else None
-    radix = radix if found is None else found
+    radix = radix if found is None else np.array(found, np.int64)  # writable, always: one type to the compiler
     if found is not None or (plan.automaton is not None and getattr(decider, "automaton", None) is plan.automaton):
         labels, probabilities = _finite(getattr(decider, "labels"), getattr(decider, "probabilities"))  # noqa: B009
     table, zero = count_crc_tables(n_features, shots)

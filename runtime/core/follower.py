@@ -150,7 +150,7 @@ class Follower:
         """Go on from the place that `part` returned, right after `begin`."""
         self.tracker.resume(place.tracker)
         for mark in place.marks:
-            self._remember(mark)
+            self.remember(mark)
         self.n_decisions, self.n_abstained, self.last_tick = place.decisions, place.abstained, place.last_tick
         self._go_on_from(place.core)
 
@@ -221,7 +221,7 @@ class Follower:
     def _take_mark(self, mark: Mark) -> Output:
         wrong = self._rules.of_mark(mark, self.tracker.next_exposure, self.end_exposure)
         if wrong is None:
-            self._remember(mark)
+            self.remember(mark)
         return Output([], [] if wrong is None else [self._contradicts(wrong)], None)
 
     def _contradicts(self, wrong: Contradiction) -> Contradiction:
@@ -277,7 +277,8 @@ class Follower:
             events.append(self._contradicts(wrong))
         return joined(Output([], events, None), self._skip_to(min(end, self.tracker.next_exposure), status.tick))
 
-    def _remember(self, mark: Mark) -> None:
+    def remember(self, mark: Mark) -> None:
+        """Know a mark from here on."""
         self.marks.pop(mark.object_index, None)
         self.marks[mark.object_index] = mark
         if len(self.marks) > MAX_MARKS:

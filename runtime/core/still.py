@@ -17,7 +17,7 @@ from pans.runtime.instrument.channel_health import Finding
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
 
-from .bulk_steps import BulkSteps
+from .bulk_steps import BulkSteps, rows_needed
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import ANY_CLASS, Follower, Place
@@ -38,7 +38,8 @@ class Core(Follower):
         self.shots = shots
         self._decider = decider
         self._visits_before = 0  # in streams that have ended
-        self._steps: BulkSteps | None = None  # once warmed up, where they give all that is asked for
+        self._bulk: BulkSteps | None = None  # once warmed up, where they give all that is asked for
+        self._steps: BulkSteps | None = None  # the same, where they decide block by block, too
         self._session_known = False  # to them
 
     @property
@@ -51,10 +52,29 @@ class Core(Follower):
         self.windows.warm_up()
         if self.guard is not None:
             self.guard.warm_up()
-        if not self.windows.parallel and (self.guard is None or self.guard.policy == "warn"):
-            steps = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, self.windows.n_windows + 1)
+        if self.guard is None or self.guard.policy == "warn":
+            rows = rows_needed(self.windows.n_windows)
+            steps = self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, rows)
             steps.warm_up()
-            self._steps = steps if steps.tables.labels.size else None  # others decide one by one, as `step` does
+            ordinary = steps.decides and not self.windows.parallel  # others decide one by one, as `step` does
+            self._steps = steps if ordinary else None
+
+    @property
+    def compiles(self) -> bool:
+        """Whether compiled steps give all that is asked for, once warmed up: no guard, or one that only warns."""
+        return self._bulk is not None
+
+    @property
+    def decides_compiled(self) -> bool:
+        """Whether they give each decision at once, too."""
+        return self._bulk is not None and self._bulk.decides
+
+    def bulk_steps(self, session: int) -> BulkSteps | None:
+        """Return the compiled steps, ready for messages of `session`; None where they do not give all that is asked for."""
+        if self._bulk is not None and not self._session_known:
+            self._bulk.begin(session)
+            self._session_known = True
+        return self._bulk
 
     def begin(self, start_tick: int, n_cycles: int) -> Output:
         """See Follower."""
@@ -69,26 +89,42 @@ class Core(Follower):
     def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
         """See Follower: an ordinary block of one detector's exposures is one call of a kernel."""
         if self._steps is None:
-            return super().step_messages(messages, place)
+            if self._bulk is None:
+                return super().step_messages(messages, place)
+            return 1, self._bulk.step(messages.frame(place))
         if not self._session_known:
-            self._steps.begin(messages.frame(place).session)
-            self._session_known = True
+            self.bulk_steps(messages.frame(place).session)
         next_exposure = self.tracker.next_exposure
         stop, rows, _ = self._steps.take(messages, place, blocks=1)
         if stop == place:
             return 1, self._steps.step(messages.frame(place))
-        events = [] if self.guard is None else self._watched(self.guard, next_exposure, rows)
+        n = self.tracker.next_exposure - next_exposure
+        events = self.watch_blocks(self._steps.stamps[:n], self._steps.bits[:n], next_exposure, rows)
         return stop - place, Output([Decision(*row) for row in rows.tolist()], events, self.last_tick)
 
-    def _watched(self, guard: DarkGuard, first: int, rows: NDArray[np.void]) -> list[Finding]:
-        """Let the guard, which only warns, see the block from exposure `first` on that the kernel has taken, and its decisions."""
-        assert self._steps is not None
-        n = self.tracker.next_exposure - first
-        block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], self._steps.stamps[:n], self._steps.bits[:n])
-        events = guard.take(block)
+    def watch_blocks(
+        self, stamps: NDArray[np.uint16], bits: NDArray[np.uint8], first: int, rows: NDArray[np.void]
+    ) -> list[Finding]:
+        """Let the guard, which only warns, see exposures from `first` on that kernels have taken, and their decisions."""
+        if self.guard is None:
+            return []
+        block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
+        events = self.guard.take(block)
         for row in rows:
             if not row["flags"] & _NOT_MEASURED:
-                guard.take_clicks(int(row["clicks"]), int(row["object"]))
+                self.guard.take_clicks(int(row["clicks"]), int(row["object"]))
+        return events
+
+    def watch_frames(self, block: FrameBlock) -> list[Finding]:
+        """As `watch_blocks` for a block of frames: of its object the guard sees which channels have clicked in lit frames."""
+        assert self.guard is not None
+        events = self.guard.take(block)
+        first = block.exposure_index % self.windows.visit_exposures
+        lit = self.windows.lit[first : first + len(block.words)]
+        if lit.any():
+            seen = np.bitwise_or.reduce(block.words[lit], axis=0)
+            clicked = np.unpackbits(seen, count=self._plan.n_patterns, bitorder="little").astype(np.int64)
+            self.guard.take_object(clicked, block.object_index)
         return events
 
     def cycles_left(self, n_cycles: int) -> int:

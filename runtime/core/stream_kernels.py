@@ -7,10 +7,7 @@ window_kernels.py's. Never allocates.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from pans.runtime.wire import walk as stream
@@ -18,6 +15,7 @@ from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
+from .stream_arrays import Block
 from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, add_exposures, add_walks, complete, spill, sum_up
 
 # state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the walk stand; what it continues of Core and DecisionWindows
@@ -26,7 +24,7 @@ N_DECISIONS, N_ABSTAINED, LAST_TICK, JITTER = range(OBJECT + 1, OBJECT + 5)
 EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES = range(JITTER + 1, JITTER + 8)
 # blocks that may be taken before the kernel returns, and then no marks (0: any number); the kind of the plan's blocks
 STEPS, KIND, N_STATE = range(N_CLASSES + 1, N_CLASSES + 4)
-ALL_DONE, ROWS_FULL, ODD = range(3)  # what `walk_messages` returns
+ALL_DONE, ROWS_FULL, ODD, TOOK_MARK, TOOK_BLOCK = range(5)  # what `walk_messages` and `take_message` return
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64
@@ -36,52 +34,6 @@ _NOT_FINITE, _AMBIGUOUS = int(DecisionFlag.NOT_FINITE) | _ABSTAINED, int(Decisio
 _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
 ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
-
-
-class DecisionTables(NamedTuple):
-    """From clicks per pattern to label, probability and checksum; without `labels` (size 0) the counts go to `counts_out`.
-
-    A label NO_LABEL abstains: its probability is below what was asked for, or 0 where the scores were not finite. `radix` int64 (d_f,):
-    the row of a table is the sum of counts * radix; of an automaton it is the leaf. `crc` uint32 (bytes of a count, d_f, 256) and
-    `crc_zero` uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte. For
-    K = 1 with a table, `word_rows` int64 and `word_crc` uint32 (bytes of a word, 256) say the same of a byte of the click word; else
-    they are empty.
-    """
-
-    labels: npt.NDArray[np.uint16]
-    probabilities: npt.NDArray[np.float32]
-    radix: npt.NDArray[np.int64]
-    crc: npt.NDArray[np.uint32]
-    crc_zero: npt.NDArray[np.uint32]
-    word_rows: npt.NDArray[np.int64]
-    word_crc: npt.NDArray[np.uint32]
-
-
-class MarkArrays(NamedTuple):
-    """The latest object numbers, truths and photons by object modulo MARK_SLOTS; int64, int16, float32 (MARK_SLOTS,)."""
-
-    objects: npt.NDArray[np.int64]
-    truths: npt.NDArray[np.int16]
-    photons: npt.NDArray[np.float32]
-
-
-class Block(NamedTuple):
-    """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, from exposure `first`, `relative` in the visit, on.
-
-    `end_tick` is that of the first exposure's end. `truth` is that of `object`, -1 where it is not known. `top_mask` are the bits of the
-    last byte of a word that are channels.
-    """
-
-    frames: np.integer[Any]
-    word_bytes: np.integer[Any]
-    at: np.integer[Any]
-    first: np.integer[Any]
-    relative: np.integer[Any]
-    end_tick: np.integer[Any]
-    period_ticks: np.integer[Any]
-    object: np.integer[Any]
-    truth: np.integer[Any]
-    top_mask: np.integer[Any]
 
 
 @njit(cache=True, nogil=True)
@@ -98,39 +50,48 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
         if state[N_ROWS] == rows.size:
             return ROWS_FULL
         start, stop = _U(spans[state[MESSAGE], 0]), _U(spans[state[MESSAGE], 1])
-        if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[SESSION]):
-            return ODD
-        kind = buffer[start]
-        payload = start + _U(stream.BODY_HEADER)
-        if kind == stream.MARK:
-            if state[STEPS]:
-                return ODD  # a live run looks into the core's own marks
-            if not _take_mark(buffer, payload, stop, state, marks):
-                return ODD
-        elif kind == stream.FRAMES:
-            if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
-                return ODD
-            block = _block_of(buffer, payload, state, marks, windows)
-            if tables.word_rows.size:
-                _take_words(buffer, block, state, windows, tables, rows)
-            else:
-                _take_windows(buffer, block, state, windows, tables, rows, counts_out)
-            if state[FRAME] < block.frames:
-                return ROWS_FULL
-            state[FRAME] = 0
-            blocks += 1
-        elif kind == stream.CLICKS:
-            if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
-                return ODD
-            block = _block_of(buffer, payload, state, marks, windows)
-            if not _settle(block, state, windows, tables, rows, counts_out):
-                return ROWS_FULL
-            state[FRAME] = 0
-            blocks += 1
-        else:
-            return ODD
+        if state[STEPS] and buffer[start] == stream.MARK:
+            return ODD  # a live run looks into the core's own marks
+        took = take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out)
+        if took in (ODD, ROWS_FULL):
+            return took
+        blocks += took == TOOK_BLOCK
         state[MESSAGE] += 1
     return ALL_DONE
+
+
+@njit(cache=True, nogil=True)
+def take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Take the message from `start` to `stop`, uint64: TOOK_MARK, TOOK_BLOCK, ODD where it is not ordinary (and nothing is done).
+
+    ROWS_FULL: the rows are, within a block; state[FRAME] says where it goes on.
+    """
+    if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[SESSION]):
+        return ODD
+    kind = buffer[start]
+    payload = start + _U(stream.BODY_HEADER)
+    if kind == stream.MARK:
+        return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
+    if kind == stream.FRAMES:
+        if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
+            return ODD
+        block = _block_of(buffer, payload, state, marks, windows)
+        if tables.word_rows.size:
+            _take_words(buffer, block, state, windows, tables, rows)
+        else:
+            _take_windows(buffer, block, state, windows, tables, rows, counts_out)
+        if state[FRAME] < block.frames:
+            return ROWS_FULL
+    elif kind == stream.CLICKS:
+        if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
+            return ODD
+        block = _block_of(buffer, payload, state, marks, windows)
+        if not _settle(block, state, windows, tables, rows, counts_out):
+            return ROWS_FULL
+    else:
+        return ODD
+    state[FRAME] = 0
+    return TOOK_BLOCK
 
 
 @njit(cache=True, nogil=True)
@@ -146,6 +107,8 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     if not fits or not stream.mark_fits(buffer, payload, state, state[N_CLASSES]):
         return False
     slot = number % MARK_SLOTS
+    if marks.objects[slot] == number:
+        return False  # marked once more: whoever adds up the rows so far must not see the later mark
     marks.objects[slot] = number
     marks.truths[slot] = np.int16(stream.mark_truth(buffer, payload))
     stream.mark_photons(buffer, payload, marks.photons, slot)

@@ -75,6 +75,7 @@ class DecisionWindows:
         self._need, self._last = self.walks.need, self.walks.last
         self._adaptive = bool(len(self.walks.nodes))
         self._longest: I64 = np.stack([self._need, self._last])  # at the beginning of a visit
+        self.lit: npt.NDArray[np.bool_] = self._window_at >= 0  # by exposure of a visit
         self._visit = 0
         self._next_window = 0
         self._object = NO_OBJECT

@@ -193,7 +193,7 @@ class FlowCore(Follower):
         self.tracker.advance(position, n_messages, facts[stream.EXPOSURES])
         if n_marks:
             for mark, photons in zip(self._new.rows[:n_marks].tolist(), self._new.photons[:n_marks].tolist()):
-                self._remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
+                self.remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
         if n_messages == n_marks:
             return taken, Output([], [], None)
         self.last_tick, self.jitter_ticks = facts[walking.END_TICK], facts[walking.JITTER_TICKS]
@@ -253,8 +253,8 @@ class FlowCore(Follower):
     def _nothing_left(self) -> bool:
         return self.tracker.next_exposure >= self.end_exposure
 
-    def _remember(self, mark: Mark) -> None:
-        super()._remember(mark)
+    def remember(self, mark: Mark) -> None:
+        super().remember(mark)
         self.matcher.add_mark(mark)
 
     def _place(self) -> dict[str, Any] | None:

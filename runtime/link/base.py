@@ -22,7 +22,8 @@ class Link(Protocol):
     """An open connection to an instrument; a lab's own driver implements these and an opener (`pans.devices`).
 
     `read` is called by two threads, never at once, and `write` by one of them, maybe while the other reads.
-    A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again.
+    A link may also have `reopen() -> Link` (come back after an outage) and `pause(seconds)`; without them its URL is opened again. With
+    `fileno() -> int | None`, a non-blocking POSIX descriptor that carries the bytes as they are, the compiled turn reads and writes it.
     """
 
     name: str
@@ -77,6 +78,13 @@ def _checked_link(point: EntryPoint, url: str) -> Link:
             remedy="see docs/how-to/own-device.md for the members of a link",
         )
     return link
+
+
+def descriptor_of(link: Link) -> int | None:
+    """Return the descriptor behind `link` that compiled code may read and write; None where there is none."""
+    own = getattr(link, "fileno", None)
+    found = None if own is None else own()
+    return found if isinstance(found, int) and found >= 0 else None
 
 
 def link_facts(link: Link) -> dict[str, Any]:

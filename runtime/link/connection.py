@@ -69,20 +69,28 @@ class Connection:
 
     def pump(self, timeout_s: float) -> list[Arrived]:
         """Send what is due, wait at most `timeout_s` for bytes, digest them; return what of them is the core's, in order."""
-        self._raise_failure()
+        stream = self._take(self.chunks(timeout_s))
+        self.take_pongs()
+        if not stream:
+            self.raise_failure()
+        return stream
+
+    def send_due(self) -> bool:
+        """Send what is due and return whether that was anything; raises what the latest frames ended the session with."""
+        self.raise_failure()
         self.session.poll(self.link.now_ns())
-        asked = self.flush()
+        return self.flush()
+
+    def chunks(self, timeout_s: float) -> list[Chunk]:
+        """Send what is due and return what has been read, waiting at most `timeout_s` for it."""
+        asked = self.send_due()
         began_ns = self.link.now_ns()
         chunks = self.reader.wait(timeout_s, eager=asked)
         if self.evidence is not None:
             self.evidence.waited(began_ns, timeout_s, self.link.now_ns())
             for chunk in chunks:
                 self.evidence.arrived(chunk.arrival_ns)
-        stream = self._take(chunks)
-        self._take_pongs()
-        if not stream:
-            self._raise_failure()
-        return stream
+        return chunks
 
     def rest(self) -> list[Arrived]:
         """Stop reading and return what has arrived and was never taken: what a host finds that stood still while its device was lost."""
@@ -95,17 +103,18 @@ class Connection:
         for place, chunk in enumerate(chunks):
             if bulk is None:
                 for frame in self.decoder.feed(chunk.data):
-                    self._sort(frame, chunk.arrival_ns, stream)
+                    self.sort(frame, chunk.arrival_ns, stream)
             else:
                 self._digest(bulk, chunk, stream, last=place + 1 == len(chunks))
         return stream
 
-    def _raise_failure(self) -> None:
+    def raise_failure(self) -> None:
+        """Raise what ended the session, once all that came with it has been delivered."""
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
 
-    def _take_pongs(self) -> None:
+    def take_pongs(self) -> None:
         """Give the clock what came for it."""
         while self.clock is not None and self.session.pongs:
             pong, arrival_ns = self.session.pongs.popleft()
@@ -134,10 +143,10 @@ class Connection:
                     stream.append(Arrived(arrival_ns, messages if stays else messages.kept()))
                     self.delivered += stop - place
                 if stop < len(spans):
-                    self._sort(bulk.frame(*spans[stop].tolist()), arrival_ns, stream)
+                    self.sort(bulk.frame(*spans[stop].tolist()), arrival_ns, stream)
                 place = stop + 1
 
-    def _sort(self, frame: Frame, arrival_ns: int, stream: list[Arrived]) -> None:
+    def sort(self, frame: Frame, arrival_ns: int, stream: list[Arrived]) -> None:
         """Give a frame to the session, and to the core what is the core's; an answer is on record before it can end the session.
 
         What ends the session waits until the frames that came with it are delivered.

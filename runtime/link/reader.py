@@ -85,6 +85,23 @@ class LinkReader:
         finally:
             self._away = True
 
+    def lend(self) -> bool:
+        """Leave the link to the caller, who reads it himself until `take_back`; False where chunks wait or somebody reads."""
+        self._away = False
+        self._visits += 1
+        if not self._chunks and self._death is None and self._reading.acquire(blocking=False):
+            if not self._chunks:  # the helper has put none before it let go
+                return True
+            self._reading.release()
+        self._away = True
+        return False
+
+    def take_back(self) -> None:
+        """Read for a busy loop again; it counts as busy from here on."""
+        self._reading.release()
+        self._visits += 1
+        self._away = True
+
     def stop(self) -> None:
         """Stop the thread; the link stays as it is."""
         self._stopping = True

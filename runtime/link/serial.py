@@ -74,6 +74,13 @@ class SerialLink:
         """See `Link.now_ns`."""
         return time.perf_counter_ns()
 
+    def fileno(self) -> int | None:
+        """Return the descriptor, for a turn that reads and writes it itself; None of a port that has none."""
+        try:
+            return int(self._port.fileno()) if self._selectable else None
+        except self._errors:
+            return None
+
     def close(self) -> None:
         """See `Link.close`."""
         with suppress(*self._errors):

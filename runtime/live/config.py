@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,21 @@ if TYPE_CHECKING:
     from pans.runtime.timing.ledger import TimingLedger
 
     from .tally import RunTally
+
+
+AUTO, COMPILED, PYTHON = "auto", "compiled", "python"
+TURNS = (AUTO, COMPILED, PYTHON)
+
+
+class TurnChoice(NamedTuple):
+    """Which turn a run took, COMPILED or PYTHON, and why, "" where nothing was in the way of the compiled one."""
+
+    taken: str = PYTHON
+    why: str = ""
+
+    def words(self) -> str:
+        """Return it as it stands in a summary."""
+        return f"{self.taken}: {self.why}" if self.why else self.taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +52,7 @@ class RunConfig:
     realtime: bool = True
     started_ns: int = 0
     core: int | None = None  # that the loop is bound to, and kept awake
+    turn: str = AUTO  # one of TURNS
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +92,7 @@ class RunResult:
     late_slots: int = 0  # that stayed dark because the host named no state in time
     turn_us: dict[str, float] = field(default_factory=dict)  # of the host's turns, where it drives
     states_shown: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # exposures of each state
+    turn: TurnChoice = field(default_factory=TurnChoice)
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too

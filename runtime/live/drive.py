@@ -8,6 +8,7 @@ their exposure are packed before arming, so that a turn is one look at the walk,
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import ADAPTIVE_PATTERN, Plan
@@ -15,9 +16,12 @@ from pans.runtime.core.still import Core
 from pans.runtime.core.window import DecisionWindows
 from pans.runtime.link.connection import Connection
 from pans.runtime.timing.ledger import LatencyHistogram
+from pans.runtime.turn.rings import Drive
 from pans.runtime.wire.automata import Show, pack_show
-from pans.runtime.wire.messages import Opcode
+from pans.runtime.wire.messages import MessageType, Opcode
+from pans.runtime.wire.schema import HEADER, STRUCTS
 
+CRC_BYTES = 4
 _EXPOSURE_BYTES = 8  # of SHOW: the exposure, u64, stands first
 
 
@@ -31,6 +35,20 @@ class WalkPlace:
         self._next_step = np.concatenate([[0], np.cumsum(adaptive)]).tolist()  # by slot: steps of the walk before it
         self._slot_of = slots.tolist()
         self._slots, self._walks = plan.slots_per_cycle, plan.cycles_per_object
+
+    def arrays(self, tails: list[bytes], session: int) -> Drive:
+        """Return what the compiled turn drives by, with the `tails` of SHOW by state, in `session`."""
+        size = HEADER.size + STRUCTS["COMMAND"].size
+        plain: npt.NDArray[np.uint8] = np.zeros(size + _EXPOSURE_BYTES + len(tails[0]) + CRC_BYTES, np.uint8)
+        head = HEADER.pack(MessageType.COMMAND, 0, 0, session) + STRUCTS["COMMAND"].pack(0, Opcode.SHOW, 0, 0)
+        plain[:size] = np.frombuffer(head, np.uint8)
+        return Drive(
+            np.array(self._next_step, np.int64),
+            np.array(self._slot_of, np.int64),
+            np.frombuffer(b"".join(tails), np.uint8).reshape(len(tails), -1).copy(),
+            plain,
+            np.array([self._slots, self._walks], np.int64),
+        )
 
     def following(self, windows: DecisionWindows, next_exposure: int) -> tuple[int, int]:
         """Return exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
@@ -69,6 +87,21 @@ class HostDriver:
             session.poll(now_ns())
             connection.flush()
             self.turns.add(now_ns() - arrival_ns)
+
+    def arrays(self, session: int) -> Drive:
+        """Return what the compiled turn drives by in `session`."""
+        return self._place.arrays(self._tails, session)
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """Exposure and state that were named last."""
+        return self._sent
+
+    def went_on(self, sent: tuple[int, int], turns_ns: list[int]) -> None:
+        """Take over what a compiled turn has named, and how long each turn took from the arrival of its block."""
+        self._sent = sent
+        for turn_ns in turns_ns:
+            self.turns.add(turn_ns)
 
     def _submit(self, connection: Connection) -> bool:
         core = self._core

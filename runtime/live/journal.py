@@ -76,3 +76,40 @@ class Journal:
         """Note a command that the device has refused, and that nobody waits for."""
         kind = "show_refused" if refusal.opcode == Opcode.SHOW else "gate_refused"
         self.note(kind, command_id=refusal.command_id, status=refusal.status, text=refusal.text)
+
+
+class Reconciled:
+    """What `LiveRun` counts across its connections."""
+
+    connection: Connection
+    journal: Journal
+    decoded: Counter[str]  # what the connections that are gone have counted
+    contradictions: Counter[str]  # between messages and the clock, or the host's own books
+    failed: list[Connection]  # those that broke before they could be armed
+    taken_here: int  # messages of the present connection that the core was given, or came before ARM
+    _counted: Connection | None = None
+
+    def count_decoded(self) -> None:
+        """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""
+        while self.failed:
+            self._add_counters(self.failed.pop())
+        if self._counted is not self.connection:
+            self._counted = self.connection
+            self._add_counters(self.connection)
+            self._reconcile(self.connection.decoder.counters.frames)
+
+    def _add_counters(self, connection: Connection) -> None:
+        counters, session = connection.decoder.counters, connection.session.counters
+        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
+        self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
+        self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
+
+    def _reconcile(self, frames: int) -> None:
+        """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
+        lost = frames - self.connection.answers - self.connection.delivered
+        untaken = self.connection.delivered - self.taken_here if self.taken_here else 0  # it was armed
+        self.taken_here = 0
+        for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
+            if count:
+                self.contradictions[what] += abs(count)
+                self.journal.note("contradiction", what=what, found=count, expected=0)

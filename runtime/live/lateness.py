@@ -53,6 +53,11 @@ class Lateness:
             return POLL_S
         return min(POLL_S, max((self.block_ns + self._patience_ns - now_ns) / NS_PER_S, LEAST_WAIT_S))
 
+    @property
+    def patience_ns(self) -> int:
+        """How long after a block the next one is overdue; 0 where the device has been asked already."""
+        return 0 if self._asked else self._patience_ns
+
     def stepped(self, begin_ns: int, end_ns: int) -> None:
         """Note how long the core took over one frame."""
         self.evidence.worked(INFERENCE, begin_ns, end_ns)

@@ -1,4 +1,4 @@
-"""What a live run needs of a core: the calls that core.Core and flow.FlowCore have in common.
+"""What a live run needs of a core: the calls that core.Core and flow.FlowCore have in common; and of what takes its turns.
 
 Owns the interface alone.
 """
@@ -6,7 +6,7 @@ Owns the interface alone.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pans.runtime.core.decision import Output
 from pans.runtime.core.follower import Place
+from pans.runtime.turn import Turn
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Frame, Mark
 from pans.runtime.wire.tracker import StreamTracker
@@ -52,3 +53,17 @@ class LiveCore(Protocol):
     def cycles_left(self, n_cycles: int) -> int: ...
 
     def part(self) -> Place | None: ...
+
+
+class Turns(Protocol):
+    """What takes a live run's turns in the place of Python's (compiled.CompiledTurns).
+
+    `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it. `settled` is told after each call that
+    brought messages.
+    """
+
+    settled: Callable[[Turn, Output], None] | None
+
+    def attach(self) -> None: ...
+
+    def turn(self, poll_s: float) -> list[Output]: ...

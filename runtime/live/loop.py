@@ -34,7 +34,8 @@ from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.timing.page_faults import ThreadCounts
 
-from .config import RunConfig, RunResult
+from .compiled import CompiledTurns, choose_turn
+from .config import COMPILED, RunConfig, RunResult
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
@@ -44,11 +45,15 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Observers:
-    """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming."""
+    """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming.
+
+    A watcher that only looks (`acts` is False) gets what a compiled turn brought all at once.
+    """
 
     watch: Watcher | None = None
     prepared: Callable[[LiveRun], None] | None = None
     stop: Stop | None = None
+    acts: bool = True
 
 
 NO_OBSERVERS = Observers()
@@ -85,13 +90,17 @@ def run_live(
     run.failed = failed
     try:
         core.warm_up()
+        run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
+        if run.turn_choice.taken == COMPILED and isinstance(core, Core):
+            run.compiled = CompiledTurns(run, core, prompt=observers.acts and observers.watch is not None)
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
         with (
             busy_core(None if link.virtual else config.core) as awake,
             arm_realtime(wanted, [] if reader is None else [reader]) as granted,
         ):
-            run.realtime, counts = granted | awake, ThreadCounts()
+            run.realtime = granted | awake | {"turn": run.turn_choice.words()}
+            counts = ThreadCounts()
             try:
                 if observers.prepared is not None:
                     observers.prepared(run)
@@ -184,6 +193,7 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
         late_cause=dict(run.lateness.incidents.causes),
         lost_cause=dict(run.lateness.incidents.missing),
         events=run.journal.events,
+        turn=run.turn_choice,
         late_slots=int(tallies[LATE_SLOTS]),
         turn_us={} if run.driver is None else run.driver.turns.summary(),
         states_shown=run.core.windows.walks.shown if isinstance(run.core, Core) else np.zeros(0, np.int64),

@@ -28,12 +28,13 @@ from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateRe
 from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
-from .config import RunConfig
+from .config import RunConfig, TurnChoice
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
-from .journal import Journal
+from .journal import Journal, Reconciled
 from .lateness import Lateness
 from .live_core import LiveCore as LiveCore
+from .live_core import Turns
 from .tally import RunTally
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
@@ -49,7 +50,7 @@ SILENCE_NS = 5 * NS_PER_S  # without clicks
 Watcher = Callable[["LiveRun", Output], None]
 
 
-class LiveRun:
+class LiveRun(Reconciled):
     """One run in progress: what `run_live` calls in turn, and what a live view may look at."""
 
     driver: HostDriver | None = None  # of an automaton that the host follows
@@ -89,10 +90,11 @@ class LiveRun:
         self.armed_after_s = 0.0
         self.start_ns = self.last_data_ns = 0
         self.failed: list[Connection] = []  # those that broke before they could be armed
-        self._counted: Connection | None = None
-        self._taken_here = 0  # messages of the present connection that the core was given, or came before ARM
-        self._recorder = recorder
+        self.taken_here = 0  # messages of the present connection that the core was given, or came before ARM
+        self.recorder = recorder
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
+        self.turn_choice = TurnChoice()
+        self.compiled: Turns | None = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
@@ -103,13 +105,31 @@ class LiveRun:
         """The link's host clock."""
         return self.connection.link.now_ns()
 
+    @property
+    def due_ns(self) -> int:
+        """When the loop has to turn again, whatever comes: for a probe, a lease, a flush."""
+        recorded = self._flush_due_ns if self.recorder is not None else self._lease_due_ns
+        return min(self._probe_due_ns, self._lease_due_ns, recorded)
+
+    @property
+    def messages_granted(self) -> int:
+        """How many messages the device may send before the next grant is due."""
+        return self._granted_until - self.core.tracker.next_seq - RECEIVE_WINDOW // 2
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether nothing more can be sent."""
+        return self._broken is not None
+
     # -- arming and stopping -------------------------------------------------------------------------------------------
 
     def arm(self) -> None:
         """Start the exposures a little in the future, at an absolute device tick."""
         n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
         self.journal.session(self.connection)
-        self._taken_here = self.connection.delivered
+        if self.compiled is not None:
+            self.compiled.attach()
+        self.taken_here = self.connection.delivered
         now_ns = self.now_ns()
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
         if not 0 <= start_tick <= LARGEST_TICK:
@@ -123,7 +143,7 @@ class LiveRun:
         self.connection.session.submit(Opcode.ARM, pack_arm(arm))
         if self.driver is not None:
             self.driver.begin(self.connection)
-        if isinstance(self._recorder, PartedRecorder):
+        if isinstance(self.recorder, PartedRecorder):
             self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
         self.last_data_ns = now_ns + ARM_LEAD_NS
         planned_ns = round((n_cycles + 1) * self.plan.cycle_us * NS_PER_US)
@@ -181,8 +201,8 @@ class LiveRun:
 
         What is acted upon must be on record first, so the recording is flushed before the command leaves.
         """
-        if self._recorder is not None:
-            self._recorder.flush_decisions()
+        if self.recorder is not None:
+            self.recorder.flush_decisions()
         body = pack_gate(Gate(tick, duration_ticks, channel))
         return self.connection.session.submit(Opcode.GATE, body, may_be_refused=True)
 
@@ -192,7 +212,8 @@ class LiveRun:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
         self.turned_s = time.monotonic()
         looked_ns = self.now_ns()
-        outputs = self.take(self.connection.pump(self.lateness.poll_s(looked_ns)))
+        poll_s = self.lateness.poll_s(looked_ns)
+        outputs = self.take(self.connection.pump(poll_s)) if self.compiled is None else self.compiled.turn(poll_s)
         now_ns = self.now_ns()
         self._act(now_ns)
         if (verdict := self.lateness.settled(self.connection, now_ns, idle=not outputs)) is not None:
@@ -206,9 +227,9 @@ class LiveRun:
             self._probe_due_ns = now_ns + PROBE_EVERY_NS
         if now_ns >= self._lease_due_ns or self._granted_until - self.core.tracker.next_seq < RECEIVE_WINDOW // 2:
             self._renew(now_ns)
-        if self._recorder is not None and now_ns >= self._flush_due_ns:
+        if self.recorder is not None and now_ns >= self._flush_due_ns:
             self.journal.clock(self.connection)
-            self._recorder.flush()
+            self.recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self._turn_page(now_ns)
         self.ended = self._why_ended(now_ns, looked_ns, idle=not outputs)
@@ -254,15 +275,15 @@ class LiveRun:
             decoded_ns = self.now_ns()
             output = self.core.step(what)
             self._drive(arrival_ns)
-            self._taken_here += 1
+            self.taken_here += 1
             self.lateness.stepped(decoded_ns, self.now_ns())
-            if self._recorder is not None:
-                self._recorder.add_message(arrival_ns, pack_body(what))
+            if self.recorder is not None:
+                self.recorder.add_message(arrival_ns, pack_body(what))
             self._book(output, arrival_ns, decoded_ns, outputs)
             if what.type == MessageType.STATUS:
                 with suppress(MalformedMessage):  # counted where it was taken
                     status = decode_status(what.payload)  # the session may know a later one, where the host was held up
-                    self._check_tick(status.tick, arrival_ns)
+                    self.check_tick(status.tick, arrival_ns)
                     self.lateness.status_came(self.connection, status, arrival_ns)
         if self._broken is not None:
             broken, self._broken = self._broken, None
@@ -276,10 +297,10 @@ class LiveRun:
             decoded_ns = self.now_ns()
             taken, output = self.core.step_messages(messages, place)
             self._drive(arrival_ns)
-            self._taken_here += taken
+            self.taken_here += taken
             self.lateness.stepped(decoded_ns, self.now_ns())
-            if self._recorder is not None:
-                self._recorder.add_messages(arrival_ns, messages, place, taken)
+            if self.recorder is not None:
+                self.recorder.add_messages(arrival_ns, messages, place, taken)
             self._book(output, arrival_ns, decoded_ns, outputs)
             place += taken
 
@@ -295,10 +316,8 @@ class LiveRun:
         """Account for what a step brought."""
         self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
         if output.block_end_tick is not None:
-            self._check_tick(output.block_end_tick, arrival_ns)
-            self.last_data_ns = arrival_ns
-            self.outage_ns = None
-            self.lateness.block_came(arrival_ns)
+            self.check_tick(output.block_end_tick, arrival_ns)
+            self.block_came(arrival_ns)
         if output.actions and self._broken is None:
             try:
                 self._act(self.now_ns())
@@ -306,7 +325,19 @@ class LiveRun:
                 self._broken = error
         outputs.append(output)
 
-    def _check_tick(self, tick: int, arrival_ns: int) -> None:
+    def block_came(self, arrival_ns: int) -> None:
+        """Note that the stream goes on."""
+        self.last_data_ns = arrival_ns
+        self.outage_ns = None
+        self.lateness.block_came(arrival_ns)
+
+    def note_late(self, number: int, marks_ns: tuple[int, int, int, int, int], uncertainty_ns: int) -> None:
+        """Note a late decision with its times, as the ledger judged them."""
+        self.journal.note("late", decision=number, latency_us=(marks_ns[3] - marks_ns[0]) / 1000)
+        self.lateness.late(number, marks_ns, uncertainty_ns)
+
+    def check_tick(self, tick: int, arrival_ns: int) -> None:
+        """Note a tick that lies in the future."""
         wrong = future_tick(self.connection.known_clock(), tick, arrival_ns)
         if wrong is not None:
             self.contradictions[wrong.what] += 1
@@ -339,21 +370,19 @@ class LiveRun:
                 end_ns = times_ns[0]
             mark = None if output.passages else self.core.marks.get(decision.object)
             self.tally.add(decision, float("nan") if mark is None else mark.photons)
-            if self._recorder is not None:
-                self._recorder.add_decision(decision)
+            if self.recorder is not None:
+                self.recorder.add_decision(decision)
             if output.block_end_tick is None:
                 continue
             marks_ns = (end_ns, *times_ns, self.now_ns())
             if self.timing.judge(marks_ns, uncertainty_ns):
-                latency_us = (marks_ns[3] - end_ns) / 1000
-                self.journal.note("late", decision=decision.number, latency_us=latency_us)
-                self.lateness.late(decision.number, marks_ns, uncertainty_ns)
-            if self._recorder is not None:
-                self._recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
+                self.note_late(decision.number, marks_ns, uncertainty_ns)
+            if self.recorder is not None:
+                self.recorder.add_timing((decision.number, end_ns, times_ns[0], times_ns[2], marks_ns[4]))
 
     def _turn_page(self, now_ns: int) -> None:
         """Go on in the recording's next part when this one is full and no window is open."""
-        recorder = self._recorder
+        recorder = self.recorder
         if not isinstance(recorder, PartedRecorder):
             return
         for event in recorder.keeper.news():
@@ -365,35 +394,10 @@ class LiveRun:
 
     def drop_recorder(self) -> None:
         """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
-        self._recorder = self.journal.recorder = None
+        self.recorder = self.journal.recorder = None
         self.connection.on_sent = self.connection.on_answer = None
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW
         self.connection.session.grant(self._granted_until, self.config.lease_ms)
         self._lease_due_ns = now_ns + self.config.lease_ms * NS_PER_MS // 4
-
-    def count_decoded(self) -> None:
-        """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""
-        while self.failed:
-            self._add_counters(self.failed.pop())
-        if self._counted is not self.connection:
-            self._counted = self.connection
-            self._add_counters(self.connection)
-            self._reconcile(self.connection.decoder.counters.frames)
-
-    def _add_counters(self, connection: Connection) -> None:
-        counters, session = connection.decoder.counters, connection.session.counters
-        self.decoded.update({name: getattr(counters, name) for name in counters.__slots__})
-        self.decoded.update({name: getattr(session, name) for name in ("wrong_session", "unknown_type")})
-        self.decoded.update(malformed_answers=session.malformed, implausible_answers=session.implausible)
-
-    def _reconcile(self, frames: int) -> None:
-        """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
-        lost = frames - self.connection.answers - self.connection.delivered
-        untaken = self.connection.delivered - self._taken_here if self._taken_here else 0  # it was armed
-        self._taken_here = 0
-        for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
-            if count:
-                self.contradictions[what] += abs(count)
-                self.journal.note("contradiction", what=what, found=count, expected=0)

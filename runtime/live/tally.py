@@ -8,12 +8,15 @@ having measured only these objects.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
+from pans.runtime.wire.messages import Mark
 
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
@@ -78,6 +81,45 @@ class RunTally:
             sums[0] += 1
             sums[1] += right
 
+    def add_rows(self, rows: npt.NDArray[np.void], photons_per_shot: npt.NDArray[np.float32]) -> None:
+        """Count many decisions, DECISION_DTYPE (n,), with the photons of one shot on each object, NaN where unknown; as `add` does."""
+        flags, labels, truths = rows["flags"], rows["label"].astype(np.int64), rows["truth"].astype(np.int64)
+        self.decisions += len(rows)
+        self.clicks += int(rows["clicks"].sum(dtype=np.int64))
+        self.exposures += int(rows["exposures"].sum(dtype=np.int64))
+        photons = photons_per_shot[~np.isnan(photons_per_shot)].astype(np.float64) * self.shots
+        self.photons = float(np.add.accumulate(np.concatenate([[self.photons], photons]))[-1])  # in the order of `add`
+        self.photons_known += len(photons)
+        silent = (flags & _ABSTAINED != 0) | (labels == NO_LABEL)
+        self.abstained += int(silent.sum())
+        self.unsure += int((silent & (flags & _AMBIGUOUS != 0)).sum())
+        known = (truths >= 0) & (truths < len(self.confusion))
+        labels, truths = labels[known], truths[known]
+        right = labels == truths
+        self.known += len(right)
+        self.right += int(right.sum())
+        named = labels != NO_LABEL
+        n = len(self.confusion)
+        cells = np.bincount(truths[named] * n + labels[named], minlength=n * n)
+        self.confusion += cells.reshape(n, n)
+        self._add_sums(rows["shot"][known] // self.shots, right, self._trial_sums)
+        numbers = rows["object"][known].astype(np.int64)
+        self._add_sums(numbers % self.distinct if self.distinct else numbers, right, self._object_sums)
+
+    def _add_sums(
+        self, keys: npt.NDArray[Any], right: npt.NDArray[np.bool_], sums_of: Callable[[int], list[int]]
+    ) -> None:
+        """Add decisions and right ones to the sums of each key, in the order in which keys come first."""
+        found, first, places = np.unique(keys, return_index=True, return_inverse=True)
+        decided, well = np.bincount(places), np.bincount(places, right)
+        for at in np.argsort(first).tolist():
+            sums = sums_of(int(found[at]))
+            sums[0] += int(decided[at])
+            sums[1] += int(well[at])
+
+    def _trial_sums(self, trial: int) -> list[int]:
+        return self._trials.setdefault(trial, [0, 0])
+
     def _which(self, decision: Decision) -> int:
         """Return which object a decision is about: one that is shown again keeps its number."""
         return decision.object % self.distinct if self.distinct else decision.object
@@ -130,3 +172,10 @@ class RunTally:
             clicks_mean=self.clicks / self.decisions if self.decisions else None,
             photons_mean=self.photons / self.photons_known if self.photons_known else None,
         )
+
+
+def photons_of(marks: Mapping[int, Mark], objects: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:
+    """Return the photoelectrons of one shot on each of `objects`, float32 (n,), NaN where no mark told them."""
+    found, places = np.unique(objects, return_inverse=True)
+    known = [marks.get(number) for number in found.tolist()]
+    return np.array([np.nan if mark is None else mark.photons for mark in known], np.float32)[places]

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from pans.runtime.wire.frame import Messages
 
+from .format import Kind
+
 
 class AnyRecorder(Protocol):
     """A recording that is being written: adding buffers, `flush` writes, `close` ends it and returns the hash of its decisions."""
@@ -29,11 +31,17 @@ class AnyRecorder(Protocol):
 
     def add_messages(self, host_ns: int, messages: Messages, first: int, count: int) -> None: ...
 
+    def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None: ...
+
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None: ...
 
     def add_answer(self, host_ns: int, data: bytes | bytearray | memoryview) -> None: ...
 
     def add_decision(self, record: Sequence[Any]) -> None: ...
+
+    def add_decisions(self, rows: NDArray[np.void]) -> None: ...
+
+    def add_timings(self, rows: NDArray[np.void]) -> None: ...
 
     def add_timing(self, record: Sequence[Any]) -> None: ...
 

@@ -29,6 +29,13 @@ class RowBuffer:
         self.used += 1
         return self.used == len(self.rows)
 
+    def add_many(self, rows: np.ndarray[Any, np.dtype[np.void]]) -> int:
+        """Store as many rows as there is room for; return how many."""
+        n = min(len(rows), len(self.rows) - self.used)
+        self.rows[self.used : self.used + n] = rows[:n]
+        self.used += n
+        return n
+
     def take(self) -> bytes:
         data = self.rows[: self.used].tobytes()
         self.used = 0

@@ -24,6 +24,7 @@ from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Opcode, encode_command
 
+from .format import Kind
 from .part_keeper import PartFacts, PartKeeper, PartLimits, chained, part_path
 from .recorder import Recorder
 
@@ -95,6 +96,10 @@ class PartedRecorder:
         """See `Recorder`."""
         self.open_part.add_messages(host_ns, messages, first, count)
 
+    def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_stamped(kind, data, spans)
+
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """See `Recorder`."""
         self.open_part.add_command(host_ns, data)
@@ -114,6 +119,10 @@ class PartedRecorder:
     def add_timing(self, record: Sequence[Any]) -> None:
         """See `Recorder`."""
         self.open_part.add_timing(record)
+
+    def add_timings(self, rows: NDArray[np.void]) -> None:
+        """See `Recorder`."""
+        self.open_part.add_timings(rows)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """See `Recorder`."""

@@ -65,10 +65,11 @@ class Recorder:
         # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
         self._in_order = (self._commands, self._answers, self._messages, self._decisions, self._timings)
         self._log = LogEncoder()
-        from .kernels import pack_messages  # numba is loaded only by who records
+        from .kernels import pack_messages, pack_stamped  # numba is loaded only by who records
 
-        self._pack = pack_messages
+        self._pack, self._pack_stamped = pack_messages, pack_stamped
         pack_messages(self._messages.array, np.zeros((0, 2), np.int64), 0, 0, 0, self._messages.array, 0)
+        pack_stamped(self._messages.array, np.zeros((0, 4), np.int64), 0, self._messages.array, 0)
         self._n_decisions = 0
         self._n_blocks = 0
         version = version_for(header)
@@ -140,6 +141,17 @@ class Recorder:
             self._add_bytes(buffer, host_ns, messages.buffer[begin:end].tobytes())  # makes room
             first += 1
 
+    def add_stamped(self, kind: Kind, data: NDArray[np.uint8], spans: NDArray[np.int64]) -> None:
+        """Keep many MESSAGES, COMMANDS or ANSWERS: `spans` int64 (n, 4) are where each begins and ends in `data`, and its time in ns."""
+        buffer = {Kind.MESSAGES: self._messages, Kind.COMMANDS: self._commands, Kind.ANSWERS: self._answers}[kind]
+        first = 0
+        while first < len(spans):
+            first, buffer.used = self._pack_stamped(data, spans, first, buffer.array, buffer.used)
+            if first < len(spans):
+                begin, end, host_ns, _ = spans[first].tolist()
+                self._add_bytes(buffer, host_ns, data[begin:end].tobytes())  # makes room
+                first += 1
+
     def add_command(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep the bytes of one command to the device and the host time at which it was sent, in ns."""
         self._add_bytes(self._commands, host_ns, data)
@@ -167,6 +179,14 @@ class Recorder:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
         if self._timings.add(record):
             self._empty(self._timings)
+
+    def add_timings(self, rows: NDArray[np.void]) -> None:
+        """Keep the host times of many decisions, TIMING_DTYPE (n,)."""
+        done = 0
+        while done < len(rows):
+            done += self._timings.add_many(rows[done:])
+            if self._timings.used == BUFFER_ROWS:
+                self._empty(self._timings)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""

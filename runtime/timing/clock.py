@@ -122,6 +122,18 @@ class ClockModel:
         host_ns = fit.reference_host_ns + round(elapsed * fit.ns_per_tick)
         return max(-LARGEST_NS, min(host_ns, LARGEST_NS)), min(int(uncertainty) + 1, LARGEST_NS)
 
+    def to_host_many(self, ticks: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the host times of many ticks below 2^62 and their uncertainties, int64 (n,), as `to_host_ns` of each."""
+        fit = self._ready()
+        elapsed = ticks - fit.reference_tick
+        rate = fit.ns_per_tick * fit.rate_uncertainty
+        bounds = [bound + np.abs(elapsed - at) * rate for at, bound in fit.anchors]
+        host = fit.reference_host_ns + np.clip(np.rint(elapsed * fit.ns_per_tick), -LARGEST_NS, LARGEST_NS).astype(
+            np.int64
+        )
+        uncertainty = np.minimum(np.minimum.reduce(bounds), LARGEST_NS - 1).astype(np.int64) + 1
+        return np.clip(host, -LARGEST_NS, LARGEST_NS), uncertainty
+
     def to_tick(self, host_ns: int) -> int:
         """Return the device tick at a host time (for commands with absolute ticks)."""
         fit = self._ready()

@@ -17,6 +17,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .page_faults import held_heap
 
 SUB_BITS = 5  # 32 steps per octave: a quantile is at most 3.2 % above the true value
@@ -42,6 +45,17 @@ class LatencyHistogram:
         self.total += 1
         if value > self.max_ns:
             self.max_ns = value
+
+    def add_many(self, durations_ns: NDArray[np.int64], weights: NDArray[np.int64]) -> None:
+        """Count many durations, each `weights` times, both int64 (n,); as `add` for each."""
+        values = np.maximum(durations_ns, 0)
+        shift = np.maximum(np.frexp(values.astype(np.float64))[1] - SUB_BITS - 1, 0)  # exact below 2^53 ns
+        buckets = (shift << SUB_BITS) + (values >> shift)
+        found, places = np.unique(buckets, return_inverse=True)
+        for bucket, count in zip(found.tolist(), np.bincount(places, weights).astype(np.int64).tolist()):
+            self.counts[bucket] += count
+        self.total += int(weights.sum())
+        self.max_ns = max(self.max_ns, int(values.max(initial=0)))
 
     def quantile_ns(self, q: float) -> int:
         """Return the upper edge of the bucket that holds quantile `q` (never above the exact maximum); 0 without data."""
@@ -99,6 +113,22 @@ class TimingLedger:
         slowest = max(range(3), key=lambda stage: steps[stage])
         self.blame[STAGES[slowest]] = self.blame.get(STAGES[slowest], 0) + 1
         return True
+
+    def judge_many(
+        self, marks_ns: NDArray[np.int64], uncertainty_ns: NDArray[np.int64], weights: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Take the times of many decisions, int64 (n, 5) as `judge` takes them, each of `weights` (n,) decisions; return which are late."""
+        steps = np.diff(marks_ns, axis=1)
+        for column, name in enumerate(STAGES):
+            self.stages[name].add_many(steps[:, column], weights)
+        latency = marks_ns[:, 3] - marks_ns[:, 0]
+        self.total.add_many(latency, weights)
+        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, int(uncertainty_ns.max(initial=0)))
+        late: NDArray[np.bool_] = latency - uncertainty_ns > self.deadline_ns
+        self.late += int(weights[late].sum())
+        for stage, count in zip(steps[late, :3].argmax(axis=1).tolist(), weights[late].tolist()):
+            self.blame[STAGES[stage]] = self.blame.get(STAGES[stage], 0) + count
+        return late
 
 
 class _Heap:

@@ -47,6 +47,11 @@ class BulkDecoder:
         )
 
     @property
+    def arrays(self) -> tuple[U8, I64, I64]:
+        """The buffer, the spans of its bodies and the tally: what compiled code continues (turn/kernels.py)."""
+        return self.buffer, self._bodies, self._tally
+
+    @property
     def held_bytes(self) -> int:
         """Bytes of a frame whose delimiter has not come yet."""
         return int(self._tally[kernels.HELD])

@@ -158,6 +158,30 @@ class HostSession:
         self._output.clear()
         return data
 
+    # -- commands that a compiled turn sends ---------------------------------------------------------------------------
+
+    @property
+    def window(self) -> tuple[int, int, int, bool]:
+        """The next id, the oldest one without an answer, since when it waits, and whether commands wait to be sent."""
+        oldest = self._unacknowledged[0][0] if self._unacknowledged else self.next_id - len(self._waiting)
+        return self.next_id, oldest, self._oldest_ns, bool(self._waiting)
+
+    def continue_from(self, oldest_id: int, oldest_ns: int, sent: list[tuple[int, bytes]], opcode: Opcode) -> None:
+        """Take over what was done elsewhere from `window` on, while none waited: commands up to `oldest_id` - 1 were carried out.
+
+        `sent` are ids and frames that have left, all of them of a kind that may be refused.
+        """
+        while self._unacknowledged and self._unacknowledged[0][0] < oldest_id:
+            self._may_be_refused.pop(self._unacknowledged.popleft()[0], None)
+        for command_id, frame in sent:
+            self.next_id = command_id + 1
+            if command_id >= oldest_id:
+                self._may_be_refused[command_id] = opcode
+                self._unacknowledged.append((command_id, frame))
+        if oldest_ns != self._oldest_ns:
+            self._oldest_ns, self._retry_after_ns = oldest_ns, RETRY_FIRST_NS
+            self._retry_due_ns = oldest_ns + RETRY_FIRST_NS
+
     # -- what time brings ----------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> None:

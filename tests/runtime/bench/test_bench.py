@@ -24,9 +24,9 @@ from pans.runtime.bench.rows import (
 )
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import main
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.mlp import SparseDecider
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.framing import FrameDecoder
 
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from plans import parallel, pattern_major, shot_major, walk_plan, walked
 from streams import SESSION, click_frames, compare, spoilt
 
-from pans.runtime.core import stream
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdict, Verdicts
+from pans.runtime.turn import streaming
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import ClickBlock
 
@@ -107,7 +107,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 @pytest.mark.uncompiled
 def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "ROWS_PER_BATCH", 5)
+    monkeypatch.setattr(streaming, "ROWS_PER_BATCH", 5)
     rng = np.random.default_rng(4)
     for plan, decider, shots in (CASES[2](), CASES[7]()):
         clean = click_frames(plan, sent_exposures(plan, rng, 0.0), rng, 16)

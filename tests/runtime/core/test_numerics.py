@@ -17,12 +17,12 @@ from plans import parallel
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.core.still import Core
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.kernels import winner
 from pans.runtime.decide.verdict import log_evidence, softmax_winner, softmax_winners
 from pans.runtime.intervals import binomial_tail, wilson_interval
 from pans.runtime.timing.clock import ClockModel
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import FrameBlock

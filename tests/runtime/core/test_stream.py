@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from plans import parallel
 from streams import SESSION, compare, spoilt
 
-from pans.runtime.core import stream
 from pans.runtime.core.bulk_steps import count_crc_tables
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
-from pans.runtime.core.stream import StreamCore
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Verdicts
+from pans.runtime.turn import streaming
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import DeviceState, FrameBlock, Mark, MessageType, StateReason, Status
 
@@ -80,7 +80,7 @@ def test_any_faults_any_cuts(data: st.DataObject) -> None:
 
 @pytest.mark.uncompiled
 def test_more_rows_than_a_batch_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream, "ROWS_PER_BATCH", 5)
+    monkeypatch.setattr(streaming, "ROWS_PER_BATCH", 5)
     plan, decider = parallel(10, 8), decider_for(10, 1, "table")
     clean = frames(plan, 10, 5, np.random.default_rng(4), 3)
     assert len(compare(plan, decider, 1, [b"".join(clean)])) == 40

@@ -224,7 +224,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
     link_states = []
 
     def prepared(run: LiveRun) -> None:
-        file = run._recorder.open_part._file  # type: ignore[union-attr]
+        file = run.recorder.open_part._file  # type: ignore[union-attr]
 
         class Full:
             closed = False
@@ -239,7 +239,7 @@ def test_a_full_disk_ends_the_run_with_the_light_off(tmp_path: Path) -> None:
                 self.closed = True
                 file.close()
 
-        run._recorder.open_part._file = Full()  # type: ignore[union-attr]
+        run.recorder.open_part._file = Full()  # type: ignore[union-attr]
         link_states.append(run)
 
     with pytest.raises(RecordingError, match="No space left on device"):

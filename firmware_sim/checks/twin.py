@@ -1,0 +1,102 @@
+"""The bytes of a run once more, through the compiled turn: what a faulty link gave to Python's turn, read from a socket by compiled code.
+
+Owns the tape of a run and its second reading; never judges the first. `differences` says where the two are not the same, bit for bit.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.core.decision import DECISION_DTYPE, Output
+from pans.runtime.core.plan import Plan
+from pans.runtime.core.still import Core
+from pans.runtime.decide.verdict import Decider
+from pans.runtime.link.base import Link
+from pans.runtime.live import LiveRun
+from pans.runtime.turn.engine import Limits
+from pans.runtime.turn.streaming import Batch, StreamCore
+
+from .reconciliation import ObservedLink
+
+MOST_SENT = 1 << 15  # bytes in one piece through a socket whose pieces stay apart
+AT_ONCE = Limits(due_ns=0)
+
+
+class TapedLink(ObservedLink):
+    """An observed link that keeps what was read, piece by piece, and when it was opened again."""
+
+    def __init__(self, link: Any) -> None:
+        super().__init__(link)
+        self.tape: list[tuple[str, Any]] = []
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        data = super().read(timeout_s)
+        if data:
+            self.tape.append(("bytes", data))
+        return data
+
+    def reopen(self) -> Link:
+        """See `Link`."""
+        self.tape.append(("opened", None))
+        return super().reopen()
+
+    def listen(self, run: LiveRun) -> None:
+        """Keep when the core of `run` begins and ends a stream, too."""
+        begin, end = run.core.begin, run.core.end
+
+        def taped_begin(start_tick: int, n_cycles: int) -> Output:
+            place = len(self.tape)
+            output = begin(start_tick, n_cycles)
+            self.tape[place:] = [
+                ("begin", (run.connection.session.nonce, start_tick, n_cycles))
+            ]  # which ends the one before
+            return output
+
+        def taped_end() -> Output:
+            self.tape.append(("end", None))
+            return end()
+
+        for name, tap in (("begin", taped_begin), ("end", taped_end)):
+            setattr(run.core, name, tap)
+
+
+def differences(
+    tape: list[tuple[str, Any]], plan: Plan, decider: Decider, shots: int, core: Core, decisions: NDArray[np.void]
+) -> list[str]:
+    """Read `tape` once more; return where decisions, counters and tallies are not those of `core`, which read it first."""
+    streamed = StreamCore(plan, decider, shots, 0, 0)
+    rows = [np.zeros(0, DECISION_DTYPE), *(batch.rows.copy() for batch in _read_again(streamed, tape))]
+    found, again = np.concatenate(rows), streamed.core
+    compared = [
+        ("decisions", len(found), len(decisions)),
+        ("stream counters", asdict(again.tracker.counters), asdict(core.tracker.counters)),
+        ("tallies", again.tallies.tolist(), core.tallies.tolist()),
+        ("place", again.tracker.position, core.tracker.position),
+    ]
+    wrong = [f"compiled turn: {what} {one}, Python's {other}" for what, one, other in compared if one != other]
+    if len(found) == len(decisions) and (differ := np.flatnonzero(found != decisions)).size:
+        wrong.append(f"compiled turn: decision {differ[0]} is {found[differ[0]]}, Python's {decisions[differ[0]]}")
+    return wrong
+
+
+def _read_again(streamed: StreamCore, tape: list[tuple[str, Any]]) -> Iterator[Batch]:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        for what, facts in tape:
+            if what == "bytes":
+                for first in range(0, len(facts), MOST_SENT):
+                    theirs.send(facts[first : first + MOST_SENT])
+                    yield from streamed.listen(ours.fileno(), AT_ONCE)
+            elif what == "opened":
+                streamed.reopen()
+            elif what == "begin":
+                yield from streamed.begin(*facts)
+            else:
+                yield from streamed.end()

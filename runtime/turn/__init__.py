@@ -1,0 +1,17 @@
+"""The compiled turn: from bytes in the system's buffer to decisions, the next command and what is to be recorded, in one call.
+
+Owns the kernels that wait, read, decide and answer by themselves, and their memory; what is not ordinary they leave to Python's turn
+(live/run.py), whose decisions they give bit for bit. live/compiled.py uses it.
+"""
+
+from typing import TYPE_CHECKING
+
+from pans.runtime.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from .engine import Turn
+    from .streaming import StreamCore
+
+__all__ = ["StreamCore", "Turn"]
+
+__getattr__ = lazy_names(__name__, {"StreamCore": ".streaming", "Turn": ".engine"})

@@ -1,0 +1,166 @@
+"""`Turn`: one connection's compiled turns, from bytes to rows, for a core whose steps are compiled.
+
+Owns the arrays between Python and the kernels, and the hand-over of the core's state in each call; never opens, records or judges. `run`
+says why it ended; what came stands in properties that are valid until the next `run`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core import stream_kernels as core_kernels
+from pans.runtime.core.bulk_steps import CLICKS_MAX, BulkSteps
+from pans.runtime.wire.bulk import BulkDecoder
+from pans.runtime.wire.messages import Mark, MessageType, decode_mark
+from pans.runtime.wire.schema import HEADER
+
+from . import rings as ring
+from .rings import I64, U8, Decoder, Drive, Rings, make_rings, no_drive
+
+NO_END = 1 << 62
+
+
+class Limits(NamedTuple):
+    """When a call ends though all is ordinary: see rings.py's control for the columns."""
+
+    due_ns: int = NO_END
+    patience_ns: int = 0
+    eager_ns: int = 0
+    budget: int = NO_END
+    floor_ns: int = 0
+
+
+class Counts(NamedTuple):
+    """What a call reports, in the order of rings.py's control."""
+
+    errno: int
+    unsent: int
+    heard_ns: int
+    steps: int
+    messages: int
+    answers: int
+    shows: int
+    notes: int
+    arrivals: int
+    kept: int
+
+
+NO_LIMITS = Limits()
+_NOTHING = Counts(*[0] * len(Counts._fields))
+
+
+class Turn:
+    """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
+
+    def __init__(self, steps: BulkSteps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
+        from .kernels import turn  # needs the compiler and a POSIX system
+
+        self.steps, self.decoder = steps, decoder
+        self.rings: Rings = make_rings()
+        self.counts = _NOTHING
+        self._kernel = turn
+        self._drive = no_drive() if drive is None else drive
+        self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
+        self.control[ring.FD] = -1
+        self.control[ring.BLOCK_ROWS] = min(steps.windows.n_windows, CLICKS_MAX)
+        self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
+        self._scratch: I64 = np.zeros(4, np.int64)
+        self._decoder = Decoder(*decoder.arrays)
+        self._walk = steps.walk
+
+    def warm_up(self) -> None:
+        """Compile or load the kernel, before arming; nothing is read and nothing changes."""
+        self.steps.load()
+        self._kernel(self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+
+    def drives(self, drive: Drive) -> None:
+        """Name the states of walks by `drive` from here on."""
+        self._drive = drive
+
+    def run(self, fd: int = -1, limits: Limits = NO_LIMITS) -> int:
+        """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY)."""
+        control, steps = self.control, self.steps
+        if fd >= 0:
+            control[ring.FD] = fd
+        control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
+        control[ring.FLOOR_NS] = limits.floor_ns
+        control[ring.OPEN] = steps.core.tracker.open
+        steps.load()
+        ended = int(self._kernel(self._decoder, self._walk, self._drive, self.rings, control, self._scratch))
+        self.counts = Counts(*control[ring.ERRNO :].tolist())
+        if self.counts.messages:
+            steps.store()
+        return ended
+
+    def feed(self, data: bytes, arrival_ns: int) -> int:
+        """Take at most CHUNK_BYTES that were read elsewhere at `arrival_ns`; as `run` without a descriptor."""
+        return self.decoded(len(self.decoder.take(data)), arrival_ns)
+
+    def decoded(self, n_bodies: int, arrival_ns: int) -> int:
+        """Take the bodies that the decoder has found in what it was given last."""
+        self.control[ring.PLACE : ring.ARRIVAL_NS + 1] = (0, n_bodies, arrival_ns)
+        return self.run()
+
+    def stop(self) -> None:
+        """End a call that is under way in another thread, and those that follow, at once."""
+        self.control[ring.STOP] = 1
+
+    # -- what came -----------------------------------------------------------------------------------------------------
+
+    @property
+    def arrival_ns(self) -> int:
+        """When the bytes were read that were decoded last."""
+        return int(self.control[ring.ARRIVAL_NS])
+
+    @property
+    def left(self) -> I64:
+        """The spans of the decoder's bodies that have not been taken, int64 (n, 2)."""
+        place, n = self.control[ring.PLACE : ring.N_BODIES + 1].tolist()
+        return self._decoder.bodies[place:n]
+
+    def skip(self, bodies: int = 1) -> None:
+        """Count bodies that the caller has taken."""
+        self.control[ring.PLACE] += bodies
+
+    @property
+    def rows(self) -> npt.NDArray[np.void]:
+        """The decisions of the call, DECISION_DTYPE (n,), in order."""
+        return self.steps.labelled(int(self._walk.state[core_kernels.N_ROWS]))
+
+    @property
+    def blocks(self) -> I64:
+        """When each block came, was decoded, decided and kept, and what had come up to it: rings.py's steps (n, N_STEP)."""
+        return self.rings.steps[: self.counts.steps]
+
+    @property
+    def messages(self) -> I64:
+        """Where the stream messages of the call stand in `kept`: rings.py's spans (n, 4)."""
+        return self.rings.messages[: self.counts.messages]
+
+    @property
+    def answers(self) -> I64:
+        """Where the acknowledgements stand in `kept`."""
+        return self.rings.answers[: self.counts.answers]
+
+    @property
+    def shows(self) -> I64:
+        """Where the commands stand in `kept` that were sent."""
+        return self.rings.shows[: self.counts.shows]
+
+    @property
+    def kept(self) -> U8:
+        """The bytes that `messages`, `answers` and `shows` speak of."""
+        return self.rings.kept
+
+    def bytes_of(self, span: npt.NDArray[Any]) -> bytes:
+        """Return what stands at one row of `messages`, `answers` or `shows`."""
+        return self.kept[int(span[ring.BEGIN]) : int(span[ring.END])].tobytes()
+
+    def marks(self) -> list[Mark]:
+        """Return the marks among `messages`, in order."""
+        found = self.messages
+        places = np.flatnonzero(found[:, ring.WHAT] == int(MessageType.MARK))
+        return [decode_mark(self.bytes_of(found[place])[HEADER.size :]) for place in places.tolist()]

@@ -1,0 +1,219 @@
+"""The turn as one compiled call: wait, read, resynchronise, check, decide, name the next state, keep what came.
+
+Owns the order of these and why a call ends; bytes are wire/kernels.py's, messages core/stream_kernels.py's, commands shows.py's.
+It goes on by itself with all that is ordinary; what is not it leaves, untouched and in its place, to the caller. Never allocates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pans.runtime.core import stream_kernels as core
+from pans.runtime.timing.evidence import OVERSLEPT_NS
+from pans.runtime.wire import kernels as wire
+from pans.runtime.wire import walk as stream
+from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
+
+from . import rings as ring
+from .shows import send_show, take_ack
+from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
+
+READ_BYTES = 1 << 16  # at once, as link/serial.py
+LEAST_WAIT_NS = 200_000
+QUIET_NS = 5_000_000
+_ACK = int(MessageType.ACK)
+_U = np.uint64
+
+
+@njit(cache=True, nogil=True)
+def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
+
+    decoder Decoder, walk WalkArrays, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). The rings are filled from
+    their beginning.
+    """
+    control[ring.ERRNO : ring.N_CONTROL] = 0
+    walk.state[core.N_ROWS] = 0
+    ended = take_bodies(decoder, walk, drive, rings, control, scratch)
+    if ended != ring.ALL_TAKEN or not control[ring.READS]:
+        return ended
+    began_ns = now_ns(scratch)
+    quiet_ns = QUIET_NS if control[ring.DRIVES] else 0  # the caller's work fits into the exposure behind a SHOW
+    while True:
+        now = now_ns(scratch)
+        due = control[ring.DUE_NS] + quiet_ns
+        if control[ring.PATIENCE_NS]:
+            due = min(due, max(control[ring.BLOCK_NS] + control[ring.PATIENCE_NS], began_ns + LEAST_WAIT_NS))
+        overdue = now >= due  # what is there is read once even then
+        over = overdue or control[ring.N_MESSAGES] >= control[ring.BUDGET]
+        if control[ring.STOP] or (over and control[ring.N_ARRIVALS]):
+            return ring.DUE
+        if control[ring.N_ARRIVALS] == rings.arrivals.size or control[ring.N_NOTES] == rings.notes.shape[0]:
+            return ring.FULL
+        awake = now < began_ns + control[ring.EAGER_NS]
+        if not awake:
+            ready = wait_for(control[ring.FD], due - now, False, scratch)
+            _note_wait(rings.notes, control, now, due, now_ns(scratch))
+            if ready < 0:
+                return _failed(control, ready)
+            if ready == 0 and overdue:
+                return ring.DUE
+            if ready == 0:
+                continue
+        found = _read(decoder, control, scratch)
+        if found < 0 or (found == 0 and not awake):
+            if found == -AGAIN:
+                continue
+            return _failed(control, found)
+        if found == 0:
+            continue  # a terminal says so when nothing is there
+        rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
+        control[ring.N_ARRIVALS] += 1
+        shows = control[ring.N_SHOWS]
+        ended = take_bodies(decoder, walk, drive, rings, control, scratch)
+        if ended != ring.ALL_TAKEN:
+            return ended
+        if control[ring.N_SHOWS] > shows and now_ns(scratch) >= control[ring.DUE_NS]:
+            return ring.DUE
+
+
+@njit(cache=True, nogil=True)
+def _failed(control, found):  # type: ignore[no-untyped-def]
+    """Why a call ends whose wait or read gave `found`, 0 or minus errno."""
+    control[ring.ERRNO] = -found
+    return ring.SIGNALLED if found == -INTERRUPTED else ring.GONE
+
+
+@njit(cache=True, nogil=True)
+def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
+    """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/evidence.py)."""
+    n = control[ring.N_NOTES]
+    if n:
+        before = notes[n - 1]
+        if before[2] - before[1] < OVERSLEPT_NS and began - min(before[1], before[2]) < control[ring.FLOOR_NS]:
+            before[1], before[2] = asked, ended
+            return
+    notes[n, 0], notes[n, 1], notes[n, 2] = began, asked, ended
+    control[ring.N_NOTES] += 1
+
+
+@njit(cache=True, nogil=True)
+def _read(decoder, control, scratch):  # type: ignore[no-untyped-def]
+    """Read behind what waits in the buffer, stamp and decode it; return the bytes read, 0, or minus errno."""
+    buffer, tally = decoder.buffer, decoder.tally
+    waiting, held = tally[wire.CONSUMED], tally[wire.HELD]
+    if waiting:
+        for i in range(held):
+            buffer[i] = buffer[waiting + i]
+        tally[wire.CONSUMED] = 0
+    found = read_now(control[ring.FD], buffer, held, min(READ_BYTES, buffer.size - held))
+    if found <= 0:
+        return found
+    control[ring.ARRIVAL_NS] = now_ns(scratch)
+    used = held + found
+    control[ring.N_BODIES] = wire.unstuff_frames(buffer, used, MAX_FRAME_BYTES, SCHEMA, decoder.bodies, tally)
+    control[ring.PLACE] = 0
+    tally[wire.HELD] = used - tally[wire.CONSUMED]
+    tally[wire.BYTES_IN] += found
+    return found
+
+
+@njit(cache=True, nogil=True)
+def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Take decoded bodies until none is left, one is not ordinary, or a ring is nearly full; say which."""
+    buffer, bodies = decoder.buffer, decoder.bodies
+    while control[ring.PLACE] < control[ring.N_BODIES]:
+        start, stop = bodies[control[ring.PLACE], 0], bodies[control[ring.PLACE], 1]
+        if not _has_room(walk, rings, control, stop - start):
+            return ring.FULL
+        if buffer[start] == _ACK and control[ring.DRIVES]:
+            if load_session(buffer, start) != walk.state[core.SESSION] or not take_ack(
+                buffer, _U(start), _U(stop), control
+            ):
+                return ring.ODD
+            _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
+            control[ring.PLACE] += 1
+            continue
+        if not control[ring.OPEN]:
+            return ring.ODD
+        decoded_ns = now_ns(scratch)
+        took = core.take_message(
+            buffer, _U(start), _U(stop), walk.state, walk.marks, walk.windows, walk.tables, walk.rows, walk.counts
+        )
+        if took == core.TOOK_BLOCK:
+            decided_ns = now_ns(scratch)
+            sent = not control[ring.DRIVES] or send_show(walk, drive, rings, control, scratch)
+            _keep(buffer, start, stop, rings.kept, rings.messages, ring.N_MESSAGES, control)
+            _put_step(walk, rings.steps, control, decoded_ns, decided_ns, now_ns(scratch))
+            control[ring.PLACE] += 1
+            if not sent:
+                return ring.BROKEN
+        elif took == core.TOOK_MARK:
+            _keep(buffer, start, stop, rings.kept, rings.messages, ring.N_MESSAGES, control)
+            control[ring.PLACE] += 1
+        else:
+            return ring.ODD
+    return ring.ALL_TAKEN
+
+
+@njit(cache=True, nogil=True)
+def load_session(buffer, start):  # type: ignore[no-untyped-def]
+    """The session of the body at `start`, int64."""
+    return np.int64(wire.load4(buffer, _U(start) + _U(4)))
+
+
+@njit(cache=True, nogil=True)
+def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
+    """Whether another body of `size` bytes, what it answers and all its decisions fit."""
+    return (
+        control[ring.KEPT] + size + ring.SHOW_BYTES <= rings.kept.size
+        and control[ring.N_STEPS] < rings.steps.shape[0]
+        and control[ring.N_MESSAGES] < rings.messages.shape[0]
+        and control[ring.N_ANSWERS] < rings.answers.shape[0]
+        and control[ring.N_SHOWS] < rings.shows.shape[0]
+        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= walk.rows.size
+    )
+
+
+@njit(cache=True, nogil=True)
+def _keep(buffer, start, stop, kept, spans, count, control):  # type: ignore[no-untyped-def]
+    """Copy a body behind what is kept, and say where it stands; `count` is the column of `control` that counts the spans."""
+    at = control[ring.KEPT]
+    kept[at : at + stop - start] = buffer[start:stop]
+    span = spans[control[count]]
+    span[ring.BEGIN], span[ring.END], span[ring.TIME] = at, at + stop - start, control[ring.ARRIVAL_NS]
+    span[ring.WHAT] = buffer[start]
+    control[count] += 1
+    control[ring.KEPT] = at + stop - start
+    control[ring.HEARD_NS] = control[ring.ARRIVAL_NS]
+
+
+@njit(cache=True, nogil=True)
+def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # type: ignore[no-untyped-def]
+    """Keep when a block came, was decoded, decided and kept, and what has come of all up to it."""
+    step = steps[control[ring.N_STEPS]]
+    step[ring.ARRIVAL], step[ring.DECODED] = control[ring.ARRIVAL_NS], decoded_ns
+    step[ring.DECIDED], step[ring.RECORDED] = decided_ns, recorded_ns
+    step[ring.END_TICK], step[ring.ROWS] = walk.state[core.LAST_TICK], walk.state[core.N_ROWS]
+    step[ring.MESSAGES], step[ring.SHOWS] = control[ring.N_MESSAGES], control[ring.N_SHOWS]
+    control[ring.N_STEPS] += 1
+    control[ring.BLOCK_NS] = control[ring.ARRIVAL_NS]
+
+
+@njit(cache=True, nogil=True)
+def unpack_blocks(kept, messages, stamps, bits):  # type: ignore[no-untyped-def]
+    """Put the patterns shown and the clicks of all CLICKS among `messages` behind one another; return how many exposures fitted.
+
+    kept uint8, messages int64 (n, 4), stamps uint16 and bits uint8 (m,).
+    """
+    used = np.int64(0)
+    for i in range(messages.shape[0]):
+        if messages[i, ring.WHAT] == stream.CLICKS:
+            payload = _U(messages[i, ring.BEGIN] + stream.BODY_HEADER)
+            count = np.int64(wire.load4(kept, payload + _U(28)) & _U(0xFFFF))
+            if used + count > stamps.size:
+                break
+            stream.unpack_clicks(kept, payload, count, stamps[used:], bits[used:])
+            used += count
+    return used

@@ -1,0 +1,139 @@
+"""The host's answer to a block, compiled: where the walk goes on, the SHOW command that names it, its bytes, its acknowledgement.
+
+Owns the compiled twins of live/drive.py (which state follows), wire/framing.py (COBS and CRC of one short frame) and of the ordinary case
+of an acknowledgement in wire/session.py. Never allocates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pans.runtime.core import stream_kernels as core
+from pans.runtime.wire import walk as stream
+from pans.runtime.wire.kernels import crc32_span, load4
+from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
+from pans.runtime.wire.session import COMMAND_WINDOW
+
+from . import rings as ring
+from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
+
+ACK_BYTES = STRUCTS["ACK"].size
+ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
+TAIL_AT = EXPOSURE_AT + 8
+WRITE_WAIT_NS = 20_000_000  # for room; what then is left, the caller sends
+_U = np.uint64
+
+
+@njit(cache=True, nogil=True)
+def following(walk, drive):  # type: ignore[no-untyped-def]
+    """Exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
+    slots, walks = drive.sizes[0], drive.sizes[1]
+    cycle = walk.state[stream.NEXT_EXPOSURE] // slots
+    step = drive.next_step[walk.state[stream.NEXT_EXPOSURE] - cycle * slots]
+    if step < drive.slot_of.size:
+        state = _walk_state(walk, cycle // walks, cycle % walks, step)
+        if state >= 0:
+            return cycle * slots + drive.slot_of[step], state
+    return (cycle + 1) * slots + drive.slot_of[0], np.int64(0)
+
+
+@njit(cache=True, nogil=True)
+def _walk_state(walk, visit, window, step):  # type: ignore[no-untyped-def]
+    """As DecisionWindows.walk_state: -1 when the walk is over, or what came before is not known."""
+    if visit != walk.state[core.VISIT]:
+        return np.int64(0) if step == 0 else np.int64(-1)
+    node = walk.windows.walks.nodes[window]
+    known = 0 <= node < walk.windows.walks.successors.shape[0] and walk.windows.seen[window, 0] == step
+    return node if known else np.int64(-1)
+
+
+@njit(cache=True, nogil=True)
+def put_show(drive, number, exposure, state, out, at):  # type: ignore[no-untyped-def]
+    """Put the frame of SHOW command `number` for `exposure` and `state` behind out[:at]; return where it ends."""
+    plain, tail = drive.plain, drive.tails.shape[1]
+    for i in range(4):
+        plain[ID_AT + i] = np.uint8(number >> 8 * i & 0xFF)
+    for i in range(8):
+        plain[EXPOSURE_AT + i] = np.uint8(exposure >> 8 * i & 0xFF)
+    for i in range(tail):
+        plain[TAIL_AT + i] = drive.tails[state, i]
+    size = TAIL_AT + tail
+    crc = np.int64(crc32_span(plain, 0, size, SCHEMA))
+    for i in range(4):
+        plain[size + i] = np.uint8(crc >> 8 * i & 0xFF)
+    code_at, code = at, 1
+    at += 1
+    for i in range(size + 4):  # fewer than 254 bytes: no group is full
+        if plain[i] == 0:
+            out[code_at] = code
+            code_at, code = at, 1
+        else:
+            out[at] = plain[i]
+            code += 1
+        at += 1
+    out[code_at] = code
+    out[at] = 0
+    return at + 1
+
+
+@njit(cache=True, nogil=True)
+def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Name what follows the exposures taken, unless that has been said; False when it could not be sent whole."""
+    exposure, state = following(walk, drive)
+    said = exposure == control[ring.SENT_EXPOSURE] and state == control[ring.SENT_STATE]
+    if said or exposure >= walk.state[stream.END_EXPOSURE]:
+        return True
+    unanswered = control[ring.NEXT_ID] - control[ring.OLDEST_ID]
+    if control[ring.WAITING] or unanswered >= COMMAND_WINDOW:
+        return True  # what waits for acknowledgements comes late: the next walk is named in time
+    begin = control[ring.KEPT]
+    end = put_show(drive, control[ring.NEXT_ID], exposure, state, rings.kept, begin)
+    sent = _send(control, rings.kept, begin, end, scratch)
+    left_ns = now_ns(scratch)
+    control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = exposure, state
+    control[ring.NEXT_ID] += 1
+    if unanswered == 0:
+        control[ring.OLDEST_NS] = left_ns
+    show = rings.shows[control[ring.N_SHOWS]]
+    show[ring.BEGIN], show[ring.END], show[ring.TIME], show[ring.WHAT] = begin, end, left_ns, control[ring.ARRIVAL_NS]
+    control[ring.N_SHOWS] += 1
+    control[ring.KEPT] = end
+    return sent
+
+
+@njit(cache=True, nogil=True)
+def _send(control, data, begin, end, scratch):  # type: ignore[no-untyped-def]
+    """Write data[begin:end]; False, with the rest's size and errno in `control`, when the other end takes no more."""
+    while begin < end:
+        taken = write_now(control[ring.FD], data, begin, end - begin)
+        if taken > 0:
+            begin += taken
+            continue
+        if taken == -INTERRUPTED:
+            continue
+        if (taken == 0 or taken == -AGAIN) and wait_for(control[ring.FD], WRITE_WAIT_NS, True, scratch) > 0:
+            continue
+        control[ring.UNSENT], control[ring.ERRNO] = end - begin, -taken
+        return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
+    """Account for an acknowledgement that refuses nothing and answers the oldest command; else False, and nothing done."""
+    at = start + _U(stream.BODY_HEADER)
+    if stop - at < _U(ACK_BYTES) or control[ring.WAITING]:
+        return False
+    last, refused = np.int64(load4(buffer, at)), np.int64(load4(buffer, at + _U(4)))
+    outcome = load4(buffer, at + _U(12))
+    status, text_bytes = outcome & _U(0xFFFF), outcome >> _U(16)
+    if stop - at != _U(ACK_BYTES) + text_bytes or text_bytes > _U(MAX_ACK_TEXT_BYTES) or (status and not refused):
+        return False
+    oldest = control[ring.OLDEST_ID]
+    if not oldest <= last < control[ring.NEXT_ID] or refused >= oldest or last - oldest > COMMAND_WINDOW:
+        return False  # an earlier refusal stays named, and has been told
+    if load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1)):
+        return False
+    control[ring.OLDEST_ID], control[ring.OLDEST_NS] = last + 1, control[ring.ARRIVAL_NS]
+    return True

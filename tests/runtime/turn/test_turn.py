@@ -1,0 +1,265 @@
+"""The compiled turn: the same decisions, recording and figures as Python's turn; how it ends, and what it leaves to Python.
+
+Streams with faults go through it in tests/runtime/core (tests/oracles/streams.py), whole runs with faults in the fault grid.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from heads import head_bundle, random_layers
+from plans import shot_major
+from streams import SESSION, click_frames
+from tree import ROOT
+
+from pans.firmware_sim.checks.twin import differences
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.serve import open_sim
+from pans.firmware_sim.ports.shell import open_port, serve
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import scene_from_arrays
+from pans.firmware_sim.testing import small_setup
+from pans.firmware_sim.trials.fault_grid import run_case
+from pans.runtime.core.still import Core
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import UsageError
+from pans.runtime.link.base import open_link
+from pans.runtime.live import RunConfig, RunResult, compiled, run_live
+from pans.runtime.live.compiled import choose_turn
+from pans.runtime.live.drive import HostDriver, WalkPlace
+from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.turn import kernels, shows, system
+from pans.runtime.turn import rings as ring
+from pans.runtime.turn.engine import Limits, Turn
+from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.wire.automata import unpack_show
+from pans.runtime.wire.bulk import BulkDecoder
+from pans.runtime.wire.framing import FrameDecoder
+from pans.runtime.wire.messages import DARK_PATTERN, Opcode, decode_command
+
+pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
+LONG_NS = 10_000_000_000
+OBJECTS = 12
+
+
+class Served:
+    """A simulated instrument for `mode` in a thread, behind a real port."""
+
+    def __init__(self, mode: str, listen: str) -> None:
+        self.profile, self.bundle, self.plan = small_setup(mode)
+        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+        scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
+        clock = DeviceClock(self.profile.clock.tick_hz)
+        device = Instrument(self.profile, scene, seed=3, power_on_tick=clock.tick_at(time.perf_counter_ns()))
+        port = open_port(listen)
+        self.url, self._stopped = port.url, threading.Event()
+        self._thread = threading.Thread(target=serve, args=(device, clock, port, self._stopped.is_set), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stopped.set()
+        self._thread.join(10)
+
+
+def recorded(setup: Any, link: Any, path: Path, turn: str) -> tuple[RunResult, Any]:
+    backend = "table" if setup.bundle.automaton is None else "automaton"
+    decider = make_decider(setup.bundle, shots=1, backend=backend)
+    config = RunConfig(1, OBJECTS * setup.plan.cycles_per_object, 0.0, 1e9, realtime=False, turn=turn)
+    core = Core(setup.plan, decider, 1, config.n_cycles)
+    driven = {"drive": setup.plan.drive, "confidence": 0.0}
+    facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}
+    with Recorder(path, facts) as recorder:
+        result = run_live(link, setup.profile, setup.bundle, setup.plan, core, config, recorder)
+        recorder.close({})
+    return result, read_recording(path)
+
+
+@pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
+@pytest.mark.parametrize("listen", ["tcp:127.0.0.1:0", "pty"])
+def test_a_run_through_a_descriptor(mode: str, listen: str, tmp_path: Path) -> None:
+    setup = Served(mode, listen)
+    result, recording = recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
+    setup.close()
+    assert (result.ended, result.turn.words()) == ("completed", "compiled")
+    assert result.tally.decisions == OBJECTS * setup.plan.shots_per_cycle * setup.plan.cycles_per_object
+    assert not result.contradictions  # every frame is an answer or was taken
+    again = replay(recording, setup.bundle)
+    assert (again.as_recorded, again.decisions) == (True, result.tally.decisions)
+    decisions = recording.decisions()
+    assert result.timing.total.total == len(decisions) or mode == "host-driven"
+    if mode == "host-driven":
+        assert sum(1 for _ in recording.commands()) > OBJECTS  # more than the first state of each walk was named
+        assert result.turn_us["max"] > 0
+    else:
+        assert not decisions["flags"].any()
+
+
+@pytest.mark.parametrize("few_rows", [0, 1 << 30])
+@pytest.mark.parametrize("mode", ["sequential", "parallel"])
+def test_virtual_runs_are_those_of_the_python_turn(
+    mode: str, few_rows: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiled, "FEW_ROWS", few_rows)
+    profile, bundle, plan = small_setup(mode)
+    found = []
+    for turn in ("python", "compiled"):
+        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+        scene = scene_from_arrays("turn", images, np.arange(6) % 3, ("a", "b", "c"))
+        clock = DeviceClock(profile.clock.tick_hz)
+        device = Instrument(profile, scene, seed=3, power_on_tick=clock.tick_at(START_NS))
+        setup = SimpleNamespace(profile=profile, bundle=bundle, plan=plan)
+        result, recording = recorded(setup, VirtualLink(device, clock, "sim:turn"), tmp_path / turn, turn)
+        assert result.turn.taken == turn
+        found.append((result, recording))
+    (ours, ours_recorded), (theirs, theirs_recorded) = found
+    assert ours.tally.figures() == theirs.tally.figures()
+    np.testing.assert_array_equal(ours.tally.confusion, theirs.tally.confusion)
+    assert ours.stream == theirs.stream
+    for name in ("total", *ours.timing.stages):
+        one, other = (result.timing.stages.get(name, result.timing.total) for result in (ours, theirs))
+        assert (one.counts, one.total, one.max_ns) == (other.counts, other.total, other.max_ns)
+    assert (ours.timing.late, ours.timing.blame) == (theirs.timing.late, theirs.timing.blame)
+    assert (ours.slot_jitter_us, ours.dark) == (theirs.slot_jitter_us, theirs.dark)
+    for which in ("decisions", "timings"):
+        assert getattr(ours_recorded, which)().tolist() == getattr(theirs_recorded, which)().tolist()
+    assert [body[8:] for _, body in ours_recorded.messages()] == [body[8:] for _, body in theirs_recorded.messages()]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_faulty_bytes_are_decided_as_in_the_python_turn(seed: int) -> None:
+    """The quick form of the fault grid: every mode, all faults; the checkers, and the bytes once more from a socket."""
+    assert run_case("all", seed, 1200, None, "python", reads_again=True).violations == []
+    assert run_case("all", seed, 1200, None, "auto").violations == []
+
+
+def test_a_second_reading_that_lacks_something_is_found() -> None:
+    plan, decider = shot_major(3, 2), make_decider(head_bundle(random_layers([3, 12, 3], seed=3)), backend="table")
+    rng = np.random.default_rng(1)
+    sent = [(int(slot), int(rng.integers(2))) for _ in range(8) for slot in plan.slot_pattern]
+    clean = click_frames(plan, sent, rng, 4)
+    tape: list[tuple[str, Any]] = [("begin", (SESSION, 0, 0)), *(("bytes", data) for data in clean), ("end", None)]
+    core, streamed = Core(plan, decider, 1, 0), StreamCore(plan, decider, 1, 0, SESSION)
+    core.begin(0, 0)
+    rows = np.concatenate([batch.rows.copy() for batch in streamed.feed(b"".join(clean))])
+    assert len(rows) == 8
+    assert differences(tape, plan, decider, 1, streamed.core, rows) == []
+    assert len(differences([*tape[:2], *tape[3:]], plan, decider, 1, streamed.core, rows)) == 3
+
+
+def streaming() -> tuple[StreamCore, list[bytes]]:
+    plan, decider = shot_major(3, 2), make_decider(head_bundle(random_layers([3, 12, 3], seed=3)), backend="table")
+    sent = [(int(slot), 1) for _ in range(4) for slot in plan.slot_pattern]
+    return StreamCore(plan, decider, 1, 0, SESSION), click_frames(plan, sent, np.random.default_rng(1), 4)
+
+
+def test_a_signal_ends_a_call_that_waits() -> None:
+    streamed, _ = streaming()
+    ours, theirs = socket.socketpair()
+    came: list[int] = []
+    before = signal.signal(signal.SIGUSR1, lambda number, frame: came.append(number))
+    with ours, theirs:
+        timer = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR1))
+        timer.start()
+        ended = streamed.turn.run(ours.fileno(), Limits(due_ns=time.perf_counter_ns() + LONG_NS))
+        timer.join()
+    signal.signal(signal.SIGUSR1, before)
+    assert ring.WHY[ended] == "signalled"
+    assert came == [signal.SIGUSR1]
+
+
+def test_another_thread_can_stop_a_call_between_messages() -> None:
+    streamed, clean = streaming()
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        streamed.turn.stop()
+        theirs.send(b"".join(clean))
+        assert ring.WHY[streamed.turn.run(ours.fileno(), Limits(due_ns=0))] == "due"
+        assert streamed.turn.counts.messages == 0  # nothing was read
+
+
+def test_the_other_end_goes() -> None:
+    streamed, clean = streaming()
+    ours, theirs = socket.socketpair()
+    with ours:
+        theirs.send(clean[0] + clean[1][:10])
+        theirs.close()
+        assert ring.WHY[streamed.turn.run(ours.fileno())] == "gone"
+        assert (streamed.turn.counts.messages, streamed.decoder.held_bytes) == (1, 10)
+    leader, follower = os.openpty()
+    tty.setraw(follower)
+    os.close(leader)
+    assert ring.WHY[streamed.turn.run(follower)] == "gone"
+    os.close(follower)
+
+
+def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
+    """The other end reads nothing: the kernel writes what fits, waits a bounded time, and says what is left."""
+    setup = Served("host-driven", "pty")
+    setup.close()
+    core = Core(setup.plan, make_decider(setup.bundle, backend="automaton"), 1, 0)
+    core.warm_up()
+    core.begin(0, 0)
+    steps = core.bulk_steps(SESSION)
+    assert steps is not None
+    drive = HostDriver(core, WalkPlace(setup.plan, setup.plan.automaton)).arrays(SESSION)
+    turn = Turn(steps, BulkDecoder(), drive)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                ours.send(bytes(64))
+        turn.control[ring.FD], turn.control[ring.NEXT_ID], turn.control[ring.OLDEST_ID] = ours.fileno(), 5, 5
+        steps.load()
+        scratch = np.zeros(4, np.int64)
+        assert not shows.send_show(steps.walk, drive, turn.rings, turn.control, scratch)
+        size = int(turn.rings.shows[0, ring.END])
+        assert 0 < turn.control[ring.UNSENT] <= size
+        frame = FrameDecoder().feed(turn.rings.kept[:size].tobytes())[0]
+        command = decode_command(frame.payload)
+        assert (frame.session, command.command_id, command.opcode) == (SESSION, 5, Opcode.SHOW)
+        assert unpack_show(command.body)[:2] == (int(setup.plan.slot_pattern[0] == DARK_PATTERN), 0)
+
+
+def test_which_turn_is_taken_and_why() -> None:
+    _, bundle, plan = small_setup("host-driven")
+    core = Core(plan, make_decider(bundle, backend="automaton"), 1, 0)
+    core.warm_up()
+    link = open_sim("sim:ideal?scene=uniform&pace=fast")
+    assert choose_turn("python", core, link, drives=False).words() == "python: asked for"
+    assert choose_turn("auto", core, link, drives=False).taken == "compiled"
+    assert "the host names each state" in choose_turn("auto", core, link, drives=True).words()
+    with pytest.raises(UsageError, match="--turn compiled: in virtual time"):
+        choose_turn("compiled", core, link, drives=True)
+    plain = SimpleNamespace(virtual=False, now_ns=time.perf_counter_ns)
+    assert "no descriptor" in choose_turn("auto", core, plain, drives=True).why  # type: ignore[arg-type]
+    other = SimpleNamespace(virtual=False, fileno=lambda: 0, now_ns=lambda: 7)
+    assert "clock of its own" in choose_turn("auto", core, other, drives=True).why  # type: ignore[arg-type]
+
+
+def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
+    """After this module's runs; a fresh process finds them all in the cache, though they call libc."""
+    assert len(kernels.turn.signatures) == 1
+    code = (
+        "import test_turn as t; s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
+        "print(n, sum(t.kernels.turn.stats.cache_hits.values()), sum(t.kernels.turn.stats.cache_misses.values()))"
+    )
+    here = Path(__file__).parent
+    paths = [here, *(ROOT / "tests" / name for name in ("support", "oracles"))]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
+    assert done.stdout.split() == ["4", "1", "0"]
