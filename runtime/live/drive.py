@@ -92,6 +92,10 @@ class HostDriver:
         """Return what the compiled turn drives by in `session`."""
         return self._place.arrays(self._tails, session)
 
+    def body(self, exposure: int, state: int) -> bytes:
+        """Return the body of the SHOW that names `state` for `exposure`."""
+        return exposure.to_bytes(_EXPOSURE_BYTES, "little") + self._tails[state]
+
     @property
     def sent(self) -> tuple[int, int]:
         """Exposure and state that were named last."""
@@ -113,6 +117,5 @@ class HostDriver:
         ):  # what waits for acknowledgements comes late: the next walk is named in time
             return False
         exposure, state = self._sent = following
-        body = exposure.to_bytes(_EXPOSURE_BYTES, "little") + self._tails[state]
-        connection.session.submit(Opcode.SHOW, body, may_be_refused=True)
+        connection.session.submit(Opcode.SHOW, self.body(exposure, state), may_be_refused=True)
         return True

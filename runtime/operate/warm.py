@@ -16,10 +16,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say
 from pans.runtime.errors import PansError
+
+if TYPE_CHECKING:
+    from pans.runtime.core.still import Core
 
 WALKING, STILL = "fashion-adaptive", "fashion10"
 WALKING_PROFILE, STILL_PROFILE = "dmd-spad", "oled-qcmos"
@@ -41,8 +44,13 @@ class Job:
 
 
 def compile_core() -> None:
-    """The steps of sequential streams, fixed patterns and walks alike."""
-    _compile_steps(WALKING, WALKING_PROFILE)
+    """The steps of sequential streams, fixed patterns and walks alike, and the compiled turn."""
+    from pans.runtime.turn import Turn
+    from pans.runtime.wire.bulk import BulkDecoder
+
+    steps = _compile_steps(WALKING, WALKING_PROFILE).bulk_steps(1)
+    if steps is not None:
+        Turn(steps, BulkDecoder()).warm_up()
 
 
 def compile_still() -> None:
@@ -50,7 +58,7 @@ def compile_still() -> None:
     _compile_steps(STILL, STILL_PROFILE)
 
 
-def _compile_steps(name: str, profile: str) -> None:
+def _compile_steps(name: str, profile: str) -> Core:
     from pans.runtime.bundle.model import load_bundle
     from pans.runtime.core.plan import build_plan
     from pans.runtime.core.still import Core
@@ -60,7 +68,9 @@ def _compile_steps(name: str, profile: str) -> None:
     bundle, _ = load_bundle(name)
     decider = make_decider(bundle)
     plan = build_plan(load_profile(profile), bundle, automaton=getattr(decider, "automaton", None))
-    Core(plan, decider, 1, 0).warm_up()
+    core = Core(plan, decider, 1, 0)
+    core.warm_up()
+    return core
 
 
 def compile_link() -> None:

@@ -16,6 +16,7 @@ from pans.runtime.core.bulk_steps import ROWS_PER_BATCH, BulkSteps, rows_needed
 from pans.runtime.core.decision import DECISION_DTYPE, CoreEvent, Decision
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
+from pans.runtime.core.stream_arrays import DecisionTables
 from pans.runtime.decide.verdict import Decider
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Frame
@@ -57,6 +58,11 @@ class StreamCore:
         self.core.windows.warm_up()
         self._steps.warm_up()
         self._steps.begin(self._session)
+
+    @property
+    def tables(self) -> DecisionTables:
+        """What decides without asking the back end."""
+        return self._steps.tables
 
     def begin(self, session: int, start_tick: int, n_cycles: int) -> Iterator[Batch]:
         """Follow the stream that an ARM starts in `session`; what the one before left open is yielded."""

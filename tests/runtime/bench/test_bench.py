@@ -152,7 +152,7 @@ def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr(cmd_bench, "_find", lambda name: bench if name != "link" else None)
     assert main(["bench", "all", "--json", "--quick", "--frames", "7"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert [row["bench"] for row in found["rows"]] == ["decide", "loop", "ingest", "sim"]
+    assert [row["bench"] for row in found["rows"]] == ["decide", "loop", "ingest", "turn", "sim"]
     assert (seen[0].quick, seen[0].frames) == (True, 7)
     assert "processor" in found["machine"]
     with pytest.raises(SystemExit, match="2"):

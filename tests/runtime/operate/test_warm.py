@@ -12,7 +12,13 @@ from pans.runtime.cli import main
 from pans.runtime.errors import PansError
 from pans.runtime.operate.warm import JOBS, Job, _carried_out, _compiled, words_of
 
-WATCHED = ("pans.runtime.record", "pans.runtime.instrument", "pans.runtime.decide", "pans.runtime.wire")
+WATCHED = (
+    "pans.runtime.record",
+    "pans.runtime.instrument",
+    "pans.runtime.decide",
+    "pans.runtime.wire",
+    "pans.runtime.turn",
+)
 
 
 def test_a_run_compiles_nothing_that_the_jobs_have_not_compiled(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
-from pans.runtime.live import RunConfig, RunResult, compiled, run_live
+from pans.runtime.live import Recovery, RunConfig, RunResult, compiled, run_live
 from pans.runtime.live.compiled import choose_turn
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.record import Recorder, read_recording, replay
@@ -83,7 +83,8 @@ def recorded(setup: Any, link: Any, path: Path, turn: str) -> tuple[RunResult, A
     driven = {"drive": setup.plan.drive, "confidence": 0.0}
     facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}
     with Recorder(path, facts) as recorder:
-        result = run_live(link, setup.profile, setup.bundle, setup.plan, core, config, recorder)
+        recovery = None if link.virtual else Recovery.of(link, setup.url, 10.0)  # a busy machine may arm too late
+        result = run_live(link, setup.profile, setup.bundle, setup.plan, core, config, recorder, recovery)
         recorder.close({})
     return result, read_recording(path)
 
