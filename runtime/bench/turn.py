@@ -148,7 +148,7 @@ def _block_row(bundle: Bundle, folder: Path, quick: bool) -> Row:
 
     def in_c() -> int:
         assert not isinstance(library, str)
-        arrays = [successors, tables.labels, tables.probabilities, at, crcs, c_rows, kept, steps]
+        arrays: list[Any] = [successors, tables.labels, tables.probabilities, at, crcs, c_rows, kept, steps]
         a, b, c, d, e, f, g, h = map(_at, arrays)
         head = (_at(data), _n(len(data)), SESSION, SCHEMA, _n(plan.exposure_ticks))
         sizes = _n(len(at)), _n(crcs.shape[0])
@@ -183,7 +183,7 @@ def _frame_row(bundle: Bundle, folder: Path, quick: bool) -> Row:
 
     def in_c() -> int:
         assert not isinstance(library, str)
-        arrays = [tables.labels, tables.probabilities, tables.word_rows, tables.word_crc, lit, c_rows, kept]
+        arrays: list[Any] = [tables.labels, tables.probabilities, tables.word_rows, tables.word_crc, lit, c_rows, kept]
         a, b, c, d, e, f, g = map(_at, arrays)
         head = (_at(data), _n(len(data)), SESSION, SCHEMA, _n(plan.exposure_ticks))
         return int(library.words(*head, a, b, c, d, int(tables.crc_zero[0]), e, _n(len(lit)), _n(width), f, g))
