@@ -92,6 +92,7 @@ def settings_of(machine: Machine, found: Rehearsal) -> list[Setting]:
     """Return a row for each setting."""
     rows = [_fifo(found), _bound(found), _awake(found), _idle(machine, found), _timers(found)]
     rows += [_governor(machine, found), _isolated(machine, found), _locked(found), _virtual(machine, found)]
+    rows.append(_terminal(found))
     return [*rows, *_serial(machine)]
 
 
@@ -186,12 +187,10 @@ def _governor(machine: Machine, found: Rehearsal) -> Setting:
     slow = bool(hot.get("p50_us")) and cold.get("p50_us", 0.0) > SLOW_WORK * hot["p50_us"]
     awake = found.work["after a pause, kept awake"]
     do = "nothing"
-    if slow:
-        do = (
-            "sudo cpupower frequency-set -g performance"
-            if machine.governor not in ("", "performance")
-            else "--core keeps it warm"
-        )
+    if slow and machine.governor not in ("", "performance"):
+        do = "sudo cpupower frequency-set -g performance"
+    elif slow and awake.get("p50_us", cold["p50_us"]) < HELPS * cold["p50_us"]:
+        do = "--core keeps it warm"
     return Setting(
         setting="governor",
         in_force=machine.governor or "not offered by this system",
@@ -265,6 +264,25 @@ def _virtual(machine: Machine, found: Rehearsal) -> Setting:
         rounds=None,
         effect="",
         do=do,
+    )
+
+
+def _terminal(found: Rehearsal) -> Setting:
+    """Bytes of serial ports and pseudo-terminals wait for a worker of the kernel, which has no priority over other programs."""
+    turns = found.arms[found.free]
+    first, second = (turns.by_round(kind, 0.99) for kind in ("terminal", "pipe"))
+    effect, better = _effect(first, second)
+    advice = "over TCP (serial:socket://) or usb: bytes do not wait so; or keep a core free of other programs for the kernel's workers"
+    return Setting(
+        setting="terminal layer",
+        in_force="in the way of serial ports and pseudo-terminals",
+        measured=f"{_WOKEN['pipe']}, {found.free}: through a terminal; through a pipe (compared by p99)",
+        without=figures(turns.all_of("terminal")),
+        with_it=figures(turns.all_of("pipe")),
+        rounds_better=better if effect else None,
+        rounds=len(first) if effect else None,
+        effect=effect,
+        do=advice if effect == "helps" else "nothing",
     )
 
 

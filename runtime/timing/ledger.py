@@ -11,6 +11,7 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -160,6 +161,8 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     The garbage collector is frozen and switched off in any case: a collection costs milliseconds with numba loaded. With `wanted`,
     SCHED_FIFO (for this thread and `other_threads`, by native id) and locked memory are asked for; both need privileges, and
     neither is needed to be correct. Locked is what has been touched, and what will be: libraries that the loop never calls stay out.
+    The interpreter's other threads that are there go one step below: whoever holds the interpreter must not wait for the rest of the
+    machine, since the loop may be waiting for it.
     """
     granted: dict[str, Any] = {}
     interval = sys.getswitchinterval()
@@ -170,10 +173,11 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     granted["gc_off"] = "granted"
     granted["switch_interval_s"] = SWITCH_INTERVAL_S
-    threads = [0, *other_threads]
-    held = ExitStack()
+    threads, held = [0, *other_threads], ExitStack()
     if wanted:
         granted["sched_fifo"] = _request_fifo(threads)
+        if granted["sched_fifo"] == "granted":
+            threads += _raised(threads)
         granted["mlockall"] = _request_mlockall()
         granted["heap_touched"] = held.enter_context(held_heap())
     try:
@@ -200,6 +204,20 @@ def _request_fifo(threads: Sequence[int]) -> str:
     except OSError as error:
         return f"refused: {error.strerror}"
     return "granted"
+
+
+def _raised(threads: Sequence[int]) -> list[int]:
+    """Put the interpreter's threads of ordinary priority, but for `threads`, one step below these; return which."""
+    found = []
+    for thread in threading.enumerate():
+        number = thread.native_id
+        if number is None or number in (*threads, threading.get_native_id()):
+            continue
+        with suppress(OSError):  # it has ended
+            if os.sched_getscheduler(number) == os.SCHED_OTHER:
+                _set_scheduler([number], "SCHED_FIFO", FIFO_PRIORITY - 1)
+                found.append(number)
+    return found
 
 
 def _set_scheduler(threads: Sequence[int], policy: str, priority: int) -> None:

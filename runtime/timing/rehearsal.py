@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -77,6 +77,11 @@ class Rehearsal:
     seconds: float
 
     @property
+    def free(self) -> str:
+        """The best arm in which the thread is not bound."""
+        return "SCHED_FIFO" if self.fifo == GRANTED else "ordinary"
+
+    @property
     def base(self) -> str:
         """The arm that those with a core kept awake are to be compared with."""
         return "bound, SCHED_FIFO" if self.fifo == GRANTED else "bound"
@@ -84,9 +89,12 @@ class Rehearsal:
 
 def arms_of(granted: bool) -> tuple[Arm, ...]:
     """Return the arms to compare; without SCHED_FIFO those that need it are left out."""
-    with_priority = (Arm("SCHED_FIFO", fifo=True), Arm("bound, SCHED_FIFO", fifo=True, bound=True)) if granted else ()
+    all_kinds = ("sleep", "pipe", "terminal")
+    with_priority: tuple[Arm, ...] = ()
+    if granted:
+        with_priority = (Arm("SCHED_FIFO", fifo=True, kinds=all_kinds), Arm("bound, SCHED_FIFO", fifo=True, bound=True))
     return (
-        Arm("ordinary"),
+        Arm("ordinary", kinds=("sleep", "pipe") if granted else all_kinds),
         Arm("bound", bound=True),
         *with_priority,
         Arm("kept awake", fifo=granted, bound=True, awake=True),
@@ -107,11 +115,13 @@ def rehearse(machine: Machine, seconds: float = SECONDS, tell: Told = lambda sha
         arms = arms_of(granted == GRANTED)
         turns = {arm.name: Turns() for arm in arms}
         turn_s = seconds * (1 - CORE_SHARE - WORK_SHARE) / (ROUNDS * sum(len(arm.kinds) for arm in arms))
-        with closing(Sender()) as sender:
-            sender.bind(device)
+        with closing(Sender()) as pipe, closing(Sender(terminal=True)) as terminal:
+            senders = {"pipe": pipe, "terminal": terminal}
+            for sender in senders.values():
+                sender.bind(device)
             for number in range(ROUNDS):
                 for place, arm in enumerate(arms):
-                    _one_turn(arm, turns[arm.name], turn_s, sender, host)
+                    _one_turn(arm, turns[arm.name], turn_s, senders, host)
                     share = (number + (place + 1) / len(arms)) / ROUNDS
                     tell(CORE_SHARE + (1 - CORE_SHARE - WORK_SHARE) * share)
         touched = {"as it comes": first_touch(lock=False), "locked": first_touch(lock=True)}
@@ -132,7 +142,7 @@ def rehearse(machine: Machine, seconds: float = SECONDS, tell: Told = lambda sha
     )
 
 
-def _one_turn(arm: Arm, turns: Turns, turn_s: float, sender: Sender, host: int | None) -> None:
+def _one_turn(arm: Arm, turns: Turns, turn_s: float, senders: Mapping[str, Sender], host: int | None) -> None:
     with ExitStack() as stack:
         asked: dict[str, Any] = {}
         if arm.bound and host is None:
@@ -153,7 +163,7 @@ def _one_turn(arm: Arm, turns: Turns, turn_s: float, sender: Sender, host: int |
         if any(str(answer).startswith("refused") for answer in asked.values()):
             return
         for kind in arm.kinds:
-            late = sleeps(turn_s) if kind == "sleep" else sender.wakes(turn_s)
+            late = sleeps(turn_s) if kind == "sleep" else senders[kind].wakes(turn_s)
             turns.late_ns.setdefault(kind, []).append(late)
 
 

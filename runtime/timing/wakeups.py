@@ -22,11 +22,17 @@ import numpy as np
 PAUSE_S = (0.0002, 0.0006)  # random: nothing on the machine has this period
 SPIN_GAP_NS = 20_000  # a reading of the clock takes 0.1 us: what is longer was spent elsewhere
 PATIENCE_MS = 2000
+SENDER_PRIORITY = 20  # of a simulated instrument
 _STAMP = struct.Struct("<q")
 
-# The other process: for each line with a count, so many stamps at random pauses, each taken right before it is written.
+# The other process, at the priority of a simulated instrument where that is allowed: for each line with a count, so many stamps at random
+# pauses, each taken right before it is written.
 _SENDER = """
 import os, random, struct, sys, time
+try:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({priority}))
+except (OSError, AttributeError):
+    pass
 pack, write, clock, sleep, dice = struct.Struct("<q").pack, os.write, time.perf_counter_ns, time.sleep, random.Random(1)
 for line in sys.stdin.buffer:
     for _ in range(int(line)):
@@ -82,12 +88,21 @@ def work_times(seconds: float, pause_s: float) -> list[int]:
 
 
 class Sender:
-    """Another process that sends stamps through a pipe, as an instrument sends bytes; `close` ends it."""
+    """Another process that sends stamps, as an instrument sends bytes; `close` ends it.
 
-    def __init__(self) -> None:
-        code = _SENDER.format(low=PAUSE_S[0], high=PAUSE_S[1])
+    Through a pipe, or through a terminal: bytes of a terminal, as those of every serial port, are handed on by a worker of the kernel.
+    """
+
+    def __init__(self, *, terminal: bool = False) -> None:
+        import tty  # POSIX
+
+        code = _SENDER.format(low=PAUSE_S[0], high=PAUSE_S[1], priority=SENDER_PRIORITY)
         words = [sys.executable, "-S", "-c", code]
-        self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+        theirs, self._ours = os.openpty() if terminal else reversed(os.pipe())
+        if terminal:
+            tty.setraw(self._ours)
+        self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=theirs, bufsize=0)
+        os.close(theirs)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
         self.wakes(0.01)  # it has started
 
@@ -100,26 +115,33 @@ class Sender:
     def wakes(self, seconds: float) -> list[int]:
         """Wait for stamps for about `seconds`; return how long after each stamp this thread had it."""
         assert self._child.stdin is not None
-        assert self._child.stdout is not None
         count = max(1, round(seconds / (sum(PAUSE_S) / 2 + 60e-6)))  # a sleep takes about 60 us longer than asked for
-        file, clock, late = self._child.stdout.fileno(), time.perf_counter_ns, list[int]()
+        file, clock, late, data = self._ours, time.perf_counter_ns, list[int](), b""
         waiting = select.poll()
         waiting.register(file, select.POLLIN)
         self._child.stdin.write(f"{count}\n".encode())
         while len(late) < count and waiting.poll(PATIENCE_MS):
-            data = os.read(file, _STAMP.size)
-            now = clock()
-            if len(data) < _STAMP.size:
+            try:
+                piece = os.read(file, _STAMP.size - len(data))
+            except OSError:  # a terminal whose other end is closed
+                break
+            now, data = clock(), data + piece
+            if len(data) == _STAMP.size:
+                late.append(now - _STAMP.unpack(data)[0])
+                data = b""
+            elif not piece:
                 break  # it has ended
-            late.append(now - _STAMP.unpack(data)[0])
         return late
 
     def close(self) -> None:
         """End it; idempotent."""
-        for pipe in (self._child.stdin, self._child.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
+        if self._ours < 0:
+            return
+        os.close(self._ours)
+        self._ours = -1
+        if self._child.stdin is not None:
+            with suppress(OSError):
+                self._child.stdin.close()
         try:
             self._child.wait(2.0)
         except subprocess.TimeoutExpired:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import os
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -125,3 +127,28 @@ def test_the_realtime_set_up_is_undone() -> None:
 def test_without_asking_nothing_is_asked_for() -> None:
     with arm_realtime(False) as granted:
         assert set(granted) == {"gc_off", "switch_interval_s"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_other_threads_of_the_interpreter_go_one_step_below_the_loop_and_come_back() -> None:
+    ended, started = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        started.set()
+        ended.wait()
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    started.wait()
+    number = thread.native_id
+    assert number is not None
+    try:
+        with arm_realtime(True) as granted:
+            if granted["sched_fifo"] != "granted":
+                pytest.skip(granted["sched_fifo"])
+            assert os.sched_getscheduler(number) == os.SCHED_FIFO
+            assert os.sched_getparam(number).sched_priority == os.sched_getparam(0).sched_priority - 1
+        assert os.sched_getscheduler(number) == os.SCHED_OTHER
+    finally:
+        ended.set()
+        thread.join()
