@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -33,9 +33,10 @@ from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, run_live
+from pans.runtime.errors import LinkError
+from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult, run_live
 from pans.runtime.live.config import AUTO, COMPILED, PYTHON
-from pans.runtime.record import Recorder, read_recording
+from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.turn.system import offered
 from pans.runtime.wire.commands import Gate
 
@@ -60,6 +61,7 @@ GRID_ALL = (
 )
 MEMORY_SLACK_KB = 16_384
 BOTH = "both"
+NEVER_ARMED = "the device was lost before it was armed"  # which ends a run: there is nothing to go on with yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,26 +143,30 @@ def run_case(
     observers = Observers(host.watch, start)
     driven = {"drive": plan.drive, "confidence": 0.0}
     header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend, **driven}}
-    with TemporaryDirectory() as folder:
-        with Recorder(Path(folder) / "grid.pansrec", header) as recorder:
-            result = run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
-            recorder.close({})
-        checker.close()
-        host.finish(result.ended)
-        recording = read_recording(Path(folder) / "grid.pansrec")
-        for disagreement in reconcile(link, checker.books, result, recording, bundle):
-            checker.fail(disagreement)
+
+    def live(recorder: Recorder) -> RunResult:
+        return run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
+
+    def disagreements(result: RunResult, recording: Recording) -> Iterator[str]:
+        yield from reconcile(link, checker.books, result, recording, bundle)
         if isinstance(link, TapedLink):
-            for disagreement in differences(link.tape, plan, decider, SHOTS, core, recording.decisions()):
-                checker.fail(disagreement)
+            yield from differences(link.tape, plan, decider, SHOTS, core, recording.decisions())
+
+    result = judged(
+        live,
+        header,
+        host,
+        disagreements,
+        may_be_lost=lambda: bool(device.counters.disconnects + device.counters.resets),
+    )
     return GridResult(
         case=case,
         seed=seed,
         mode=mode,
         frames=checker.counts.frames_emitted,
-        ended=result.ended,
-        reconnects=result.reconnects,
-        abstained=result.tally.abstained,
+        ended=NEVER_ARMED if result is None else result.ended,
+        reconnects=0 if result is None else result.reconnects,
+        abstained=0 if result is None else result.tally.abstained,
         memory_kb=host.memory_growth_kb,
         seconds=time.perf_counter() - started,
         virtual_s=(link.now_ns() - START_NS) / 1e9,
@@ -168,6 +174,35 @@ def run_case(
         faults={name: count for name, count in asdict(device.counters).items() if count},
         violations=checker.violations,
     )
+
+
+def judged(
+    live: Callable[[Recorder], RunResult],
+    header: Mapping[str, Any],
+    host: GridHost,
+    disagreements: Callable[[RunResult, Recording], Iterator[str]],
+    *,
+    may_be_lost: Callable[[], bool],
+) -> RunResult | None:
+    """Record what `live` does and let the host's checker judge it; None for a device that was lost before it was armed."""
+    checker = host.checker
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "grid.pansrec"
+        try:
+            with Recorder(path, header) as recorder:
+                result = live(recorder)
+                recorder.close({})
+        except LinkError as error:
+            if host.began or not may_be_lost():
+                raise
+            if checker.counts.frames_emitted:
+                checker.fail(f"frames before ARM, of a device that was lost: {error}")
+            return None
+        checker.close()
+        host.finish(result.ended)
+        for disagreement in disagreements(result, read_recording(path)):
+            checker.fail(disagreement)
+    return result
 
 
 def plan_blocks(plan: Plan) -> list[int]:
@@ -194,6 +229,11 @@ class GridHost:
         self._frames = frames
         self._early_kb = 0
         self._run: LiveRun | None = None
+
+    @property
+    def began(self) -> bool:
+        """Whether the run has come to where it arms the device."""
+        return self._run is not None
 
     def start(self, run: LiveRun) -> None:
         """Listen to the run."""

@@ -18,7 +18,7 @@ from pans.firmware_sim.ports import faulty as faulty_module
 from pans.firmware_sim.ports.faults import NAMES, NO_FAULTS, USUAL, Faults, Recurring, check_possible, parse_faults
 from pans.firmware_sim.ports.faulty import FaultCounters, FaultyDevice, Lane
 from pans.firmware_sim.ports.serve import open_sim, parse_sim_url
-from pans.firmware_sim.trials.fault_grid import MODES, case_faults, run_case
+from pans.firmware_sim.trials.fault_grid import MODES, NEVER_ARMED, case_faults, run_case
 from pans.runtime.core import stream_kernels
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.still import Core
@@ -378,3 +378,10 @@ def test_memory_that_grows_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(session_module.HostSession, "poll", hoarding)
     assert found("none", "the process grew")
+
+
+def test_a_device_that_goes_away_before_it_is_armed_ends_the_run() -> None:
+    """Seed 411 takes the link away while the clock is measured: nothing has been asked for, and there is nothing to go on with."""
+    result = run_case("all", 411, 100)
+    assert result.faults["disconnects"] == 1
+    assert (result.ended, result.frames, result.violations) == (NEVER_ARMED, 0, [])
