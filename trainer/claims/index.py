@@ -12,9 +12,9 @@ from pathlib import Path
 from pans.runtime.outputs import replace_file
 from pans.trainer import frontier
 from pans.trainer.frontier.summary import by_point, click_budgets, error_of, margins
-from pans.trainer.paper.page import Rows, Table, read_rows
+from pans.trainer.paper.page import Column, Rows, Table, read_rows
 from pans.trainer.paper.tables import FIRST, FIRST_OBJECTS
-from pans.trainer.verdicts import Claim, against, claim, sampling_error
+from pans.trainer.verdicts import VERDICTS, Claim, against, claim, sampling_error
 
 from .known import PAGES, page_of
 
@@ -24,11 +24,20 @@ BEGIN, END = "<!-- counts: begin -->", "<!-- counts: end -->"
 
 def index_counts(folder: Path) -> str:
     """Return the part of the index between its markers, of all pages whose NAME.json lies in `folder`."""
-    lines = ["| page | table | ours | against | above | level | below | of |", "| --- " * 8 + "|"]
-    for name in PAGES:
-        if (folder / f"{name}.json").is_file():
-            lines += [_line(name, heading, one) for heading, one in claims_of(name, read_rows(folder, name))]
-    return "\n".join([BEGIN, "", *lines, "", END])
+    return "\n".join([BEGIN, "", *index_table(folder, "[{page}]({page}.md)").lines(), "", END])
+
+
+def index_table(folder: Path, page: str = "{page}") -> Table:
+    """Return what every page of `folder` claims; `page` is the template of the first column."""
+    keys = ("table", "ours", "against", "above", "level", "below", "of")
+    there = [name for name in PAGES if (folder / f"{name}.json").is_file()]
+    rows = [
+        {"page": name, "table": heading, "ours": one.ours, "against": one.beside, "of": len(one.verdicts)}
+        | dict(zip(VERDICTS, one.counts()))
+        for name in there
+        for heading, one in claims_of(name, read_rows(folder, name))
+    ]
+    return Table([Column("page", page), *(Column(key, f"{{{key}}}") for key in keys)], rows)
 
 
 def claims_of(name: str, rows: Rows) -> list[tuple[str, Claim]]:
@@ -39,11 +48,6 @@ def claims_of(name: str, rows: Rows) -> list[tuple[str, Claim]]:
     return [
         (re.split(r"[:(,]", table.heading.lstrip("# "))[0].strip(), one) for table in tables for one in table.claims
     ]
-
-
-def _line(name: str, heading: str, one: Claim) -> str:
-    cells = [f"[{name}]({name}.md)", heading, one.ours, one.beside, *one.counts(), len(one.verdicts)]
-    return f"| {' | '.join(map(str, cells))} |"
 
 
 def _of_the_frontier(rows: Rows) -> list[tuple[str, Claim]]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit, say
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, make_folder
-from pans.trainer.claims.index import rewrite_index
 from pans.trainer.claims.known import PAGES, page_of
 from pans.trainer.paper import Asked, Made, Page, rewrite_page, write_page
 from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
@@ -25,7 +24,7 @@ NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", choices=(*PAGES, "all", "list"), help="which table or figure")
+    parser.add_argument("name", choices=(*PAGES, "all", "list", "check"), help="which table or figure")
     parser.add_argument("--rows", type=int, nargs="+", metavar="D", help="only the rows with that many patterns")
     parser.add_argument("--dark", type=float, nargs="+", metavar="R", help="only these dark counts (not of all tables)")
     parser.add_argument(
@@ -60,6 +59,10 @@ def _run(args: argparse.Namespace) -> int:
         import torch
     except ModuleNotFoundError as error:
         raise UsageError("training needs the package torch, which is not installed", remedy=NEEDS_TORCH) from error
+    if args.name == "check":
+        from .reproduce_check import check  # of torch, as the pages are
+
+        return check(args)
     names = tuple(PAGES) if args.name == "all" else (args.name,)
     if args.out is not None:
         files = [path for name in names for path in page_files(args.out, name, page_of(name))]
@@ -77,7 +80,7 @@ def _run(args: argparse.Namespace) -> int:
             results[name] = _measured(name, args)
             if args.out:
                 write_page(args.out, name, *results[name])
-                rewrite_index(args.out)
+                _count_again(args.out)
     except KeyboardInterrupt:
         say(f"interrupted; finished rows and the row in work are in {args.cache}\n  go on: the same command")
         return EXIT_INTERRUPTED
@@ -85,6 +88,12 @@ def _run(args: argparse.Namespace) -> int:
     blocks = [page.around(page.block(name, made.rows, made.pictures)) for name, (page, made) in results.items()]
     emit(args, {"rows": rows, "simulated": True}, "\n\n".join(blocks))
     return EXIT_FINE
+
+
+def _count_again(folder: Path) -> None:
+    from pans.trainer.claims.index import rewrite_index  # of torch, which `list` does without
+
+    rewrite_index(folder)
 
 
 def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
@@ -97,7 +106,7 @@ def _rewrite(names: tuple[str, ...], args: argparse.Namespace) -> int:
             raise UsageError(f"{path} is not there", remedy=f"measure it: pans reproduce {name} -o {args.out}")
         rewrite_page(args.out, name, page_of(name))
         rows += read_rows(args.out, name)
-    rewrite_index(args.out)
+    _count_again(args.out)
     emit(args, {"rows": rows, "simulated": True}, "\n".join(f"{args.out / name}.md" for name in names))
     return EXIT_FINE
 
@@ -146,5 +155,6 @@ REPRODUCE = Command(
     examples=(
         "pans reproduce list",
         "pans reproduce fashion-mnist -o out",
+        "pans reproduce check",
     ),
 )

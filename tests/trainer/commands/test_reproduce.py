@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 
 import pytest
 from tree import ROOT
@@ -22,6 +24,11 @@ def test_the_command_lists_collects_and_refuses(tmp_path, capsys):
     assert (tmp_path / "out" / "mnist.md").read_text().startswith("# mnist")
     assert main([*words, "--rows", "5"]) == 2
     assert "mnist has 4, 9, 16" in capsys.readouterr().err
+
+
+def test_pages_are_listed_without_torch():
+    words = "import sys; from pans.trainer.commands import reproduce; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", words], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("name", ["barcode", "mmf-mnist"])
