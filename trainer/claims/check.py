@@ -1,7 +1,7 @@
 """A folder of results, checked: text, JSON and command of every page agree.
 
 Owns what is looked at and the findings; changes nothing. A fault is a contradiction. A note names a page whose rows come from different
-versions, as far as its JSON tells: bundles that are not those of the page they are said to be of, rows that lack options which others have.
+versions, as far as its JSON tells (versions.py).
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pans.trainer.paper.page import BEGIN, END, Page, Row, Rows, generated
-from pans.trainer.paper.tables import ACTIVE
+from pans.trainer.paper.page import BEGIN, END, Page, Rows, generated
 
 from .commands import command_faults
 from .declared import faults
 from .index import INDEX, index_counts
 from .known import PAGES, page_of
 from .sources import Figures
+from .versions import version_notes
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _LINK = re.compile(r"\]\(([^)#:]+\.(?:png|md))(?:#[^)]*)?\)")
@@ -47,7 +47,7 @@ def check_folder(folder: Path) -> tuple[list[Finding], list[Finding]]:
         found += [Finding(name, kind, words) for kind, words in _of_text(figures, name)]
     if (folder / INDEX).is_file() and index_counts(folder) not in (folder / INDEX).read_text(encoding="utf-8"):
         found.append(Finding("README", "count", f"the counts are not those of the pages: {_AGAIN}"))
-    return found, [note for name in PAGES for note in _versions(figures, name)]
+    return found, [Finding(name, "version", words) for name in PAGES for words in version_notes(figures, name)]
 
 
 _AGAIN = "pans reproduce all --from-json -o FOLDER writes tables and counts again"
@@ -87,20 +87,3 @@ def _trainings(page: Page, rows: Rows) -> Iterator[str]:
     seeds = sorted({row["options"]["seed"] for row in rows if "options" in row})
     if said and seeds and seeds != [int(said[1])]:
         yield f'its head says "{page.trainings}", its rows have the seeds {seeds}'
-
-
-def _versions(figures: Figures, name: str) -> Iterator[Finding]:
-    rows = figures.rows(name)
-    keys = {frozenset(row["options"]) for row in rows if "options" in row}
-    if len(keys) > 1:
-        missing = sorted(frozenset.union(*keys) - frozenset.intersection(*keys))
-        yield Finding(name, "version", f"rows of {len(keys)} versions: some lack the options {', '.join(missing)}")
-    foreign = [row for row in rows if row.get("table") in ACTIVE and not _is_of_its_table(figures, row)]
-    if foreign:
-        which = ", ".join(dict.fromkeys(f"{row['table']} d_f = {row['features']}" for row in foreign))
-        yield Finding(name, "version", f"measured on other bundles than those of the table: {which}")
-
-
-def _is_of_its_table(figures: Figures, row: Row) -> bool:
-    own = [one["sha256"] for one in figures.rows(row["table"]) if one["features"] == row["features"]]
-    return row.get("sha256") in own

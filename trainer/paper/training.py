@@ -19,6 +19,7 @@ the data are left out of the seconds.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +40,7 @@ from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.data import TrainingData, encoder_input
 from pans.trainer.train.head_fit import joint_distribution
 from pans.trainer.train.loop import Run, Trained, train
-from pans.trainer.verdicts import against, claim, sampling_error
+from pans.trainer.verdicts import against, claim, sampling_error, training_spread
 
 from .active import recipe
 from .page import Asked, Made, Row, Rows, Table, cached_row, columns, pages
@@ -52,6 +53,7 @@ REPEATS = 300
 STAGES = (1, 4, 16)  # epochs of training before the gradients are compared
 EPOCHS = 12
 SEEDS = (0, 1)
+TESTED = 10_000  # test images, all of them
 BASE = Options(features=FEATURES, alpha=5e-4, hidden=128, head_rate=3e-3, epochs=EPOCHS)
 WAYS = {name: {"estimator": name, "warm": 0.0} for name in ESTIMATORS} | {
     "ste, then exact": {"estimator": "exact", "warm": 0.3},
@@ -178,17 +180,29 @@ def estimators_tables(rows: Rows) -> list[Table]:
     for row in rows:
         if "way" in row:
             of_way.setdefault(row["way"], []).append(row)
-    trained = []
+    trained: Rows = []
     for way, runs in of_way.items():
         keys = ("accuracy", "clicks", "photons", "illumination", "cpu_seconds")
         means = {key: sum(run[key] for run in runs) / len(runs) for key in keys}
         accuracies = [run["accuracy"] for run in runs]
-        trained.append({"way": way, "over_seeds": max(accuracies) - min(accuracies), **means})
+        errors = (100 * training_spread(accuracies) / len(runs) ** 0.5, sampling_error(100 * means["accuracy"], TESTED))
+        facts = {"way": way, "trainings": len(runs), "error": math.hypot(*errors)}
+        trained.append(facts | {"over_seeds": max(accuracies) - min(accuracies), **means})
+    exact = next((row for row in trained if row["way"] == "exact"), None)
+    for row in trained:
+        row["beside"] = None if exact is None or row is exact else _held_against(row, exact)
     gradients = [row for row in rows if "estimator" in row]
     return [
         Table(columns("gradients"), gradients, "## Gradients"),
-        Table(columns("trainings"), trained, "## Trainings"),
+        Table(
+            columns("trainings"), trained, "## Trainings", [claim("Others", "exact", [r["beside"] for r in trained])]
+        ),
     ]
+
+
+def _held_against(row: Row, exact: Row) -> Row:
+    """A way to train beside the exact gradient: means over the seeds, with the errors of both from few seeds and few objects."""
+    return against(100 * row["accuracy"], 100 * exact["accuracy"], row["error"], exact["error"])
 
 
 # ---- time ----

@@ -13,6 +13,8 @@ from pans.trainer.claims import check as module
 from pans.trainer.claims.check import check_folder
 from pans.trainer.claims.commands import command_faults
 from pans.trainer.claims.index import BEGIN, END
+from pans.trainer.claims.sources import Figures
+from pans.trainer.claims.versions import version_notes
 
 RESULTS = ROOT / "docs" / "results"
 NAME = "time"
@@ -80,6 +82,26 @@ def test_rows_of_different_versions_are_noted(folder):
     (folder / "time.json").write_text(json.dumps(page))
     (note,) = check_folder(folder)[1]
     assert note.words == "rows of 2 versions: some lack the options clicks"
+
+
+def test_rows_of_other_bundles_and_recipes_are_noted(tmp_path):
+    for name in ("fig-3", "mnist", "equal-photons"):
+        shutil.copy(RESULTS / f"{name}.json", tmp_path)
+    assert [*version_notes(Figures(tmp_path), "mnist")] == []
+    (one,) = version_notes(Figures(tmp_path), "fig-3")  # the table of FashionMNIST is not there
+    assert one.startswith(
+        "measured on other bundles than those of the table: fashion-mnist d_f = 3, fashion-mnist d_f = 4"
+    )
+    page = json.loads((tmp_path / "mnist.json").read_text())
+    page["rows"][1]["options"]["epochs"] += 1
+    (tmp_path / "mnist.json").write_text(json.dumps(page))
+    (one,) = version_notes(Figures(tmp_path), "mnist")
+    assert one == "1 of 6 rows are of another recipe than today's: task mnist features 9"
+    page = json.loads((tmp_path / "equal-photons.json").read_text())
+    page["rows"] = [row | {"options": row["options"] | {"hidden": 7}} for row in page["rows"] if "options" in row][:1]
+    (tmp_path / "equal-photons.json").write_text(json.dumps(page))
+    (one,) = version_notes(Figures(tmp_path), "equal-photons")
+    assert one == "1 of 1 rows are of another recipe than today's: task transient way PANS asked 1.0"
 
 
 def test_commands_of_a_page():
