@@ -4,19 +4,20 @@ Owns the law and its table; never samples and never links exposures. Nothing wit
 is the rest of the dead time that a detection of the exposure before, or of the pause between, carries over. The law is the stationary
 share of silent exposures, P0, under steady light. It is given as the *counted mean* -log P0, which takes the mean's place in a click
 law, and holds on average over exposures of about equal light. How exposures depend on each other is left out: after a silent one a
-gated detector is awake, and its chance is 1 - exp(-mean).
+gated, non-paralysable detector is awake, and its chance is 1 - exp(-mean).
 
 With the exposure as unit of time, mean m, dead time f, pause g, a = m f, and r = f - g the reach into the next exposure (gated; r = f
 where the detector stays on in the pause, or there is none):
 
 - A non-paralysable detector that stays on is a renewal process of intervals f + Exp(m). Its forward recurrence time exceeds 1 with
-  P0 = exp(-m (1 - f)) / (1 + a), or (1 + m (f - 1)) / (1 + a) where f > 1 (Cox, Renewal Theory, 1962, section 5.3).
+  P0 = exp(-m (1 - f)) / (1 + a), or (1 + m (f - 1)) / (1 + a) where f > 1 (Cox, Renewal Theory, 1962, on recurrence times).
 - A gated one begins an exposure blind for d with the density w(d), 0 < d <= r, of a detection at 1 - r + d in the exposure before:
   P0 = exp(-m) (1 + integral of w(d) (exp(m d) - 1)). Detections after d have the density h(s) = sum_n m (m s_n)^n / n! exp(-m s_n) with
   s_n = s - n f > 0, and w is what repeats itself: w(d) = (1 - integral of w) h(1 - r + d) + integral of w(e) h(1 - r + d - e).
 - A paralysable one detects a photon that follows the one before by more than f. From a photon on, nothing is detected until t with
   q(t) = sum_k (-1)^k exp(-k a) (m (t - k f))^k / k! over k f < t; with u the first photon of the exposure and its forerunner less than r
-  before, P0 = exp(-m) + integral over u from 0 to r of m (exp(-m u) - exp(-m r)) q(1 - u).
+  before, P0 = exp(-m) + integral over u from 0 to r of m (exp(-m u) - exp(-m r)) q(1 - u). With f > 1 it detects at most once in an
+  exposure: free-running, P0 = 1 - m exp(-a).
 """
 
 from __future__ import annotations
