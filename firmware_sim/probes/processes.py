@@ -124,8 +124,11 @@ def stolen_s(cores: list[int]) -> dict[int, float]:
     return {core: ticks[f"cpu{core}"] / os.sysconf("SC_CLK_TCK") for core in cores}
 
 
-def real_time_programs(known: set[int]) -> set[str]:
-    """Return the programs of real-time priority now, but for those of the pids `known` and for threads of the kernel: "name (priority)"."""
+def real_time_programs(known: set[int], parents: frozenset[int] = frozenset()) -> set[str]:
+    """Return the programs of real-time priority now: "name (priority)".
+
+    Left out are the pids `known`, the children of `parents`, and threads of the kernel.
+    """
     found = set()
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -134,6 +137,6 @@ def real_time_programs(known: set[int]) -> set[str]:
             continue
         fields = rest.split()
         parent, priority = int(fields[1]), int(fields[37])
-        if priority and parent not in (0, KERNEL_PARENT) and int(path.parent.name) not in known:
+        if priority and parent not in (0, KERNEL_PARENT, *parents) and int(path.parent.name) not in known:
             found.add(f"{name} ({priority})")
     return found

@@ -123,7 +123,7 @@ def _wait(
             samples.append((elapsed, *(processor_s(pid) for pid in pids)))
         except OSError:  # it has just ended
             break
-        others |= real_time_programs(probes | set(pids))
+        others |= real_time_programs(probes | set(pids), frozenset(pids))
         if elapsed > told + PROGRESS_S:
             told = elapsed
             say(f"{elapsed:6.0f} s")
