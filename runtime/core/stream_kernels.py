@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from pans.runtime.wire import walk as stream
+from pans.runtime.wire.bare import bare
 from pans.runtime.wire.kernels import load4, load8
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
@@ -43,6 +44,8 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
     Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows
     WindowArrays, tables DecisionTables, rows DECISION_DTYPE (m,), counts_out int64 (m, d_f).
     """
+    marks, windows, tables = bare(marks), bare(windows), bare(tables)
+    buffer, state, rows, counts_out = bare(buffer), bare(state), bare(rows), bare(counts_out)
     blocks = 0
     while state[MESSAGE] < spans.shape[0]:
         if state[STEPS] and blocks == state[STEPS]:

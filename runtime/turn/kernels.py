@@ -13,6 +13,7 @@ from pans.runtime.core import stream_kernels as core
 from pans.runtime.timing.evidence import OVERSLEPT_NS
 from pans.runtime.wire import kernels as wire
 from pans.runtime.wire import walk as stream
+from pans.runtime.wire.bare import bare
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
 from . import rings as ring
@@ -33,6 +34,8 @@ def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-unty
     decoder Decoder, walk WalkArrays, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). The rings are filled from
     their beginning.
     """
+    decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
+    control, scratch = bare(control), bare(scratch)
     control[ring.ERRNO : ring.N_CONTROL] = 0
     walk.state[core.N_ROWS] = 0
     ended = take_bodies(decoder, walk, drive, rings, control, scratch)
