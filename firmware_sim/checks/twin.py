@@ -67,6 +67,32 @@ class TapedLink(ObservedLink):
             setattr(run.core, name, tap)
 
 
+class SocketTwin:
+    """A core behind the compiled turn, which reads from a socket what another core is given; `took` is how many messages it took."""
+
+    def __init__(self, plan: Plan, decider: Decider, session: int) -> None:
+        self._streamed = StreamCore(plan, decider, 1, 0, session)
+        self.took = 0
+
+    def takes(self, data: bytes, core: Core) -> str:
+        """Read `data`; return where this core is not where `core` is, "" where they agree."""
+        before = self._streamed.core.tracker.counters.messages
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with ours, theirs:
+            for first in range(0, len(data), MOST_SENT):
+                theirs.send(data[first : first + MOST_SENT])
+                for _ in self._streamed.listen(ours.fileno(), AT_ONCE):
+                    pass
+        again = self._streamed.core
+        self.took = again.tracker.counters.messages - before
+        names = ("n_decisions", "n_abstained", "completed", "last_tick", "jitter_ticks", "contradictions")
+        compared = [(name, getattr(again, name), getattr(core, name)) for name in names]
+        compared += [("stream counters", again.tracker.counters, core.tracker.counters)]
+        compared += [("tallies", again.tallies.tolist(), core.tallies.tolist())]
+        wrong = [f"{what} {one}, Python's {other}" for what, one, other in compared if one != other]
+        return f"the compiled turn disagrees over {data[:100].hex()}: {'; '.join(wrong)}" if wrong else ""
+
+
 def differences(
     tape: list[tuple[str, Any]], plan: Plan, decider: Decider, shots: int, core: Core, decisions: NDArray[np.void]
 ) -> list[str]:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from pans.firmware_sim.checks.strange import StrangeCommands
+from pans.firmware_sim.checks.twin import SocketTwin
 from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.states import MAX_SHOWS
@@ -29,8 +30,10 @@ from pans.firmware_sim.scene.still import Scene, load_scene
 from pans.firmware_sim.testing import following_profile, small_setup
 from pans.runtime.cli import say
 from pans.runtime.core.still import Core
+from pans.runtime.decide.verdict import Verdicts
 from pans.runtime.errors import LinkError
 from pans.runtime.ranges import Range
+from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
@@ -76,6 +79,7 @@ class FuzzCounts:
     runs_armed: int = 0
     automata_armed: int = 0
     blocks_accepted: int = 0
+    compiled_messages: int = 0  # through the compiled turn, from a socket
     slowest_call_s: float = 0.0
 
 
@@ -144,6 +148,7 @@ class Fuzzer:
         self._host_decoder = wire.FrameDecoder()
         self._host_decoder.use_kernels()
         self._host_ns = 0
+        self._twin = None if offered() else SocketTwin(plan, _AnyDecider(bundle.n_features), NONCE)  # type: ignore[arg-type]
 
     def _device_takes(self, data: bytes) -> None:
         device = self._device
@@ -162,8 +167,16 @@ class Fuzzer:
 
     def _host_takes(self, data: bytes) -> None:
         started = time.process_time()
+        core = self._core
         self._host_digests(data)
         self._judge_time(started, "host", data)
+        if self._twin is not None and core is self._core:  # else the session has ended within the bytes
+            started = time.process_time()
+            wrong = self._twin.takes(data, core)
+            self._judge_time(started, "compiled turn", data)
+            self.counts.compiled_messages += self._twin.took
+            if wrong:
+                raise LimitBroken(wrong)
 
     def _host_digests(self, data: bytes) -> None:
         self._host_ns += 1_000_000
@@ -286,6 +299,9 @@ class _AnyDecider:
 
     def decide(self, counts: np.ndarray, shots: int) -> tuple[int, float]:
         return 0, 0.5
+
+    def verdicts(self, counts: np.ndarray, shots: int) -> Verdicts:
+        return Verdicts(np.zeros(len(counts), np.uint16), np.full(len(counts), 0.5, np.float32))
 
 
 def fuzz(seed: int, n_bytes: int, n_frames: int) -> tuple[FuzzCounts, str]:

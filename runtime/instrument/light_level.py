@@ -19,6 +19,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 CHANGE = 0.06  # of the clicks, relative, looked for
 BATCH = 50  # decisions
 BASELINE_ERROR = 0.0075  # of the mean
@@ -69,6 +72,20 @@ class LightWatch:
             self._learn(total)
             return ""
         return self._compare(total, self.baseline)
+
+    def take_many(self, clicks: npt.NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Take the clicks of many decisions, int64 (n,), as `take` of each; return what has been found."""
+        known, at = len(self.found), 0
+        while at < len(clicks):
+            n = min(self.batch - self._in_batch - 1, len(clicks) - at)  # all but the one that ends a batch
+            self.decisions += n
+            self._in_batch += n
+            self._clicks += int(clicks[at : at + n].sum())
+            at += n
+            if at < len(clicks):
+                self.take(int(clicks[at]))
+                at += 1
+        return self.found[known:]
 
     def report(self) -> dict[str, Any]:
         """What is known: the baseline, how long a change of the clicks by STATED_CHANGE takes to be found, and what was found."""

@@ -10,6 +10,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
@@ -21,6 +22,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.link.base import Link, descriptor_of
 from pans.runtime.link.connection import Arrived
+from pans.runtime.link.reader import Chunk
 from pans.runtime.record.format import TIMING_DTYPE, Kind
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
@@ -44,6 +46,7 @@ I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
 
 NOTHING = Output([], [], None)
+GATHERED_BYTES = 1 << 17
 EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
 TURN_NS = 20_000_000  # a call comes back at least so often: signals, the watchdog's heartbeat, other threads' wishes
@@ -124,16 +127,18 @@ class CompiledTurns:
             self._settle(turn, outputs)
             if turn.counts.notes or turn.counts.arrivals:
                 self._note_waits(turn)
-            self._go_on(turn, ended, outputs)
+            self._go_on(turn, ended, outputs, turn.run)
             if ended == ring.GONE:
                 self._ask_why(turn)
         else:
-            for chunk in connection.chunks(poll_s):
-                for piece in turn.decoder.pieces(chunk.data):
-                    self._lend(turn)
-                    ended = turn.feed(piece, chunk.arrival_ns)
-                    self._settle(turn, outputs)
-                    self._go_on(turn, ended, outputs)
+            chunks = self._gathered(poll_s)
+            if chunks:
+                pieces = [(piece, at_ns) for at_ns, data in chunks for piece in turn.decoder.pieces(data)]
+                data = np.frombuffer(b"".join([piece for piece, _ in pieces]), np.uint8)
+                self._lend(turn)
+                ended = turn.feed(data.copy(), np.array([(len(piece), at_ns) for piece, at_ns in pieces], np.int64))
+                self._settle(turn, outputs)
+                self._go_on(turn, ended, outputs, turn.feed_on)
         connection.take_pongs()
         if self._error is not None:
             raise self._error
@@ -165,8 +170,28 @@ class CompiledTurns:
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
-    def _go_on(self, turn: Turn, ended: int, outputs: list[Output]) -> None:
-        """Deal with what ended a call until nothing decoded is left; no more is read."""
+    def _gathered(self, poll_s: float) -> list[Chunk]:
+        """Return what was read elsewhere; of parallel frames in virtual time many reads, where nobody acts on the first."""
+        run = self._run
+        connection, link = run.connection, run.connection.link
+        chunks = connection.chunks(poll_s)
+        if not (link.virtual and self._core.windows.parallel and chunks) or self._prompt:
+            return chunks
+        left = run.messages_granted - chunks[0].data.count(0)
+        n_bytes = 0
+        while left > 0 and n_bytes < GATHERED_BYTES and link.now_ns() < run.due_ns:
+            more: list[Chunk] = []
+            with suppress(LinkError):  # the reader says so again when it is asked for more
+                more = connection.reader.wait(poll_s)
+            if not more:
+                break
+            chunks += more
+            left -= more[0].data.count(0)
+            n_bytes += len(more[0].data)
+        return chunks
+
+    def _go_on(self, turn: Turn, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
+        """Deal with what ended a call until nothing that was read is left; no more is read."""
         while ended in (ring.ODD, ring.FULL, ring.BROKEN):
             try:
                 if ended == ring.ODD:
@@ -176,7 +201,8 @@ class CompiledTurns:
             except LinkError as error:
                 self._error = self._error or error
             self._lend(turn)
-            ended = turn.run()
+            _own(outputs)
+            ended = again()
             self._settle(turn, outputs)
 
     def _take_odd(self, turn: Turn, outputs: list[Output]) -> None:
@@ -270,7 +296,7 @@ class CompiledTurns:
         """Account for the blocks of a call and their decisions."""
         run, blocks, rows = self._run, turn.blocks, turn.rows
         if run.connection.link.virtual:
-            blocks[:, ring.DECODED : ring.RECORDED + 1] = run.now_ns()
+            blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
         events = self._watch(turn, rows)
         for event in events:
             run.journal.take(event)
@@ -308,6 +334,12 @@ class RowDecisions(Sequence[Decision]):
 
     def __init__(self, rows: Rows) -> None:
         self.rows = rows
+        self._owned = False
+
+    def own(self) -> None:
+        """Copy the rows, once."""
+        if not self._owned:
+            self.rows, self._owned = self.rows.copy(), True
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -326,6 +358,13 @@ class RowDecisions(Sequence[Decision]):
         return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
+def _own(outputs: list[Output]) -> None:
+    """Give outputs rows of their own, before the next call fills the ring anew."""
+    for output in outputs:
+        if isinstance(output.decisions, RowDecisions):
+            output.decisions.own()
+
+
 def account_rows(run: LiveRun, blocks: I64, rows: Rows) -> list[Decision]:
     """Judge, tally and record the decisions of `blocks` (rings.py's steps); return them."""
     if not len(rows):
@@ -336,7 +375,7 @@ def account_rows(run: LiveRun, blocks: I64, rows: Rows) -> list[Decision]:
     if len(rows) <= FEW_ROWS:
         return _one_by_one(run, blocks[of_block].tolist(), rows.tolist())
     _in_columns(run, blocks[of_block], counts[of_block], rows)
-    return cast(list[Decision], RowDecisions(rows.copy()))  # read like a list, by whoever looks at an output
+    return cast(list[Decision], RowDecisions(rows))  # read like a list, by whoever looks at an output
 
 
 def _one_by_one(run: LiveRun, blocks: list[list[int]], rows: list[Any]) -> list[Decision]:

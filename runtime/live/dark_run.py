@@ -128,6 +128,11 @@ class DarkRun:
 
     def look(self, run: LiveRun, output: Output) -> None:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""
+        rows = getattr(output.decisions, "rows", None)  # of many at once
+        if rows is not None:
+            for found in self.light.take_many(rows["clicks"][rows["flags"] & int(NOT_MEASURED) == 0].astype(np.int64)):
+                run.journal.note("light_changed", **found)
+            return
         for decision in output.decisions:
             if not decision.flags & NOT_MEASURED:
                 words = self.light.take(decision.clicks)

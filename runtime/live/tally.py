@@ -8,9 +8,8 @@ having measured only these objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +53,7 @@ class RunTally:
         self.clicks = self.exposures = 0  # exposures: of walks
         self.photons = 0.0
         self.photons_known = 0
-        self._trials: dict[int, list[int]] = {}  # window within the visit -> [decided, right]
+        self._trials: npt.NDArray[np.int64] = np.zeros((64, 2), np.int64)  # by window within the visit: decided, right
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
         self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
 
@@ -77,9 +76,12 @@ class RunTally:
         if decision.label != NO_LABEL:
             self.confusion[decision.truth, decision.label] += 1
         trial = decision.shot // self.shots
-        for sums in (self._trials.setdefault(trial, [0, 0]), self._object_sums(self._which(decision))):
-            sums[0] += 1
-            sums[1] += right
+        self._make_room(trial)
+        self._trials[trial, 0] += 1
+        self._trials[trial, 1] += right
+        sums = self._object_sums(self._which(decision))
+        sums[0] += 1
+        sums[1] += right
 
     def add_rows(self, rows: npt.NDArray[np.void], photons_per_shot: npt.NDArray[np.float32]) -> None:
         """Count many decisions, DECISION_DTYPE (n,), with the photons of one shot on each object, NaN where unknown; as `add` does."""
@@ -102,23 +104,29 @@ class RunTally:
         n = len(self.confusion)
         cells = np.bincount(truths[named] * n + labels[named], minlength=n * n)
         self.confusion += cells.reshape(n, n)
-        self._add_sums(rows["shot"][known] // self.shots, right, self._trial_sums)
+        trials = (rows["shot"][known] // self.shots).astype(np.int64)
+        self._make_room(int(trials.max(initial=0)))
+        n = len(self._trials)
+        self._trials[:, 0] += np.bincount(trials, minlength=n)
+        self._trials[:, 1] += np.bincount(trials[right], minlength=n)
         numbers = rows["object"][known].astype(np.int64)
-        self._add_sums(numbers % self.distinct if self.distinct else numbers, right, self._object_sums)
+        self._add_objects(numbers % self.distinct if self.distinct else numbers, right)
 
-    def _add_sums(
-        self, keys: npt.NDArray[Any], right: npt.NDArray[np.bool_], sums_of: Callable[[int], list[int]]
-    ) -> None:
-        """Add decisions and right ones to the sums of each key, in the order in which keys come first."""
-        found, first, places = np.unique(keys, return_index=True, return_inverse=True)
-        decided, well = np.bincount(places), np.bincount(places, right)
-        for at in np.argsort(first).tolist():
-            sums = sums_of(int(found[at]))
-            sums[0] += int(decided[at])
-            sums[1] += int(well[at])
+    def _make_room(self, trial: int) -> None:
+        """Make the sums of trials long enough for one more, twice as long each time; a visit has at most 2^24 exposures."""
+        while trial >= len(self._trials):
+            self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
 
-    def _trial_sums(self, trial: int) -> list[int]:
-        return self._trials.setdefault(trial, [0, 0])
+    def _add_objects(self, numbers: npt.NDArray[np.int64], right: npt.NDArray[np.bool_]) -> None:
+        """Add decisions and right ones to the sums of each object, in the order in which they come: runs of the same one at a time."""
+        starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+        totals = np.concatenate([[0], np.cumsum(right)])
+        stops = np.append(starts[1:], len(numbers))
+        decided, well = (stops - starts).tolist(), (totals[stops] - totals[starts]).tolist()
+        for number, count, good in zip(numbers[starts].tolist(), decided, well):
+            sums = self._object_sums(number)
+            sums[0] += count
+            sums[1] += good
 
     def _which(self, decision: Decision) -> int:
         """Return which object a decision is about: one that is shown again keeps its number."""
@@ -160,13 +168,13 @@ class RunTally:
 
     def figures(self) -> TallyFigures:
         """Return accuracy, its spread over trials and over objects, clicks and photons per decision."""
-        per_trial = [right / n for n, right in self._trials.values() if n]
+        per_trial = [right / n for n, right in self._trials.tolist() if n]
         return TallyFigures(
             accuracy=self.accuracy,
             accuracy_std_trials=float(np.std(per_trial, ddof=1)) if len(per_trial) > 1 else None,
             accuracy_stderr_objects=self._spread_over_objects(),
             objects=self.objects,
-            trials=len(self._trials),
+            trials=len(per_trial),
             decisions=self.decisions,
             abstained=self.abstained,
             clicks_mean=self.clicks / self.decisions if self.decisions else None,

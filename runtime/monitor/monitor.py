@@ -92,7 +92,7 @@ class Monitor:
 
     def watch(self, run: LiveRun, output: Output) -> None:
         """Take the decisions of a block."""
-        self._latest.extend(output.decisions)
+        self._latest.extend(output.decisions[-(self._latest.maxlen or 0) :])
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

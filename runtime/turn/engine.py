@@ -56,12 +56,13 @@ class Turn:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
 
     def __init__(self, steps: BulkSteps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
-        from .kernels import turn  # needs the compiler and a POSIX system
+        from .kernels import feed, turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
         self.rings: Rings = make_rings()
         self.counts = _NOTHING
-        self._kernel = turn
+        self._kernel, self._feed = turn, feed
+        self._fed: tuple[U8, I64] = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
         self.control[ring.FD] = -1
@@ -72,9 +73,9 @@ class Turn:
         self._walk = steps.walk
 
     def warm_up(self) -> None:
-        """Compile or load the kernel, before arming; nothing is read and nothing changes."""
-        self.steps.load()
-        self._kernel(self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+        """Compile or load the kernels, before arming; nothing is read and nothing changes."""
+        self.run()
+        self.feed(*self._fed)
 
     def drives(self, drive: Drive) -> None:
         """Name the states of walks by `drive` from here on."""
@@ -82,6 +83,10 @@ class Turn:
 
     def run(self, fd: int = -1, limits: Limits = NO_LIMITS) -> int:
         """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY)."""
+        self._prepare(fd, limits)
+        return self._done(self._kernel(self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch))
+
+    def _prepare(self, fd: int, limits: Limits) -> None:
         control, steps = self.control, self.steps
         if fd >= 0:
             control[ring.FD] = fd
@@ -89,15 +94,28 @@ class Turn:
         control[ring.FLOOR_NS] = limits.floor_ns
         control[ring.OPEN] = steps.core.tracker.open
         steps.load()
-        ended = int(self._kernel(self._decoder, self._walk, self._drive, self.rings, control, self._scratch))
-        self.counts = Counts(*control[ring.ERRNO :].tolist())
-        if self.counts.messages:
-            steps.store()
-        return ended
 
-    def feed(self, data: bytes, arrival_ns: int) -> int:
-        """Take at most CHUNK_BYTES that were read elsewhere at `arrival_ns`; as `run` without a descriptor."""
-        return self.decoded(len(self.decoder.take(data)), arrival_ns)
+    def _done(self, ended: int) -> int:
+        self.counts = Counts(*self.control[ring.ERRNO :].tolist())
+        if self.counts.messages:
+            self.steps.store()
+        return int(ended)
+
+    def feed(self, data: U8, reads: I64) -> int:
+        """Take what was read elsewhere, uint8 (n,), read by read: `reads` int64 (n, 2), bytes (at most CHUNK_BYTES) and when they came.
+
+        Returns why it ended; `feed_on` goes on behind what ended it, until ALL_TAKEN.
+        """
+        self._fed = data, reads
+        self.control[ring.NEXT_READ : ring.READ_AT + 1] = 0
+        return self.feed_on()
+
+    def feed_on(self) -> int:
+        """Go on with what `feed` was given."""
+        self._prepare(-1, NO_LIMITS)
+        return self._done(
+            self._feed(*self._fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+        )
 
     def decoded(self, n_bodies: int, arrival_ns: int) -> int:
         """Take the bodies that the decoder has found in what it was given last."""

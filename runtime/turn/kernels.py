@@ -82,6 +82,57 @@ def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
+def feed(data, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
+    """Take what was read elsewhere, `data` uint8, read by read: `reads` int64 (n, 2) are their bytes and the times of their arrival.
+
+    control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins. Returns why it ended, as `turn`; ALL_TAKEN
+    behind the last one. The rings are filled from their beginning.
+    """
+    decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
+    data, reads, control, scratch = bare(data), bare(reads), bare(control), bare(scratch)
+    control[ring.ERRNO : ring.N_CONTROL] = 0
+    walk.state[core.N_ROWS] = 0
+    while True:
+        ended = take_bodies(decoder, walk, drive, rings, control, scratch)
+        if ended != ring.ALL_TAKEN or control[ring.NEXT_READ] == reads.shape[0]:
+            return ended
+        if control[ring.N_ARRIVALS] == rings.arrivals.size:
+            return ring.FULL
+        size = reads[control[ring.NEXT_READ], 0]
+        control[ring.ARRIVAL_NS] = reads[control[ring.NEXT_READ], 1]
+        control[ring.NEXT_READ] += 1
+        held = _make_room(decoder)
+        at = control[ring.READ_AT]
+        decoder.buffer[held : held + size] = data[at : at + size]
+        control[ring.READ_AT] += size
+        _decode(decoder, control, held, size)
+        rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
+        control[ring.N_ARRIVALS] += 1
+
+
+@njit(cache=True, nogil=True)
+def _make_room(decoder):  # type: ignore[no-untyped-def]
+    """Move what waits for the rest of its frame to the beginning of the buffer; return how many bytes those are."""
+    buffer, tally = decoder.buffer, decoder.tally
+    waiting, held = tally[wire.CONSUMED], tally[wire.HELD]
+    if waiting:
+        for i in range(held):
+            buffer[i] = buffer[waiting + i]
+        tally[wire.CONSUMED] = 0
+    return held
+
+
+@njit(cache=True, nogil=True)
+def _decode(decoder, control, held, found):  # type: ignore[no-untyped-def]
+    """Decode `found` new bytes behind `held` ones."""
+    tally, used = decoder.tally, held + found
+    control[ring.N_BODIES] = wire.unstuff_frames(decoder.buffer, used, MAX_FRAME_BYTES, SCHEMA, decoder.bodies, tally)
+    control[ring.PLACE] = 0
+    tally[wire.HELD] = used - tally[wire.CONSUMED]
+    tally[wire.BYTES_IN] += found
+
+
+@njit(cache=True, nogil=True)
 def _failed(control, found):  # type: ignore[no-untyped-def]
     """Why a call ends whose wait or read gave `found`, 0 or minus errno."""
     control[ring.ERRNO] = -found
@@ -104,21 +155,11 @@ def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True)
 def _read(decoder, control, scratch):  # type: ignore[no-untyped-def]
     """Read behind what waits in the buffer, stamp and decode it; return the bytes read, 0, or minus errno."""
-    buffer, tally = decoder.buffer, decoder.tally
-    waiting, held = tally[wire.CONSUMED], tally[wire.HELD]
-    if waiting:
-        for i in range(held):
-            buffer[i] = buffer[waiting + i]
-        tally[wire.CONSUMED] = 0
-    found = read_now(control[ring.FD], buffer, held, min(READ_BYTES, buffer.size - held))
-    if found <= 0:
-        return found
-    control[ring.ARRIVAL_NS] = now_ns(scratch)
-    used = held + found
-    control[ring.N_BODIES] = wire.unstuff_frames(buffer, used, MAX_FRAME_BYTES, SCHEMA, decoder.bodies, tally)
-    control[ring.PLACE] = 0
-    tally[wire.HELD] = used - tally[wire.CONSUMED]
-    tally[wire.BYTES_IN] += found
+    held = _make_room(decoder)
+    found = read_now(control[ring.FD], decoder.buffer, held, min(READ_BYTES, decoder.buffer.size - held))
+    if found > 0:
+        control[ring.ARRIVAL_NS] = now_ns(scratch)
+        _decode(decoder, control, held, found)
     return found
 
 

@@ -24,9 +24,11 @@ STOP = 11  # a flag that anybody may set: the call ends
 # what both ends keep: the next decoded body and how many there are, when they were read, when a block came last; the session's
 # window of commands (next id, the oldest without an answer, since when that counts); what SHOW named last
 PLACE, N_BODIES, ARRIVAL_NS, BLOCK_NS, NEXT_ID, OLDEST_ID, OLDEST_NS, SENT_EXPOSURE, SENT_STATE = range(12, 21)
+# of bytes that were read elsewhere: the next read, and where it begins
+NEXT_READ, READ_AT = range(21, 23)
 # what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and how much of each
 # ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(21, 32)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(23, 34)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)

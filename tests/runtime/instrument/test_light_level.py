@@ -101,3 +101,18 @@ def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[
     captured = capsys.readouterr()
     assert "calibrate again" in captured.err
     assert len(json.loads(captured.out)["calibration_warnings"]) == 1
+
+
+def test_many_decisions_at_once_are_those_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    clicks = np.concatenate([rng.poisson(5.0, 60_000), rng.poisson(3.0, 40_000)])
+    one, many = LightWatch(batch=100), LightWatch(batch=100)
+    for number in clicks.tolist():
+        one.take(number)
+    at = 0
+    while at < len(clicks):
+        n = int(rng.integers(0, 700))
+        many.take_many(clicks[at : at + n])
+        at += n
+    assert one.found
+    assert (one.found, one.report()) == (many.found, many.report())

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from pans.firmware_sim.ports.serve import open_sim
+import pytest
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
@@ -33,11 +38,14 @@ class Counted:
         return bytes(data)
 
 
-def test_the_frames_of_attempts_that_failed_are_counted() -> None:
-    profile, bundle, plan = small_setup()
+@pytest.mark.parametrize("mode", ["sequential", "parallel"])  # of parallel frames many reads are taken at once
+def test_the_frames_of_attempts_that_failed_are_counted(mode: str) -> None:
+    profile, bundle, plan = small_setup(mode)
+    clock = DeviceClock(profile.clock.tick_hz)
+    device = Instrument(profile, load_scene("uniform"), seed=1, power_on_tick=clock.tick_at(START_NS))
     frames: Counter[str] = Counter()
     breaks = iter([("run", 500), ("first attempt", 3), ("second attempt", 7), ("rest", 1 << 30)])
-    first = Counted(open_sim("sim:ideal?scene=uniform&pace=fast&seed=1"), frames, *next(breaks))
+    first = Counted(VirtualLink(device, clock, "sim:turn"), frames, *next(breaks))
     recovery = Recovery(
         lambda lost: Counted(lost.link.reopen(), frames, *next(breaks)),  # type: ignore[attr-defined]
         60.0,
