@@ -249,8 +249,10 @@ def _recorded(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcom
     limits, header = job.continuous.limits, ready.header | {"simulated": link.simulated}
     with ExitStack() as opened:
         opened.enter_context(gone_if_refused(job))
-        same = _same_bundle(job, ready)
-        recorder = opened.enter_context(open_recorder(job.recording, header, same, limits, force=job.force))
+        # the file is not held by a name: it may have 64 MiB, and the run begins here
+        recorder = opened.enter_context(
+            open_recorder(job.recording, header, _same_bundle(job, ready), limits, force=job.force)
+        )
         result = _watched(job, ready, link, recorder, recovery, beside)
         summary = _summary(job, ready, result)
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))

@@ -154,7 +154,7 @@ def long_recording(path: Path, decisions: int) -> Path:
     """A recording of many decisions with their timings."""
     with Recorder(path, {"config": {"shots": 1, "tick_hz": 1000}}) as recorder:
         for number in range(decisions):
-            recorder.add_decision((number, number, number, 0, 0, 1, 0, -1, 0, 0.5, 0))
+            recorder.add_decision((number, number, number, 0, 0, 1, 0, -1, 0, 0.5, 0, 0))
             recorder.add_timing((number, number, number, number, number))
         recorder.close({})
     return path
