@@ -21,6 +21,7 @@ from pans.trainer.baselines.common import Measurement, detect, measure
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.information import fisher, fisher_of_frames, posterior_information, word_information
 from pans.trainer.tasks.registry import Objects, Task, load_task
+from pans.trainer.verdicts import against, claim, sampling_error
 
 from . import plots
 from .page import Asked, Made, Row, Rows, Table, columns, pages
@@ -82,7 +83,7 @@ def _words(task: Task, report: Callable[[str], None]) -> Rows:
         known = word_information(eta * train, task.train.labels, eta * test, task.test.labels, n_classes, law=law)
         p = click_probability(law, eta * test)
         ratio = fisher(p, p * (1 - p), task.test.labels)
-        row = {"way": "click words", "photons": photons, "bits": known.heldout_bits, "bits_se": 0.0}
+        row = {"way": "click words", "photons": photons, "bits": known.heldout_bits, "bits_se": None}
         row |= {"accuracy": known.heldout_bayes_accuracy, "clicks": known.clicks, "fisher": asdict(ratio)}
         report(f"click words, {photons:g} photons: {known.heldout_bits:.2f} bits")
         rows.append(row | {"objects": len(test), "illumination": bundle.illumination() * eta})
@@ -90,8 +91,18 @@ def _words(task: Task, report: Callable[[str], None]) -> Rows:
 
 
 def information_tables(rows: Rows) -> list[Table]:
-    """Return one line per way and photon level."""
-    return [Table(columns("information"), rows)]
+    """Return one line per way and photon level, click words beside the frames of as many photons by their accuracy."""
+    frames = {row["photons"]: row for row in rows if row["way"] == "frames" and "accuracy" in row}
+    shown = [row | {"beside": _held_against(row, frames.get(row["photons"]))} for row in rows]
+    return [Table(columns("information"), shown, claims=[claim("Click words", "frames", [r["beside"] for r in shown])])]
+
+
+def _held_against(row: Row, frames: Row | None) -> Row | None:
+    """The accuracy of click words beside that of frames; both errors are binomial, since none of objects was kept."""
+    if frames is None or row is frames:
+        return None
+    accuracies = [100 * one["accuracy"] for one in (row, frames)]
+    return against(*accuracies, *(sampling_error(a, one["objects"]) for a, one in zip(accuracies, (row, frames))))
 
 
 PAGES = pages({"fig-2c": (information_page, information_tables)})
