@@ -57,6 +57,7 @@ class StreamCore:
         self.decoder.warm_up()
         self.core.windows.warm_up()
         self._steps.warm_up()
+        self.turn.warm_up()
         self._steps.begin(self._session)
 
     @property
