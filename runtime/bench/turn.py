@@ -38,9 +38,11 @@ from pans.runtime.wire.frame import unpack_body
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
+    Ack,
     ClickBlock,
     Mark,
     Opcode,
+    encode_ack,
     encode_clicks,
     encode_command,
     encode_mark,
@@ -287,7 +289,7 @@ def _framed(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> tu
     first = encode_command(1, Opcode.SHOW, driver.body(0, 0), SESSION)
     control[ring.DRIVES], control[ring.NEXT_ID], control[ring.OLDEST_ID] = 1, 2, 1
     control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = 0, 0
-    times, bodies, rows, answers = list[NDArray[np.int64]](), list[bytes](), list[Rows](), 0
+    times, bodies, rows = list[NDArray[np.int64]](), list[bytes](), list[Rows]()
     with _process(kind, device, 1, len(first), 0, plan.slots_per_cycle) as fd:
         os.write(fd, first)
         while sum(map(len, times)) < n:
@@ -301,13 +303,14 @@ def _framed(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> tu
             times.append(np.diff(blocks[:, ring.DECIDED]) + kept)
             bodies += [turn.bytes_of(span) for span in turn.messages]
             rows.append(turn.rows.copy())
-            answers = max(answers, 28 + 52)
     again = Core(plan, decider, 1, 0)
     again.begin(0, 0)
     wanted = [one for body in bodies for one in again.step(unpack_body(body)).decisions]
     wrong = _differ(np.concatenate(rows), np.array(wanted, DECISION_DTYPE))
     found = np.concatenate(times)
-    return found[len(found) // 10 :], len(first), answers, wrong
+    one = ClickBlock(1, 0, 100, 1, 100, 0, np.zeros(1, np.uint16), np.zeros(1, np.uint8))
+    answer = len(encode_ack(Ack(1, 0, 0, ""), SESSION)) + len(encode_clicks(one, SESSION))
+    return found[len(found) // 10 :], len(first), answer, wrong
 
 
 def _soon() -> int:

@@ -108,6 +108,7 @@ class CompiledTurns:
         drive = None if run.driver is None else run.driver.arrays(nonce)
         self._steps, self._turn = steps, Turn(steps, bulk, drive)
         self._turn.warm_up()
+        unpack_blocks(self._turn.kept, self._turn.messages, self._stamps, self._bits)
         link = run.connection.link
         self._fd = None if link.virtual else descriptor_of(link)
 
