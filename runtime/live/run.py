@@ -46,7 +46,6 @@ STOP_GIVE_UP_NS = 1 * NS_PER_S
 UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every second
 SILENCE_NS = 5 * NS_PER_S  # without clicks
 
-
 Watcher = Callable[["LiveRun", Output], None]
 
 
@@ -68,9 +67,8 @@ class LiveRun(Reconciled):
         self.connection, self.plan, self.core, self.config = connection, plan, core, config
         self.timing = TimingLedger(int(config.deadline_us * NS_PER_US))
         welcome = connection.session.welcome
-        shown = (
-            0 if welcome is None else int(welcome.facts.get("objects", 0))
-        )  # of a simulator: they come again in turn
+        # of a simulator: they come again in turn
+        shown = 0 if welcome is None else int(welcome.facts.get("objects", 0))
         self.tally = RunTally(n_classes, config.shots, shown)
         self.journal = Journal(recorder)
         self.gates = GateQueue(recorder, self.journal)
