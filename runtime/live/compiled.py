@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast, overload
@@ -19,8 +18,8 @@ import numpy.typing as npt
 from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.decision import Decision, Output
 from pans.runtime.core.still import Core
-from pans.runtime.errors import LinkError, UsageError
-from pans.runtime.link.base import Link, descriptor_of
+from pans.runtime.errors import LinkError
+from pans.runtime.link.base import descriptor_of
 from pans.runtime.link.connection import Arrived
 from pans.runtime.link.reader import Chunk
 from pans.runtime.record.format import TIMING_DTYPE, Kind
@@ -28,13 +27,11 @@ from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
 from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
-from pans.runtime.turn.system import offered
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import MessageType, Opcode, decode_frames
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES
 
-from .config import COMPILED, PYTHON, TurnChoice
 from .tally import photons_of
 
 if TYPE_CHECKING:
@@ -50,34 +47,6 @@ GATHERED_BYTES = 1 << 17
 EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
 TURN_NS = 20_000_000  # a call comes back at least so often: signals, the watchdog's heartbeat, other threads' wishes
-
-
-def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoice:
-    """Return which turn a run takes, and why; UsageError where "compiled" was asked for and cannot be."""
-    why = "asked for" if wanted == PYTHON else _excluded(core, link, drives=drives)
-    if wanted == COMPILED and why:
-        raise UsageError(f"--turn compiled: {why}", remedy="--turn auto takes Python's turn here")
-    if why:
-        return TurnChoice(PYTHON, why)
-    return TurnChoice(COMPILED, "virtual time: what was read at once is taken at once" if link.virtual else "")
-
-
-def _excluded(core: Any, link: Link, *, drives: bool) -> str:
-    """Why no compiled turn can be taken; "" where it can."""
-    if not isinstance(core, Core):
-        return "objects in flow have a turn of their own"
-    if not core.compiles:
-        return "--on-dark changes decisions while they are made"
-    if link.virtual:
-        return "in virtual time, the host names each state in a turn of its own" if drives else ""
-    if missing := offered():
-        return missing
-    if not core.decides_compiled:
-        return "the back end is no table and no automaton: it decides in Python"
-    if descriptor_of(link) is None:
-        return "the link has no descriptor that compiled code could read"
-    before_ns, there_ns = time.perf_counter_ns(), link.now_ns()
-    return "" if before_ns <= there_ns <= time.perf_counter_ns() else "the link stamps with a clock of its own"
 
 
 class CompiledTurns:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from pans.runtime.core.dark_guard import DarkGuard
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
-from pans.runtime.errors import DeviceError, LinkError, RecordingError
+from pans.runtime.errors import DeviceError, LinkError, RecordingError, UsageError
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.instrument.profile import Profile
@@ -33,9 +34,10 @@ from pans.runtime.record import AnyRecorder
 from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.timing.page_faults import ThreadCounts
+from pans.runtime.turn.eligible import excluded
 
-from .compiled import CompiledTurns, choose_turn
-from .config import COMPILED, RunConfig, RunResult
+from .compiled import CompiledTurns
+from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
@@ -118,6 +120,16 @@ def run_live(
         return _result(run, profile)
     finally:
         run.connection.close()
+
+
+def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoice:
+    """Return which turn a run takes, and why; UsageError where "compiled" was asked for and cannot be."""
+    why = "asked for" if wanted == PYTHON else excluded(core, link, drives=drives)
+    if wanted == COMPILED and why:
+        raise UsageError(f"--turn compiled: {why}", remedy="--turn auto takes Python's turn here")
+    if why:
+        return TurnChoice(PYTHON, why)
+    return TurnChoice(COMPILED, "virtual time: what was read at once is taken at once" if link.virtual else "")
 
 
 def open_session(

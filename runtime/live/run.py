@@ -95,8 +95,7 @@ class LiveRun(Reconciled):
         self.compiled: Turns | None = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
-        self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = 0
-        self._granted_until = 0
+        self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = self._granted_until = 0
         self._over_ns = 0  # when the plan has long been done
 
     def now_ns(self) -> int:

@@ -39,9 +39,8 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, compiled, run_live
-from pans.runtime.live.compiled import choose_turn
 from pans.runtime.live.drive import HostDriver, WalkPlace
-from pans.runtime.live.loop import NO_OBSERVERS
+from pans.runtime.live.loop import NO_OBSERVERS, choose_turn
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.turn import kernels, shows, system
 from pans.runtime.turn import rings as ring
