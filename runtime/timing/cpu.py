@@ -87,10 +87,11 @@ class _Spinner:
         self._state[:] = 0
         self._ended = ENDED
         self._thread = threading.Thread(target=spin, args=(self._state,), name="pans-awake", daemon=True)
-        self._thread.start()
-        while not self._state[SPINS]:
-            time.sleep(LOOK_EVERY_S)
-        self.answer = _idle_on(core, self._thread.native_id)
+        with _ordinary():
+            self._thread.start()
+            while not self._state[SPINS]:
+                time.sleep(LOOK_EVERY_S)
+            self.answer = _idle_on(core, self._thread.native_id)
         if self.answer != "granted":
             self.stop()
 
@@ -101,6 +102,22 @@ class _Spinner:
                 os.sched_setscheduler(self._thread.native_id, os.SCHED_OTHER, os.sched_param(0))
         self._state[self._ended] = 1
         self._thread.join()
+
+
+@contextmanager
+def _ordinary() -> Iterator[None]:
+    """Ordinary priority for the calling thread: one that begins here inherits it, and with a real-time one would spin for good."""
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    if policy in (os.SCHED_FIFO, os.SCHED_RR):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    try:
+        yield
+    finally:
+        if policy in (os.SCHED_FIFO, os.SCHED_RR):
+            os.sched_setscheduler(0, policy, parameters)
 
 
 def _idle_on(core: int, thread: int | None) -> str:

@@ -174,13 +174,13 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     granted["gc_off"] = "granted"
     granted["switch_interval_s"] = SWITCH_INTERVAL_S
     threads, held = [0, *other_threads], ExitStack()
-    if wanted:
-        granted["sched_fifo"] = _request_fifo(threads)
-        if granted["sched_fifo"] == "granted":
-            threads += _raised(threads)
-        granted["mlockall"] = _request_mlockall()
-        granted["heap_touched"] = held.enter_context(held_heap())
     try:
+        if wanted:
+            granted["sched_fifo"] = _request_fifo(threads)
+            if granted["sched_fifo"] == "granted":
+                threads += _raised(threads)
+            granted["mlockall"] = _request_mlockall()
+            granted["heap_touched"] = held.enter_context(held_heap())
         yield granted
     finally:
         held.close()

@@ -51,6 +51,22 @@ def test_it_is_undone_when_the_run_breaks() -> None:
     assert spinners() == []
 
 
+def test_a_thread_of_real_time_priority_is_not_shut_out_by_its_own_spinner() -> None:
+    before = os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
+    except OSError:
+        pytest.skip("no real-time priority is granted here")
+    try:
+        with busy_core(max(os.sched_getaffinity(0))) as granted:
+            assert granted["kept_awake"] == "granted"
+            assert os.sched_getscheduler(0) == os.SCHED_FIFO
+            assert os.sched_getparam(0).sched_priority == 2
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, before)
+    assert spinners() == []
+
+
 def test_nothing_is_done_unasked() -> None:
     before = os.sched_getaffinity(0)
     with busy_core(None) as granted:
