@@ -10,7 +10,8 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
@@ -153,23 +154,27 @@ class TcpPort:
             self._client = None
 
 
-def ask_for_priority() -> str:
-    """Ask for SCHED_FIFO, since the instrument stands in for hardware that is never late itself; return what was granted."""
+@contextmanager
+def prompt_thread() -> Iterator[None]:
+    """SCHED_FIFO for the calling thread where it is granted, since the instrument stands in for hardware that is never late itself."""
     if not hasattr(os, "sched_setscheduler"):
-        return "this system has no SCHED_FIFO"
-    try:
+        yield
+        return
+    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
+    with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-    except OSError as error:
-        return f"refused: {error.strerror}"
-    return "granted"
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, before)
 
 
 def serve(
     device: SteppedDevice, clock: DeviceClock, port: Port, stopped: Callable[[], bool], core: int | None = None
 ) -> None:
     """Step `device` in real time and carry its bytes over `port` until `stopped()`; on `core`, kept awake, if one is given."""
-    ask_for_priority()
-    with busy_core(core):
+    with prompt_thread(), busy_core(core):
         _serve(device, clock, port, stopped)
 
 

@@ -398,6 +398,15 @@ def test_a_client_that_never_reads_costs_bounded_memory(monkeypatch: pytest.Monk
     assert port.largest == 9 * 1001  # whole outputs only
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind threads to cores")
+def test_the_loop_on_a_core_of_its_own_runs_and_gives_its_priority_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its spinner waits on the same core: with the loop's priority it would never let the loop run."""
+    monkeypatch.setattr(shell, "MAX_BACKLOG_BYTES", 10_000)
+    port, before = StuckPort(), (os.sched_getscheduler(0), os.sched_getaffinity(0))
+    serve(Talker(), DeviceClock(1_000_000), port, lambda: port.waits > 100, max(before[1]))
+    assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
+
+
 # -- processes of their own --------------------------------------------------------------------------------------------
 
 
