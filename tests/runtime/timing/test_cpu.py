@@ -52,7 +52,7 @@ def test_it_is_undone_when_the_run_breaks() -> None:
 
 
 def test_a_thread_of_real_time_priority_is_not_shut_out_by_its_own_spinner() -> None:
-    before = os.sched_getparam(0)
+    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
     except OSError:
@@ -63,7 +63,7 @@ def test_a_thread_of_real_time_priority_is_not_shut_out_by_its_own_spinner() -> 
             assert os.sched_getscheduler(0) == os.SCHED_FIFO
             assert os.sched_getparam(0).sched_priority == 2
     finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, before)
+        os.sched_setscheduler(0, policy, before)
     assert spinners() == []
 
 
