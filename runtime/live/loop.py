@@ -43,6 +43,7 @@ from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 
 NS_PER_S = 1_000_000_000
+SETTLED_WITHIN_US = 700.0  # recorder, tally and evidence of one block take 0.2 to 0.4 ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,9 @@ def run_live(
         core.warm_up()
         run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
         if run.turn_choice.taken == COMPILED and isinstance(core, Core):
-            run.compiled = CompiledTurns(run, core, prompt=observers.acts and observers.watch is not None)
+            # settled behind each block where there is time for it: left to gather, it comes when the next block does
+            spare = not link.virtual and plan.cycle_us >= SETTLED_WITHIN_US
+            run.compiled = CompiledTurns(run, core, prompt=spare or (observers.acts and observers.watch is not None))
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
         with (
