@@ -96,7 +96,8 @@ def run_live(
         run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
         if run.turn_choice.taken == COMPILED and isinstance(core, Core):
             # settled behind each block where there is time for it: left to gather, it comes when the next block does
-            spare = not link.virtual and plan.cycle_us >= SETTLED_WITHIN_US
+            block_us = plan.cycle_us * min(plan.block_exposures / plan.slots_per_cycle, 1.0)
+            spare = not link.virtual and block_us >= SETTLED_WITHIN_US
             run.compiled = CompiledTurns(run, core, prompt=spare or (observers.acts and observers.watch is not None))
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
