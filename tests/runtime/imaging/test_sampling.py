@@ -1,0 +1,202 @@
+"""What the pattern grid meets of an object, held against rendering with 256 points per pixel, Fourier's theorem and numpy.rot90."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pans.runtime.imaging import IDENTITY, Imaging, levelled, met, operator, seen
+from pans.runtime.imaging.sampling import _gathered, _tail
+
+SHAPE = (9, 12)
+FINE, PAD = 16, 7  # points per pixel and axis; pixels around the object
+
+
+def picture(seed=0, shape=SHAPE):
+    return np.random.default_rng(seed).random((3, *shape))
+
+
+def rendered(imaging, image):
+    """The object as constant squares, looked up point by point, blurred on the fine grid by the FFT, averaged per pattern pixel."""
+    rows, columns = image.shape
+    fine = (
+        (np.arange((max(rows, columns) + 2 * PAD) * FINE) + 0.5) / FINE - PAD - 0.5
+    )  # pixel k covers k - 0.5 .. k + 0.5
+    down, right = np.meshgrid(fine, fine, indexing="ij")
+    down, right = down - (rows - 1) / 2 - imaging.down_px, right - (columns - 1) / 2 - imaging.right_px
+    up = -down
+    turn = np.exp(-1j * math.radians(imaging.rotation_deg))  # the way back, clockwise
+    place = (right + 1j * up) * turn / imaging.scale
+    row = np.floor(-place.imag + (rows - 1) / 2 + 0.5).astype(int)
+    column = np.floor(place.real + (columns - 1) / 2 + 0.5).astype(int)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    field = np.where(inside, image[row.clip(0, rows - 1), column.clip(0, columns - 1)], 0.0)
+    frequency = np.fft.fftfreq(len(fine), 1 / FINE)
+    low_pass = np.exp(-2 * (math.pi * imaging.psf_px * frequency) ** 2)
+    field = np.fft.ifft2(np.fft.fft2(field) * low_pass[:, None] * low_pass).real
+    blocks = field.reshape(len(fine) // FINE, FINE, -1, FINE).mean(axis=(1, 3))
+    return blocks[PAD : PAD + rows, PAD : PAD + columns]
+
+
+@pytest.mark.parametrize(
+    ("imaging", "within"),
+    [
+        (Imaging(0.5, -0.25), 1e-12),
+        (Imaging(1.0625, 0.375, psf_px=0.6), 1e-3),
+        (Imaging(-0.5, 0.25, scale=1.25, psf_px=0.5), 5e-3),
+        (Imaging(0.25, 0.5, rotation_deg=2.0, psf_px=0.6), 5e-3),
+        (
+            Imaging(0.25, 0.5, rotation_deg=-3.0, scale=0.97),
+            2e-2,
+        ),  # no blur: the corners of turned squares, and the points' own error
+        (Imaging(rotation_deg=30.0, psf_px=0.7), 5e-3),
+    ],
+)
+def test_what_is_seen_is_what_a_rendering_with_256_points_per_pixel_gives(imaging, within):
+    image = picture()[0]
+    expected = rendered(imaging, image)
+    found = seen(imaging, image.reshape(1, -1), SHAPE)[0].reshape(SHAPE)
+    np.testing.assert_allclose(found, expected, atol=within)
+    other = Imaging(**(imaging.numbers() | {"right_px": imaging.right_px + 0.5}))
+    assert np.abs(rendered(other, image) - expected).max() > 4 * within  # so that the comparison can fail
+
+
+def test_the_object_moves_right_and_down_and_turns_counter_clockwise():
+    dot = np.zeros((1, *SHAPE))
+    dot[0, 4, 5] = 1.0
+    moved = seen(Imaging(right_px=2, down_px=1), dot.reshape(1, -1), SHAPE).reshape(SHAPE)
+    assert np.argwhere(moved).tolist() == [[5, 7]]
+    east = np.zeros((1, 11, 11))
+    east[0, 5, 10] = 1.0
+    turned = seen(Imaging(rotation_deg=30.0), east.reshape(1, -1), (11, 11)).reshape(11, 11)
+    down, right = (turned * np.mgrid[0:11, 0:11]).sum(axis=(1, 2)) / turned.sum()
+    assert (right - 5, down - 5) == pytest.approx((5 * math.cos(math.pi / 6), -5 * math.sin(math.pi / 6)), abs=0.05)
+
+
+def test_quarter_turns_are_those_of_numpy():
+    images = picture(shape=(8, 8))
+    for quarters in (-4, -3, -1, 1, 2, 3, 4):
+        turned = seen(Imaging(rotation_deg=90.0 * quarters), images.reshape(3, -1), (8, 8))
+        np.testing.assert_array_equal(turned.reshape(-1, 8, 8), np.rot90(images, quarters, axes=(1, 2)))
+
+
+def test_perfect_optics_change_no_bit_and_whole_shifts_move_pixels():
+    images = picture().reshape(3, -1)
+    np.testing.assert_array_equal(seen(IDENTITY, images, SHAPE), images)
+    np.testing.assert_array_equal(seen(Imaging(black=0.1, gain=2.0), images, SHAPE), images)
+    expected = np.zeros((3, *SHAPE))
+    expected[:, 2:, :-3] = images.reshape(-1, *SHAPE)[:, :-2, 3:]
+    np.testing.assert_array_equal(seen(Imaging(-3.0, 2.0), images, SHAPE).reshape(-1, *SHAPE), expected)
+
+
+@pytest.mark.parametrize("frequency", [1 / 16, 2 / 16, 3 / 16])
+def test_a_wave_is_shifted_and_damped_as_fourier_says(frequency):
+    """Two squares and a Gaussian: the wave's amplitude falls by sinc(f)**2 exp(-2 (pi sigma f)**2), its phase by the shift."""
+    x, sigma, shift = np.arange(80), 0.9, 0.37
+    wave = np.cos(2 * math.pi * frequency * x)
+    found = seen(Imaging(right_px=shift, psf_px=sigma), wave.reshape(1, -1), (1, 80))[0]
+    inner = slice(20, 60)  # beyond reach of the ends
+    height = seen(Imaging(psf_px=sigma), np.ones((1, 5)), (5, 1))[0, 2]  # what is lost above and below a single row
+    row = seen(Imaging(psf_px=sigma), np.array([[1.0]]), (1, 1))[0, 0] ** 0.5
+    amplitude = row * np.sinc(frequency) ** 2 * math.exp(-2 * (math.pi * sigma * frequency) ** 2)
+    np.testing.assert_allclose(
+        found[inner], amplitude * np.cos(2 * math.pi * frequency * (x - shift))[inner], atol=3e-6
+    )
+    assert height < 1
+
+
+def test_no_light_is_made_or_lost_inside_and_a_magnified_object_has_more_of_it():
+    dot = np.zeros((1, 31, 31))
+    dot[0, 14:16, 15] = 0.7
+    for imaging in (Imaging(0.3, -0.8), Imaging(1.7, 0.2, psf_px=1.1), Imaging(0.4, 0.1, scale=1.3, psf_px=0.8)):
+        total = seen(imaging, dot.reshape(1, -1), (31, 31)).sum()
+        assert total == pytest.approx(1.4 * imaging.scale**2, abs=1e-12 if imaging.scale == 1 else 2e-3)
+    assert seen(Imaging(2.0, rotation_deg=7.0, psf_px=0.6), dot.reshape(1, -1), (31, 31)).sum() == pytest.approx(
+        1.4, abs=2e-3
+    )
+    even = seen(Imaging(0.3, 0.4, 5.0, 1.0, 0.5), np.ones((1, 31 * 31)), (31, 31)).reshape(31, 31)
+    np.testing.assert_allclose(even[8:-8, 8:-8], 1.0, atol=1e-12)  # an even object is seen even
+    assert seen(Imaging(100.0), dot.reshape(1, -1), (31, 31)).max() == 0.0
+
+
+def test_the_map_is_linear_and_its_matrix_and_the_form_without_a_matrix_agree():
+    images = picture().reshape(3, -1)
+    for imaging in (Imaging(0.7, 0.3, psf_px=0.7), Imaging(0.7, 0.3, 11.0, 1.1, 0.7), Imaging(-4.0, 0.3, 200.0, 0.8)):
+        found = seen(imaging, images, SHAPE)
+        np.testing.assert_allclose(images @ operator(imaging, SHAPE).T, found, atol=1e-14)
+        np.testing.assert_allclose(_gathered(imaging, images, SHAPE), found, atol=1e-14)
+        np.testing.assert_allclose(
+            seen(imaging, 2 * images[:1] - images[1:2], SHAPE), 2 * found[:1] - found[1:2], atol=1e-14
+        )
+
+
+def test_shifts_of_a_blurred_object_add_up_and_turns_come_back():
+    x = np.linspace(-1, 1, 41)
+    blob = np.exp(-8 * (x[:, None] ** 2 + (x - 0.2) ** 2)).reshape(1, -1)
+    shape = (41, 41)
+    twice = seen(Imaging(1.0), seen(Imaging(2.0, 1.0), blob, shape), shape)
+    np.testing.assert_array_equal(twice, seen(Imaging(3.0, 1.0), blob, shape))
+    back = seen(Imaging(rotation_deg=-20.0), seen(Imaging(rotation_deg=20.0), blob, shape), shape)
+    assert np.abs(back - blob).max() < 0.02 < np.abs(seen(Imaging(rotation_deg=20.0), blob, shape) - blob).max()
+
+
+def test_tiny_and_huge_numbers_give_what_their_limits_give():
+    images = picture().reshape(3, -1)
+    np.testing.assert_allclose(seen(Imaging(psf_px=1e-300), images, SHAPE), images, atol=1e-15)
+    np.testing.assert_allclose(seen(Imaging(1e-13, rotation_deg=1e-13), images, SHAPE), images, atol=1e-11)
+    wide = seen(Imaging(psf_px=1000.0), images, SHAPE)
+    expected = images.sum(axis=1, keepdims=True) / (2 * math.pi * 1000.0**2)
+    np.testing.assert_allclose(wide, np.broadcast_to(expected, wide.shape), rtol=1e-4)
+    assert seen(Imaging(-1e4, 1e4, 45.0, 10.0), images, SHAPE).max() == 0.0
+    assert np.isfinite(seen(Imaging(scale=0.1, psf_px=3.0, rotation_deg=1.0), images, SHAPE)).all()
+
+
+def test_the_tail_of_the_normal_law_is_that_of_erfc():
+    z = np.random.default_rng(3).uniform(0, 8.5, 2000)
+    expected = [0.5 * math.erfc(value / math.sqrt(2)) for value in z]
+    np.testing.assert_allclose(_tail(z), expected, atol=1e-15)
+
+
+def test_the_light_of_a_pattern_has_black_flat_field_and_gain_once_each():
+    rng = np.random.default_rng(5)
+    flat = rng.random(SHAPE)
+    flat /= flat.mean()
+    imaging = Imaging(0.4, -0.2, 3.0, 1.05, 0.6, black=0.01, gain=1.3, flat=flat)
+    patterns, objects = rng.random((4, 108)), picture().reshape(3, -1)
+    field = seen(imaging, objects, SHAPE)
+    by_hand = np.array(
+        [
+            [1.3 * sum(flat.ravel()[i] * (0.01 + 0.99 * p[i]) * x[i] for i in range(108)) for x in field]
+            for p in patterns
+        ]
+    )
+    np.testing.assert_allclose(met(imaging, patterns, SHAPE) @ objects.T, by_hand, rtol=1e-12)
+    np.testing.assert_allclose(levelled(imaging, 7 * patterns, SHAPE, 7.0), 7 * levelled(imaging, patterns, SHAPE))
+    np.testing.assert_array_equal(met(IDENTITY, patterns, SHAPE), patterns)
+
+
+@pytest.mark.parametrize(
+    ("fact", "words"),
+    [
+        ({"right_px": math.nan}, "right_px is nan"),
+        ({"scale": 0.0}, "scale is 0.0, allowed: a number from 0.1 to 10"),
+        ({"psf_px": -0.1}, "psf_px is -0.1"),
+        ({"black": 1.0}, "black is 1"),
+        ({"gain": 0.0}, "gain is 0"),
+        ({"flat": np.full(SHAPE, 1.1)}, "flat has the mean 1.1"),
+        ({"flat": np.ones(4)}, r"flat is \(4,\)"),
+        ({"flat": np.full(SHAPE, math.inf)}, "not finite"),
+    ],
+)
+def test_impossible_optics_are_refused(fact, words):
+    with pytest.raises(ValueError, match=words):
+        Imaging(**fact)
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="images are"):
+        seen(IDENTITY, np.zeros((1, 7)), SHAPE)
+    with pytest.raises(ValueError, match="up to 4096 pixels"):
+        operator(IDENTITY, (65, 64))
+    with pytest.raises(ValueError, match="flat field is"):
+        met(Imaging(flat=np.ones((2, 2))), np.zeros((1, 108)), SHAPE)
