@@ -6,8 +6,8 @@ of their log, which is the recorded one when nothing has changed, and how far th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.dark_guard import recorded_guard
-from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.core.decision import DECISION_DTYPE, Decision
 from pans.runtime.core.follower import Follower, Place
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
@@ -31,13 +31,22 @@ from pans.runtime.wire.messages import MalformedMessage, unpack_body
 
 from .log import LogEncoder
 from .parts import place_of
-from .pictures import PictureLog
 from .recording import Recording
 from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device
 
 SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
 _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
+
+
+class Asked(Protocol):
+    """What stands between the core and its back end in a replay, and is told of the decisions: `PictureLog`, or refit's `ClickLog`."""
+
+    def over(self, decider: Decider) -> Decider:
+        """Return the back end that the core is to ask."""
+
+    def note(self, decisions: Sequence[Decision]) -> None:
+        """Take the decisions in their order."""
 
 
 class Replayed(NamedTuple):
@@ -59,8 +68,8 @@ class Replayed(NamedTuple):
         return max(0, self.decisions - self.recorded)
 
 
-def replay(recording: Recording, bundle: Bundle, pictures: PictureLog | None = None) -> Replayed:
-    """Decide `recording` again with `bundle`; `pictures` collects those given back."""
+def replay(recording: Recording, bundle: Bundle, pictures: Asked | None = None) -> Replayed:
+    """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked."""
     if never_armed(recording):
         return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True)
     core, log = _replayed(recording, bundle, pictures)
@@ -73,7 +82,7 @@ def replay(recording: Recording, bundle: Bundle, pictures: PictureLog | None = N
 class _Log:
     """The log of a replay; `sha256_as_far` is its hash after as many decisions as are recorded, "" while there are fewer."""
 
-    def __init__(self, n_recorded: int, pictures: PictureLog | None) -> None:
+    def __init__(self, n_recorded: int, pictures: Asked | None) -> None:
         self.decisions = 0
         self.sha256_as_far = ""
         self._n_recorded, self._pictures = n_recorded, pictures
@@ -108,7 +117,7 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
     return replayed_figures(core, recording.events()), core.matcher.confusion
 
 
-def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None) -> tuple[Core | FlowCore, _Log]:
+def _replayed(recording: Recording, bundle: Bundle, pictures: Asked | None) -> tuple[Core | FlowCore, _Log]:
     """Drive a core through `recording`; return it and the log of its decisions."""
     core, steps, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
@@ -124,7 +133,7 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: PictureLog | None)
 
 
 def _rebuilt(
-    recording: Recording, bundle: Bundle, pictures: PictureLog | None
+    recording: Recording, bundle: Bundle, pictures: Asked | None
 ) -> tuple[Core | FlowCore, BulkSteps | None, Sent]:
     """Return the core of the run, its compiled steps where they give all that is asked for, and what the device was sent.
 

@@ -1,0 +1,275 @@
+"""The clicks behind each decision of recordings, and what the object was.
+
+Owns the way from recordings to arrays: each is decided again, and its clicks are noted as the back end is asked. Decisions without
+trustworthy clicks (a gap, a wrong pattern, changed dark counts) are left out. Never fits anything.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.container import MIB, open_regular
+from pans.runtime.core.decision import Decision, DecisionFlag
+from pans.runtime.decide.verdict import Decider, Verdict
+from pans.runtime.errors import DamagedFileError, UsageError
+from pans.runtime.record import Recording, read_recording, replay
+from pans.runtime.record.parts import is_of_parts, parts_in
+from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
+
+from .labels import Labels
+
+_ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
+_TRUSTED = DecisionFlag.ABSTAINED | _ASKED
+
+
+class ClickLog:
+    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
+
+    def __init__(self) -> None:
+        self._decider: Decider | None = None
+        self.counts: list[NDArray[np.int64]] = []
+        self.decisions: list[Decision] = []
+        self.shots = 1
+
+    def over(self, decider: Decider) -> Decider:
+        """Return the back end that the core is to ask."""
+        self._decider = decider
+        self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
+        return self
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """As `Decider`."""
+        self.counts.append(counts.copy())
+        self.shots = shots
+        return self._back_end.decide(counts, shots)
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """As `Decider`."""
+        return self._back_end.scores_batch(counts, shots)
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """As `Decider`."""
+        return self._back_end.decide_batch(counts, shots)
+
+    def note(self, decisions: Sequence[Decision]) -> None:
+        """Take the decisions in their order: those that were asked for, in the order of asking."""
+        self.decisions += [
+            one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(_ASKED)
+        ]
+
+    @property
+    def _back_end(self) -> Decider:
+        assert self._decider is not None
+        return self._decider
+
+
+class Light(NamedTuple):
+    """Means per decision that a run's summary told, nan where it did not know."""
+
+    photons: float
+    illumination: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Labelled:
+    """Decisions with a known truth, of all recordings; `left_out` counts the others by why."""
+
+    counts: NDArray[np.int64]  # (n, d_f): clicks per pattern, or of a walk its click word
+    truth: NDArray[np.int64]  # (n,)
+    thing: NDArray[np.int64]  # (n,): the object; the same number in two decisions is the same object
+    shots: int
+    sources: tuple[dict[str, Any], ...]  # of the provenance: name, SHA-256 and decisions of each recording
+    simulated: bool
+    left_out: dict[str, int]
+    light: Light
+
+
+class _Read(NamedTuple):
+    path: Path
+    sha256: str
+    recording: Recording
+    log: ClickLog
+    cycle: int  # objects after which the scene starts over; 0: never, or it is not known
+    scene: str  # of that many objects; recordings of one scene show the same ones
+
+    def place(self, decision: Decision) -> int:
+        """Return the object's number in its scene."""
+        return decision.object % self.cycle if self.cycle else decision.object
+
+
+def labelled_clicks(
+    bundle: Bundle, bundle_sha256: str, paths: Sequence[Path], labels: Labels | None, cycle: int = 0
+) -> Labelled:
+    """Return the labelled decisions in recordings of `bundle`, files or folders of parts; truths are those of `labels`, or the marks'.
+
+    `cycle` says after how many objects the scene starts over: object k and k + cycle are one. A simulated scene says it itself. UsageError
+    for recordings of another bundle, of moving objects, twice the same one, or without a label; DamagedFileError for damage.
+    """
+    files = [part for path in paths for part in (parts_in(path) if is_of_parts(path) else [path])]
+    read = [_read(path, bundle, bundle_sha256, cycle) for path in files]
+    _demand_different(read)
+    _demand_same_shots(read)
+    if labels is not None:
+        _check_named(labels, read)
+    truths, things, counts, sources = [], [], [], []
+    of_one_scene = labels is None or not labels.names_recordings
+    numbers: dict[tuple[str, int], int] = {}
+    left_out = {"without a label": 0, "not trusted": 0}
+    for one in read:
+        scene = one.scene if one.cycle and of_one_scene else one.sha256
+        known = _truths(one, labels, alone=len(read) == 1)
+        taken = 0
+        for words, decision, truth in zip(one.log.counts, one.log.decisions, known, strict=True):
+            if decision.flags & ~int(_TRUSTED):
+                left_out["not trusted"] += 1
+            elif truth is None:
+                left_out["without a label"] += 1
+            else:
+                taken += 1
+                counts.append(words)
+                truths.append(truth)
+                things.append(numbers.setdefault((scene, one.place(decision)), len(numbers)))
+        sources.append({"name": one.path.name, "sha256": one.sha256, "decisions": taken})
+    if not truths:
+        raise UsageError(
+            "no decision has a label" + "".join(f", {n} are {why}" for why, n in left_out.items() if n),
+            remedy="name the objects' classes with --labels FILE.csv (a simulated scene with labels names them itself)",
+        )
+    _demand_one_truth(truths, things, [place for _, place in numbers])
+    return Labelled(
+        np.stack(counts), np.array(truths), np.array(things), read[0].log.shots, tuple(sources),
+        any(one.recording.simulated for one in read), left_out, _light(read),
+    )  # fmt: skip
+
+
+def _read(path: Path, bundle: Bundle, bundle_sha256: str, cycle: int) -> _Read:
+    recording = read_recording(path)
+    found = recording.header.get("bundle_sha256")
+    if found != bundle_sha256:
+        raise UsageError(
+            f"{path}: recorded with another bundle (SHA-256 {ascii(found)[1:13]}..., {bundle.name} has {bundle_sha256[:12]}...)",
+            remedy="refit the bundle that the recording was made with",
+        )
+    config = recording.header.get("config")
+    if isinstance(config, dict) and ("flow" in config or config.get("confidence")):
+        what = "objects flow past" if "flow" in config else "walks end early (--confidence)"
+        raise UsageError(f"{path}: {what} in this run", remedy="record objects that stand still, without --confidence")
+    log = ClickLog()
+    found_again = replay(recording, bundle, log)
+    if not found_again.as_recorded or len(log.counts) != len(log.decisions):
+        raise DamagedFileError(
+            f"{path}: its clicks do not give its decisions again", remedy="see `pans replay` and `pans verify`"
+        )
+    objects, scene = (cycle, "") if cycle else _scene_of(recording)
+    return _Read(path, _sha256(path), recording, log, objects, scene)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open_regular(path) as file:
+        while part := file.read(MIB):
+            digest.update(part)
+    return digest.hexdigest()
+
+
+def _scene_of(recording: Recording) -> tuple[int, str]:
+    """Return how many objects a simulated scene says that it has, and its name; (0, "") where no device says so."""
+    for _, body in recording.answers():
+        try:
+            frame = unpack_body(body)
+            if frame.type == MessageType.WELCOME:
+                facts = decode_welcome(frame.payload).facts
+                objects = facts.get("objects", 0)
+                return (objects, str(facts.get("scene", ""))) if isinstance(objects, int) and objects > 0 else (0, "")
+        except MalformedMessage:
+            continue
+    return 0, ""
+
+
+def _demand_different(read: Iterable[_Read]) -> None:
+    seen: dict[str, Path] = {}
+    for one in read:
+        before = seen.setdefault(one.sha256, one.path)
+        if before is not one.path:
+            raise UsageError(f"{one.path}: the same recording as {before}", remedy="name each recording once")
+
+
+def _demand_same_shots(read: Sequence[_Read]) -> None:
+    shots = {one.log.shots for one in read if one.log.counts}
+    if len(shots) > 1:
+        raise UsageError(f"recordings with {sorted(shots)} shots per decision", remedy="refit each --shots by itself")
+
+
+def _check_named(labels: Labels, read: Sequence[_Read]) -> None:
+    """Every label belongs to an object that was recorded, and every recording has labels."""
+    if not labels.names_recordings:
+        if len(read) > 1 and not all(one.cycle for one in read):
+            raise UsageError(
+                f"labels by object alone for {len(read)} recordings",
+                remedy="add a column `recording` with the file's name, or say with --cycle after how many objects the scene starts over",
+            )
+        recorded = {one.place(decision) for one in read for decision in one.log.decisions}
+        _demand_recorded(labels.by_recording[""], recorded, "the recordings")
+        return
+    names = [one.path.name for one in read]
+    for name in labels.by_recording:
+        if names.count(name) != 1:
+            raise UsageError(f"labels of {ascii(name)[:60]}, which {names.count(name)} of the recordings are called")
+    for one in read:
+        if one.path.name not in labels.by_recording:
+            raise UsageError(f"{one.path}: no labels for this recording", remedy="label it, or leave it out")
+        _demand_recorded(labels.by_recording[one.path.name], {one.place(d) for d in one.log.decisions}, str(one.path))
+
+
+def _demand_recorded(labelled: Iterable[int], recorded: set[int], where: str) -> None:
+    unknown = sorted(set(labelled) - recorded)
+    if unknown:
+        raise UsageError(
+            f"labels for {len(unknown)} objects that {where} do not have, object {unknown[0]} first",
+            remedy="number the objects from 0 in the order in which they passed",
+        )
+
+
+def _truths(one: _Read, labels: Labels | None, *, alone: bool) -> list[int | None]:
+    if labels is None:
+        return [decision.truth if decision.truth >= 0 else None for decision in one.log.decisions]
+    mine = labels.by_recording[one.path.name if labels.names_recordings else ""]
+    places = [one.place(decision) for decision in one.log.decisions]
+    missing = sorted({place for place in places if place not in mine})
+    if missing and (alone or labels.names_recordings):
+        raise UsageError(
+            f"{one.path}: {len(missing)} objects are not in the labels, object {missing[0]} first",
+            remedy="add their lines, with an empty label where it is unknown: those are left out",
+        )
+    return [mine.get(place) for place in places]
+
+
+def _demand_one_truth(truths: list[int], things: list[int], places: list[int]) -> None:
+    known: dict[int, int] = {}
+    for truth, thing in zip(truths, things):
+        if known.setdefault(thing, truth) != truth:
+            raise UsageError(
+                f"object {places[thing]} is once of class {known[thing]}, once of class {truth}",
+                remedy="correct the labels, or --cycle: after how many objects the scene starts over",
+            )
+
+
+def _light(read: Sequence[_Read]) -> Light:
+    """Means over the decisions of what the summaries say."""
+    weights = np.array([float(len(one.log.counts)) for one in read])
+
+    def mean(*names: str) -> float:
+        told = [next((s[name] for name in names if s.get(name) is not None), None) for s in summaries]
+        numbers = [float(value) if isinstance(value, int | float) else np.nan for value in told]
+        return float(np.average(numbers, weights=weights)) if weights.sum() else float("nan")
+
+    summaries = [one.recording.summary for one in read]
+    return Light(mean("photons_mean"), mean("illumination_mean", "illumination"))

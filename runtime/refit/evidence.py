@@ -1,0 +1,92 @@
+"""Labelled clicks as numbers: which row of scores each decision came to, what the object was, and which decisions share an object.
+
+Owns the weights (each object counts once, however often it was shown), the folds and the losses per object; never fits and never reads a
+file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Decisions with a known truth. A *row* is a click word, a vector of counts or a node: decisions of one row have the same scores."""
+
+    scores: F64  # (rows, classes): of the old back end, as logarithms
+    clicks: F64  # (rows, features): click means of fixed patterns; (rows, 0) of nodes
+    row: I64  # (n,)
+    truth: I64  # (n,)
+    thing: I64  # (n,): the object, 0..objects-1; an object has one truth
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes."""
+        return int(self.scores.shape[1])
+
+    @cached_property
+    def n_objects(self) -> int:
+        """Number of objects."""
+        return int(self.thing.max()) + 1
+
+    @cached_property
+    def shown(self) -> I64:
+        """How many decisions there are of each object, (objects,)."""
+        return np.bincount(self.thing, minlength=self.n_objects)
+
+    @cached_property
+    def classes(self) -> I64:
+        """The truth of each object, (objects,)."""
+        found = np.zeros(self.n_objects, np.int64)
+        found[self.thing] = self.truth
+        return found
+
+    def counts(self, chosen: NDArray[np.bool_]) -> F64:
+        """Return how often each class came to each row, (rows, classes), over the objects `chosen` (objects,), each with weight 1."""
+        taken = chosen[self.thing]
+        found = np.zeros(self.scores.shape)
+        np.add.at(found, (self.row[taken], self.truth[taken]), 1.0 / self.shown[self.thing[taken]])
+        return found
+
+    def losses(self, scores: F64) -> tuple[F64, F64]:
+        """Return the log loss and the share of right decisions of each object, (objects,), by other `scores` of the rows."""
+        logs = log_softmax(scores)
+        loss = -logs[self.row, self.truth]
+        right = (logs.argmax(axis=1)[self.row] == self.truth).astype(np.float64)
+        return self._per_object(loss), self._per_object(right)
+
+    def folds(self, n_folds: int, chosen: NDArray[np.bool_], rng: np.random.Generator) -> I64:
+        """Return the fold of each object, (objects,), -1 outside `chosen`; the classes are spread evenly over the folds."""
+        fold = np.full(self.n_objects, -1, np.int64)
+        objects = rng.permutation(np.flatnonzero(chosen))
+        objects = objects[np.argsort(self.classes[objects], kind="stable")]
+        fold[objects] = np.arange(len(objects)) % n_folds
+        return fold
+
+    def _per_object(self, values: F64) -> F64:
+        return np.bincount(self.thing, values, self.n_objects) / self.shown
+
+
+def evidence_of(
+    scores: NDArray[Any], clicks: NDArray[Any], row: NDArray[Any], truth: NDArray[Any], thing: NDArray[Any]
+) -> Evidence:
+    """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
+    wide = np.asarray(scores, np.float64)
+    _, numbers = np.unique(thing, return_inverse=True)
+    centred = wide - wide.mean(axis=1, keepdims=True)
+    return Evidence(centred, np.asarray(clicks, np.float64), row.astype(np.int64), truth.astype(np.int64), numbers)
+
+
+def log_softmax(scores: F64) -> F64:
+    """Return the logarithms of the class probabilities of scores (n, classes), float64."""
+    moved = scores - scores.max(axis=1, keepdims=True)
+    moved -= np.log(np.exp(moved).sum(axis=1, keepdims=True))
+    return moved

@@ -1,0 +1,157 @@
+"""A correction of scores that is linear in what is known of a decision: the old scores and the clicks.
+
+    new score = old score + bias + A (old score) + B (clicks)
+
+A and B are zero where the instrument is the one that the bundle was made for. A change of the click rates of class c, from p to p' under
+pattern i, changes the log likelihood of independent clicks by exactly a term linear in them: B has its place there. Each block (bias, A, B)
+has a Gaussian prior around zero; its width is that of greatest marginal likelihood, by Laplace's approximation (D. MacKay, "Bayesian
+interpolation", Neural Computation 4, 415, 1992), so that what was seen decides how far the correction goes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .evidence import F64, I64, log_softmax
+
+BLOCKS = ("bias", "scores", "clicks")
+PRECISION_RANGE = (1e-2, 1e6)  # of a prior: a score moves by 10 at the one end and by a thousandth at the other
+_FIRST_PRECISION = 10.0
+_ROUNDS, _STEPS, _LAST_STEPS = 12, 4, 30  # of the prior's width; Newton steps in a round, and at the end
+_SETTLED = 0.05  # change of the logarithm of a precision that ends the search
+_FLAT = 1e-9  # variance of a feature that says nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """`gain` (features, classes) and `offset` (classes,): added to the scores are `features @ gain + offset`."""
+
+    blocks: tuple[str, ...]
+    gain: F64
+    offset: F64
+    precision: F64  # of the prior of each block, for standardised features
+
+    def apply(self, scores: F64, clicks: F64) -> F64:
+        """Return the corrected scores of centred `scores` (n, classes) and `clicks` (n, d_f)."""
+        return scores + _raw_features(self.blocks, scores, clicks) @ self.gain + self.offset
+
+
+class _Standard(NamedTuple):
+    """Features of mean 0 and variance 1 over what was seen, the bias first; `block` is the number of each one's block."""
+
+    features: F64
+    mean: F64
+    scale: F64
+    block: I64
+
+
+class Prior(NamedTuple):
+    """What a fit begins with, and leaves to one on nearly the same data: precisions (blocks,) and weights (1 + features, classes)."""
+
+    precision: F64
+    weights: F64
+
+
+def fit(
+    blocks: tuple[str, ...], scores: F64, clicks: F64, counts: F64, prior: Prior | None = None
+) -> tuple[Correction, Prior]:
+    """Fit the `blocks` to `counts` (rows, classes) of rows with `scores` and `clicks`; `prior` fixes the precisions."""
+    standard = _standardised(blocks, scores, clicks, counts)
+    if prior is None:
+        prior = _widest_likelihood(standard, scores, counts)
+    weights, _ = _maximised(standard, scores, counts, prior, _LAST_STEPS)
+    gain = weights[1:] / standard.scale[:, None]
+    return Correction(blocks, gain, weights[0] - standard.mean @ gain, prior.precision), Prior(prior.precision, weights)
+
+
+def n_parameters(blocks: tuple[str, ...], n_classes: int, n_clicks: int) -> int:
+    """Return how many numbers a correction has."""
+    sizes = {"bias": 1, "scores": n_classes, "clicks": n_clicks}
+    return n_classes * sum(sizes[block] for block in blocks)
+
+
+def _raw_features(blocks: tuple[str, ...], scores: F64, clicks: F64) -> F64:
+    parts = {"scores": scores, "clicks": clicks}
+    chosen = [parts[block] for block in blocks if block != "bias"]
+    return np.concatenate(chosen, axis=1) if chosen else np.zeros((len(scores), 0))
+
+
+def _standardised(blocks: tuple[str, ...], scores: F64, clicks: F64, counts: F64) -> _Standard:
+    raw = _raw_features(blocks, scores, clicks)
+    weight = counts.sum(axis=1) / counts.sum()
+    mean = weight @ raw
+    variance = weight @ (raw - mean) ** 2
+    scale = np.where(variance > _FLAT, np.sqrt(variance + _FLAT), np.inf)  # what never varies keeps a gain of 0
+    features = np.concatenate([np.ones((len(raw), 1)), (raw - mean) / scale], axis=1)
+    sizes = {"bias": 1, "scores": scores.shape[1], "clicks": clicks.shape[1]}
+    block = np.repeat(np.arange(len(blocks)), [sizes[name] for name in blocks])
+    return _Standard(features, mean, scale, block)
+
+
+def _widest_likelihood(standard: _Standard, scores: F64, counts: F64) -> Prior:
+    """Return the precisions of greatest marginal likelihood, and the weights there."""
+    n_blocks, n_classes = int(standard.block.max()) + 1, counts.shape[1]
+    found = Prior(np.full(n_blocks, _FIRST_PRECISION), np.zeros((len(standard.block), n_classes)))
+    for _ in range(_ROUNDS):
+        weights, hessian = _maximised(standard, scores, counts, found, _STEPS)
+        variance = np.diag(np.linalg.inv(hessian)).reshape(weights.shape)
+        precision = np.empty(n_blocks)
+        for block in range(n_blocks):
+            of_block = standard.block == block
+            measured = of_block.sum() * n_classes - found.precision[block] * variance[of_block].sum()
+            precision[block] = max(measured, _FLAT) / max((weights[of_block] ** 2).sum(), _FLAT)
+        precision = precision.clip(*PRECISION_RANGE)
+        settled = np.abs(np.log(precision / found.precision)).max() < _SETTLED
+        found = Prior(precision, weights)
+        if settled:
+            break
+    return found
+
+
+def _maximised(standard: _Standard, scores: F64, counts: F64, prior: Prior, steps: int) -> tuple[F64, F64]:
+    """Return the weights of greatest posterior density by Newton's method, from the prior's, and the Hessian of the last step."""
+    features, weights = standard.features, prior.weights
+    precision = prior.precision[standard.block]
+    total = counts.sum(axis=1)
+
+    def loss_at(weights: F64) -> tuple[float, F64]:
+        logs = log_softmax(scores + features @ weights)
+        return float(-(counts * logs).sum() + 0.5 * (precision[:, None] * weights**2).sum()), logs
+
+    loss, logs = loss_at(weights)
+    hessian = np.zeros((0, 0))
+    for _ in range(steps):
+        chance = np.exp(logs)
+        slope = features.T @ (total[:, None] * chance - counts) + precision[:, None] * weights
+        hessian = _hessian(features, total, chance, precision)
+        step = np.linalg.solve(hessian, slope.ravel()).reshape(weights.shape)
+        wanted, length = float((step * slope).sum()), 1.0
+        after, logs_after = loss_at(weights - step)
+        while after > loss - 1e-4 * length * wanted and length > 1e-6:
+            length /= 2
+            after, logs_after = loss_at(weights - length * step)
+        if after >= loss:
+            break
+        weights, gained, loss, logs = weights - length * step, loss - after, after, logs_after
+        if gained < 1e-9 * total.sum():
+            break
+    return weights, hessian
+
+
+def _hessian(features: F64, total: F64, chance: F64, precision: F64) -> F64:
+    n_features, n_classes = features.shape[1], chance.shape[1]
+    found: NDArray[np.float64] = np.zeros((n_features, n_classes, n_features, n_classes))
+    for first in range(n_classes):
+        for second in range(first, n_classes):
+            weight = total * chance[:, first] * ((first == second) - chance[:, second])
+            block = (features * weight[:, None]).T @ features
+            found[:, first, :, second] = block
+            found[:, second, :, first] = block
+    size = n_features * n_classes
+    flat = found.reshape(size, size)
+    flat[np.diag_indices(size)] += np.repeat(precision, n_classes)
+    return flat

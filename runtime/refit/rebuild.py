@@ -1,0 +1,187 @@
+"""From labelled clicks to a refitted bundle: rows and scores of each kind of back end, and the new back end in its place.
+
+Owns what can be corrected in which back end: an automaton's posteriors and a table are corrected number by number, a head in its layers
+(its table is made from it again). Never chooses (choosing.py) and never writes a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.bundle import Automaton, BackEnd, Bundle, Shown, make_bundle
+from pans.runtime.bundle.layers import Layer, quantise_head, read_layers, reference_scores
+from pans.runtime.bundle.model import word_means
+from pans.runtime.bundle.walks import log_scores, walk_nodes
+from pans.runtime.errors import UsageError
+
+from .choosing import Kind, Refitted, choose
+from .clicks import Labelled
+from .evidence import F64, I64, Evidence, evidence_of, log_softmax
+from .onnx_chain import chain_onnx, corrected_layers
+
+_LEAST = 1e-9  # of a posterior, so that no class is ever excluded for good
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The evidence, and what its rows are: leaves, table rows, or (of a head alone) nothing that has a number."""
+
+    evidence: Evidence
+    number: I64  # (rows,)
+    own_posteriors: bool  # whether a row can be corrected by itself
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rebuilt:
+    """The new bundle, and what had to change besides."""
+
+    bundle: Bundle
+    slots_corrected: int  # of an automaton: exposures after which the states' posteriors were corrected too
+    notes: tuple[str, ...]
+
+
+def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
+    """Return the rows that the labelled clicks came to, with the old back end's scores; UsageError for a bundle that has none."""
+    if bundle.picture_shape is not None:
+        raise UsageError(f"{bundle.name} returns pictures", remedy="refit a bundle that decides among classes")
+    if bundle.automaton is not None:
+        leaves = walk_nodes(bundle.automaton, clicks.counts)[:, -1].astype(np.int64)
+        return _rows(log_scores(bundle.automaton.posteriors), None, leaves, clicks, own_posteriors=True)
+    if bundle.table is not None and clicks.shots == 1:
+        words = clicks.counts @ (1 << np.arange(bundle.n_features, dtype=np.int64))
+        bits = word_means(np.arange(len(bundle.table)), bundle.n_features)
+        return _rows(bundle.table, bits, words, clicks, own_posteriors=_layers(bundle) is None)
+    layers = _layers(bundle)
+    if layers is None:
+        raise UsageError(
+            f"the head of {bundle.name} is no plain chain of layers (Gemm, Relu), and there is no table for {clicks.shots} shots",
+            remedy="refit a bundle with a table, on recordings of --shots 1",
+        )
+    vectors, row = np.unique(clicks.counts, axis=0, return_inverse=True)
+    means = vectors / clicks.shots
+    scores = reference_scores(layers, means)
+    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing)
+    return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
+
+
+def _rows(
+    scores: NDArray[Any], means: NDArray[Any] | None, found: I64, clicks: Labelled, *, own_posteriors: bool
+) -> Rows:
+    """The rows that were seen, of `scores` (all rows, classes) and click `means` (all rows, d_f), None of nodes."""
+    number, row = np.unique(found, return_inverse=True)
+    seen = np.zeros((len(number), 0)) if means is None else means[number]
+    return Rows(evidence_of(scores[number], seen, row, clicks.truth, clicks.thing), number, own_posteriors)
+
+
+def _layers(bundle: Bundle) -> tuple[Layer, ...] | None:
+    if bundle.head_onnx is None:
+        return None
+    layers = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
+    return None if layers is None or layers[-1].relu else layers
+
+
+def rebuilt(bundle: Bundle, rows: Rows, found: Refitted, clicks: Labelled, provenance: Mapping[str, Any]) -> Rebuilt:
+    """Return `bundle` with what was `found` in place of its back end, and `provenance` beside its own; the old one where nothing was."""
+    facts = {**bundle.provenance, "refit": dict(provenance)}
+    if found.correction is None:
+        return Rebuilt(replace(bundle, provenance=facts), 0, ())
+    if bundle.automaton is not None:
+        automaton, slots = _automaton(bundle.automaton, rows, found, clicks)
+        notes = () if bundle.expected is None else ("the expected figures were the old instrument's, and are left out",)
+        return Rebuilt(_made(bundle, facts, automaton=automaton), slots, notes)
+    layers = _layers(bundle)
+    if layers is None:
+        notes = (
+            ()
+            if bundle.head_onnx is None
+            else ("only the table is refitted: the head is no plain chain, and left out",)
+        )
+        return Rebuilt(_made(bundle, facts, BackEnd(table=_table(bundle, rows, found))), 0, notes)
+    return _with_head(bundle, facts, layers, found)
+
+
+def _with_head(bundle: Bundle, facts: dict[str, Any], layers: tuple[Layer, ...], found: Refitted) -> Rebuilt:
+    assert found.correction is not None
+    new = corrected_layers(layers, found.correction)
+    assert new is not None  # _layers has looked
+    notes, int8 = [], None
+    if bundle.int8_head is not None:
+        try:
+            int8 = quantise_head(new)
+        except ValueError as error:
+            notes.append(f"the head in eight bits is left out: {error}")
+    if bundle.int8_onnx is not None:
+        notes.append("the quantised ONNX model is left out: only the trainer writes it")
+    made = _made(bundle, facts, BackEnd(head_onnx=chain_onnx(new), int8_head=int8))
+    return Rebuilt(made, 0, tuple(notes))
+
+
+def _made(
+    bundle: Bundle, provenance: dict[str, Any], back_end: BackEnd | None = None, automaton: Automaton | None = None
+) -> Bundle:
+    shown = Shown(bundle.levels, bundle.pattern_levels, bundle.photons_per_level)
+    return make_bundle(
+        name=bundle.name,
+        task=bundle.task,
+        classes=bundle.classes,
+        image_shape=bundle.image_shape,
+        optics=shown if bundle.analyser is None else bundle.analyser,
+        provenance=provenance,
+        back_end=back_end,
+        automaton=automaton,
+    )
+
+
+def _table(bundle: Bundle, rows: Rows, found: Refitted) -> F64:
+    """All rows by the correction; those that were seen as they were found."""
+    assert found.correction is not None
+    assert bundle.table is not None
+    wide = bundle.table.astype(np.float64)
+    centred = wide - wide.mean(axis=1, keepdims=True)
+    means = word_means(np.arange(len(wide)), bundle.n_features).astype(np.float64)
+    scores = found.correction.apply(centred, means)
+    scores[rows.number] = found.scores
+    return scores
+
+
+def _automaton(old: Automaton, rows: Rows, found: Refitted, clicks: Labelled) -> tuple[Automaton, int]:
+    """Leaves as they were found; the states of each slot by a correction of their own where that is better."""
+    assert found.correction is not None
+    scores = log_scores(old.posteriors).astype(np.float64)
+    scores -= scores.mean(axis=1, keepdims=True)
+    posteriors = old.posteriors.astype(np.float64)
+    leaves = scores[old.n_states :]
+    posteriors[old.n_states :] = np.exp(log_softmax(found.correction.apply(leaves, np.zeros((len(leaves), 0)))))
+    posteriors[rows.number] = np.exp(log_softmax(found.scores))
+    nodes, corrected = walk_nodes(old, clicks.counts).astype(np.int64), 0
+    for slot in range(old.n_slots):
+        here = np.flatnonzero(old.depth == slot)
+        passed = nodes[:, slot] < old.n_states
+        new = _of_slot(scores, nodes[passed, slot], clicks, passed, here, found.correction.blocks)
+        if new is not None:
+            posteriors[here] = new
+            corrected += 1
+    posteriors = np.maximum(posteriors, _LEAST)
+    posteriors /= posteriors.sum(axis=1, keepdims=True)
+    return Automaton(old.pattern, old.dwell, old.dwell_steps, old.successors, posteriors.astype(np.float32)), corrected
+
+
+def _of_slot(
+    scores: F64, nodes: I64, clicks: Labelled, passed: NDArray[np.bool_], states: I64, blocks: tuple[str, ...]
+) -> F64 | None:
+    if not len(nodes):
+        return None
+    number, row = np.unique(nodes, return_inverse=True)
+    seen = np.zeros((len(number), 0))
+    evidence = evidence_of(scores[number], seen, row, clicks.truth[passed], clicks.thing[passed])
+    found = choose(evidence, (Kind(blocks), Kind(blocks, rows=True)))
+    if found.correction is None:
+        return None
+    new = found.correction.apply(scores[states], np.zeros((len(states), 0)))
+    new[np.searchsorted(states, number)] = found.scores
+    return np.exp(log_softmax(new))

@@ -1,0 +1,130 @@
+"""`pans refit` on recordings of the simulated instrument, whose objects are shifted by a pixel: figures, files and refusals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import json_of
+
+from pans.firmware_sim.scene.still import load_scene
+from pans.runtime import SHIPPED
+from pans.runtime.bundle import load_bundle
+from pans.runtime.cli import main
+from pans.runtime.record import read_recording, replay
+from pans.runtime.refit.clicks import ClickLog, Labelled, labelled_clicks
+from pans.runtime.refit.labels import read_labels
+from pans.runtime.refit.words import words_of
+
+BUNDLE = SHIPPED / "fashion10.pans"
+OBJECTS, TRIALS = 200, 2
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with shifted.npz and run.pansrec, the shipped fixed patterns on it."""
+    found = tmp_path_factory.mktemp("refit")
+    scene = load_scene("fashion200")
+    moved = np.zeros_like(scene.images)
+    moved[:, 1:, 1:] = scene.images[:, :-1, :-1]
+    np.savez(found / "shifted.npz", images=moved, labels=scene.labels, classes=np.array(scene.classes))
+    recorded(found, "run.pansrec", 1)
+    return found
+
+
+def recorded(folder: Path, name: str, seed: int, *more: str) -> Path:
+    device = f"sim:oled-qcmos?scene={folder / 'shifted.npz'}&seed={seed}&pace=fast"
+    many = ("--trials", str(TRIALS), "--decisions", str(OBJECTS * TRIALS), "--no-realtime", "-q")
+    main(["run", str(BUNDLE), "--device", device, *many, "--record", str(folder / name), *more])
+    return folder / name
+
+
+def labels(folder: Path, name: str, skip: int = 0, **changed: str) -> Path:
+    """Write the scene's truth, the first `skip` objects without a line, and the `changed` ones (o3="Bag") as told."""
+    scene = load_scene("fashion200")
+    rows = [f"{number},{changed.get(f'o{number}', scene.classes[label])}" for number, label in enumerate(scene.labels)]
+    (folder / name).write_text("\n".join(["object,label", *rows[skip:]]) + "\n")
+    return folder / name
+
+
+def test_a_refit_is_better_on_clicks_that_it_never_saw(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    new = folder / "new.pans"
+    found = json_of(capsys, "refit", BUNDLE, folder / "run.pansrec", "-o", new)
+    held = found["held_out"]
+    assert (found["objects"], found["decisions"], found["simulated"]) == (OBJECTS, OBJECTS * TRIALS, True)
+    assert found["changed"]
+    assert held["log_loss_gain"]["low"] > 0
+    assert held["accuracy_old"]["value"] == pytest.approx(
+        read_recording(folder / "run.pansrec").summary["accuracy"], abs=1e-9
+    )
+    assert found["clicks_mean"] > 1 < found["photons_mean"] < found["illumination"]
+    assert [row["objects"] for row in found["learning_curve"]] == [20, 40, 80, 160]
+    bundle, sha256 = load_bundle(new)
+    assert sha256 == found["sha256"]
+    told = bundle.provenance["refit"]
+    assert told["recordings"][0]["decisions"] == OBJECTS * TRIALS
+    assert told["from_bundle_sha256"] == load_bundle(BUNDLE)[1]
+    other = read_recording(recorded(folder, "other.pansrec", 2))
+    words = words_of(found)
+    for word in ("SIMULATED", "accuracy", "clicks", "photons", "illumination", "with 400 objects in all"):
+        assert word in words
+    truth = other.decisions()["truth"]
+    right = [(decided(other, one) == truth).mean() for one in (load_bundle(BUNDLE)[0], bundle)]
+    assert right[1] > right[0] + 0.02  # 400 decisions on the same objects, other photons
+
+
+def decided(recording, bundle):
+    log = ClickLog()
+    replay(recording, bundle, log)
+    return np.array([decision.label for decision in log.decisions])
+
+
+def test_labels_from_a_file_are_the_marks(folder: Path) -> None:
+    bundle, sha256 = load_bundle(BUNDLE)
+
+    def read(name: str, **changed: str) -> Labelled:
+        found = read_labels(labels(folder, name, **changed), bundle.classes)
+        return labelled_clicks(bundle, sha256, [folder / "run.pansrec"], found)
+
+    by_file, by_marks = read("truth.csv"), labelled_clicks(bundle, sha256, [folder / "run.pansrec"], None)
+    for name in ("counts", "truth", "thing"):
+        assert np.array_equal(getattr(by_file, name), getattr(by_marks, name))
+    assert by_file.counts.sum(axis=1).tolist() == read_recording(folder / "run.pansrec").decisions()["clicks"].tolist()
+    fewer = read("some.csv", **{f"o{number}": "" for number in range(0, 200, 4)}, o5="Bag", o6="8")
+    assert (len(fewer.truth), len(np.unique(fewer.thing)), fewer.left_out["without a label"]) == (300, 150, 100)
+    assert fewer.truth[[6, 8]].tolist() == [8, 8]  # objects 5 and 6: 1, 2 and 3 were before, twice each
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    found = json_of(capsys, "refit", *words, code=2)
+    return str(found["error"]["message"])
+
+
+def test_what_cannot_be_refitted_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, out = folder / "run.pansrec", folder / "never.pans"
+    assert "another bundle" in refusal(capsys, SHIPPED / "fashion-adaptive.pans", run, "-o", out)
+    assert "same recording" in refusal(capsys, BUNDLE, run, run, "-o", out)
+    assert "is the input" in refusal(capsys, BUNDLE, run, "-o", run)
+    assert "exists already" in refusal(capsys, BUNDLE, run, "-o", folder / "shifted.npz")
+    bad = [
+        (labels(folder, "short.csv", skip=3), "3 objects are not in the labels, object 0 first"),
+        (labels(folder, "range.csv", o7="17"), "range.csv:9: the label is '17', allowed: 0 to 9"),
+        (labels(folder, "none.csv", **{f"o{n}": "" for n in range(200)}), "no object has a label"),
+        (labels(folder, "few.csv", **{f"o{n}": "" for n in range(100)}), "too few labelled objects, allowed: 10"),
+    ]
+    text = (
+        (folder / "truth.csv").read_text() if (folder / "truth.csv").exists() else labels(folder, "t.csv").read_text()
+    )
+    for name, more, said in (
+        ("twice.csv", "5,Bag\n", "twice.csv:202: object 5 has a label already"),
+        ("beyond.csv", "200,Bag\n", "labels for 1 objects that the recordings do not have, object 200"),
+        ("minus.csv", "-1,Bag\n", "minus.csv:202: the object is '-1'"),
+        ("wide.csv", "1,2,3\n", "wide.csv:202: 3 values"),
+    ):
+        (folder / name).write_text(text + more)
+        bad.append((folder / name, said))
+    (folder / "head.csv").write_text("what,ever\n")
+    bad.append((folder / "head.csv", "allowed: object,label or recording,object,label"))
+    for path, said in bad:
+        assert said in refusal(capsys, BUNDLE, run, "--labels", path, "-o", out), path.name
+    assert "is once of class" in refusal(capsys, BUNDLE, run, "--cycle", 7, "-o", out)
+    assert not out.exists()
