@@ -1,14 +1,16 @@
-"""What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures.
+"""What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures; who reaches what.
 
 Owns the pass without gradient over given objects; decisions are those of the machine's class counts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 
+from .grow import sum_of
 from .machine import Machine, Sight, forward
 from .objects import Block
 
@@ -50,3 +52,20 @@ def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
                 dtype=torch.float64,
             )
     return Figures(*(sums / n).tolist())
+
+
+def masses(machine: Machine, sight: Sight, blocks: list[Block]) -> list[torch.Tensor]:
+    """Return how often every state is reached by the objects in `blocks`, (states,) per level."""
+    with torch.no_grad():
+        passes = [forward(machine, sight, block.grey) for block in blocks]
+        levels = range(len(machine.levels))
+        return [sum_of(passed.steps[level].alpha.sum(dim=1) for passed in passes) for level in levels]
+
+
+def mean_objects(machine: Machine, sight: Sight, blocks: list[Block]) -> Iterator[torch.Tensor]:
+    """Yield level by level the mean transmission of the objects that reach a state, (states, pixels)."""
+    passes = [forward(machine, sight, block.grey) for block in blocks]
+    for level in range(len(machine.levels)):
+        alphas = [passed.steps[level].alpha for passed in passes]
+        sums = sum_of(sight.mask_slope(alpha, block.grey) for alpha, block in zip(alphas, blocks))
+        yield sums / sum_of(alpha.sum(dim=1, keepdim=True) for alpha in alphas).clamp(min=1e-9)

@@ -33,11 +33,12 @@ class Rerouted:
     stopped: int = 0
 
 
-class _Sweep:
+class Sweep:
     """What a sweep keeps of every block: probability and light of all states, and the expected loss behind the present level."""
 
     def __init__(self, machine: Machine, sight: Sight, blocks: list[Block]) -> None:
         self.machine, self.sight, self.blocks = machine, sight, blocks
+        self.n_states = sum(level.n_states for level in machine.levels)
         counted = sum(float(counts.sum()) for counts in machine.counts)
         self.scale = counted / sum(len(block) for block in blocks)  # the sweep may be over a part of the objects
         self.kept: list[list[tuple[Tensor, Tensor]]] = []
@@ -100,7 +101,7 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, e
     With an `exposure_price` an edge may end the walk: it goes to a new leaf where to decide at once costs less than what follows.
     """
     with torch.no_grad():
-        sweep = _Sweep(machine, sight, blocks)
+        sweep = Sweep(machine, sight, blocks)
         moved = revived = stopped = 0
         saved = 0.0
         for number in range(len(machine.levels) - 1, -1, -1):
@@ -123,7 +124,7 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, e
 
 
 def _stop(
-    machine: Machine, number: int, sweep: _Sweep, cost: Tensor, arrived: Tensor, error: Tensor
+    machine: Machine, number: int, sweep: Sweep, cost: Tensor, arrived: Tensor, error: Tensor
 ) -> tuple[int, float]:
     """Give edges leaves of their own where that costs less than `cost`; all (2, states). Returns how many, and what is saved.
 

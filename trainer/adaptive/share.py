@@ -1,46 +1,85 @@
 """Few patterns for many states: one-bit patterns are grouped, and the states of a group show one pattern, each with its own brightness.
 
-Owns the grouping (k-means on the parameters of the pixels, weighted by how often a state is reached) and the pool that takes the place of
-the states' own patterns; the pool is trained on like any other parameters.
+Owns the grouping (k-means on the directions of the patterns, weighted by how often a state is reached), the pool that takes the place of
+the states' own patterns and is trained on like any other parameters, and the sweep in which every state takes the pattern and brightness
+of the pool that cost its objects least (the improvement step of reroute.py, over patterns instead of edges).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from .light import BRIGHTNESS_MIN, Bits
-from .machine import Machine
+from .machine import OUTCOMES, Machine, Sight
+from .objects import Block
+from .outcomes import no_click
+from .reroute import Sweep
 
 ROUNDS = 12  # of k-means
-LEAN_MAX = 1.0  # what a pixel counts at most, so that a few pixels do not decide
+NEAREST = 48  # patterns of the pool that a state tries, the most alike
+BRIGHTER = (0.6, 0.8, 1.0, 1.25, 1.6)  # times the brightness that keeps the light as it was
+HARDLY = 1e-3  # chance to reach a state, below which an object is left out of that state's choice
+GLARE = 1e-3  # of the price of a detected photoelectron, what one sent out costs: else a bright spot where hardly anything is would do
+SURE = 1e-4  # of a state's cost, by which another pattern must be better
 
 
 def share_patterns(
-    machine: Machine, wanted: int, masses: list[Tensor], mean_object: Tensor, random: torch.Generator
+    machine: Machine, wanted: int, masses: list[Tensor], own: list[Tensor], random: torch.Generator
 ) -> None:
     """Let all states of `machine` show at most `wanted` patterns; `masses` (states,) per level say how often a state is reached.
 
-    The light on `mean_object` (pixels,) stays as it was. Nothing happens where there are no more states than that.
+    The light on `own`, the mean object of every state (states, pixels) per level, stays as it was. Nothing happens where there are no
+    more states than that.
     """
-    lights = [level.light for level in machine.levels]
-    bits = [light for light in lights if isinstance(light, Bits)]
-    leans = torch.cat([light.own() for light in bits])
-    if len(bits) < len(lights) or len(leans) <= wanted:
+    bits = [level.light for level in machine.levels if isinstance(level.light, Bits)]
+    masks = torch.cat([light.shown()[0] for light in bits])
+    if len(bits) < len(machine.levels) or len(masks) <= wanted:
         return
     weights = torch.cat(masses).clamp(min=1e-9)
-    group = k_means(leans.clamp(-LEAN_MAX, LEAN_MAX), weights, wanted, random)
-    pool = torch.zeros(wanted, leans.shape[1]).index_add_(0, group, leans * weights.unsqueeze(1))
-    pool = pool / torch.zeros(wanted).index_add_(0, group, weights).clamp(min=1e-30).unsqueeze(1)
-    first = 0
-    for light in bits:
-        before = light.shown()[0] @ mean_object
-        light.rows, light.lean = group[first : first + len(light.log_light)], pool
-        first += len(light.rows)
-        after = (light.shown()[0] @ mean_object).clamp(min=BRIGHTNESS_MIN)
-        if len(light.log_light) == len(light.rows):
-            light.log_light += (before.clamp(min=BRIGHTNESS_MIN) / after).log().unsqueeze(1)
+    points = directions(masks)
+    group = k_means(points, weights, wanted, random)
+    sums = torch.zeros(wanted, masks.shape[1], dtype=masks.dtype).index_add_(0, group, points * weights.unsqueeze(1))
+    pool, first = one_bit(sums), 0
+    for light, mean in zip(bits, own):
+        before = light.shown()[0]
+        light.rows, light.lean = group[first : first + len(before)], pool
+        first += len(before)
+        if not one_brightness(bits):
+            _keep_light(light, (before * mean).sum(dim=1), mean)
         light.settle()
+
+
+def one_brightness(lights: list[Bits]) -> bool:
+    """Return whether all levels share one brightness."""
+    return len(lights) > 1 and lights[0].log_light is lights[1].log_light
+
+
+def directions(masks: Tensor) -> Tensor:
+    """Return patterns (n, pixels) as vectors of length 1: two that differ in brightness alone are one direction; dark ones stay 0."""
+    return masks / masks.square().sum(dim=1, keepdim=True).sqrt().clamp(min=1e-9)
+
+
+def one_bit(sums: Tensor) -> Tensor:
+    """Return the parameters (lit above 0) of the one-bit patterns that point most nearly along `sums`, (n, pixels), none below 0.
+
+    Of the brightest k pixels the cosine with the sum is their part of it over the square root of k: the best k is taken. A mean of the
+    parameters themselves would leave few pixels lit, or none, where the patterns of a group differ.
+    """
+    values, _ = sums.sort(dim=1, descending=True)
+    number = torch.arange(1, sums.shape[1] + 1, dtype=sums.dtype)
+    best = (values.cumsum(dim=1) / number.sqrt()).argmax(dim=1, keepdim=True)
+    last = values.gather(1, best)
+    following = torch.where(best + 1 < sums.shape[1], values.gather(1, (best + 1).clamp(max=sums.shape[1] - 1)), 0.0)
+    return (sums - (last + following) / 2) / values[:, :1].clamp(min=1e-30)
+
+
+def _keep_light(light: Bits, before: Tensor, mean: Tensor) -> None:
+    """Set the brightness so that the light on the mean objects is `scale * before` again, (states,)."""
+    after = (light.shown()[0] * mean).sum(dim=1).clamp(min=BRIGHTNESS_MIN)
+    light.log_light += (before.clamp(min=BRIGHTNESS_MIN) / after).log().unsqueeze(1)
 
 
 def k_means(points: Tensor, weights: Tensor, wanted: int, random: torch.Generator) -> Tensor:
@@ -50,7 +89,7 @@ def k_means(points: Tensor, weights: Tensor, wanted: int, random: torch.Generato
     for _ in range(ROUNDS):
         distance = centres.square().sum(dim=1) - 2 * points @ centres.T
         least, group = distance.min(dim=1)
-        mass = torch.zeros(wanted).index_add_(0, group, weights)
+        mass = torch.zeros(wanted, dtype=points.dtype).index_add_(0, group, weights)
         sums = torch.zeros_like(centres).index_add_(0, group, points * weights.unsqueeze(1))
         centres = torch.where(mass.unsqueeze(1) > 0, sums / mass.clamp(min=1e-30).unsqueeze(1), centres)
         empty = (mass == 0).nonzero().flatten()
@@ -58,3 +97,118 @@ def k_means(points: Tensor, weights: Tensor, wanted: int, random: torch.Generato
             error = (least + points.square().sum(dim=1)) * weights
             centres[empty] = points[error.topk(len(empty)).indices]
     return group
+
+
+# ---- which pattern of the pool a state shows ----
+
+
+@dataclass(frozen=True, slots=True)
+class _Pool:
+    """What a state can choose: `light` of every pattern on the objects (patterns, objects), the pixels that each lights (patterns,), which
+    patterns are most like which, the pattern itself first (patterns, tried), and by what the brightness may change.
+    """
+
+    light: Tensor
+    lit: Tensor
+    near: Tensor
+    factors: Tensor
+
+
+def choose_patterns(
+    machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0
+) -> int:
+    """Let every state show the pattern of the pool, and have the brightness, that cost the objects in `blocks` least; return how many
+    states changed. `price` is that of a photoelectron. From the last level to the first, so that the expected cost falls with every
+    change. Patterns that nothing shows afterwards become copies of those that are shown most, and take half of their states.
+    """
+    lights = [level.light for level in machine.levels]
+    pooled = [light for light in lights if isinstance(light, Bits) and light.rows is not None]
+    if len(pooled) < len(lights) or len(machine.levels[0].successors) != OUTCOMES:
+        return 0
+    with torch.no_grad():
+        sweep = Sweep(machine, sight, blocks)
+        pool = _pool_of(pooled, sight, blocks)
+        changed, reached = 0, []
+        for number in range(len(lights) - 1, -1, -1):
+            alphas = torch.cat([kept[number][0] for kept in sweep.kept], dim=1).float()
+            reached.append(alphas.sum(dim=1))
+            changed += _choose(pooled[number], number, sweep, alphas, pool, price)
+            sweep.step_back(number, price, exposure_price)
+        _use_all(pooled, reached[::-1])
+    return changed
+
+
+def _pool_of(pooled: list[Bits], sight: Sight, blocks: list[Block]) -> _Pool:
+    mask = torch.gt(pooled[0].lean, 0).to(sight.sums)
+    alike = directions(mask)
+    near = (alike @ alike.T).fill_diagonal_(2.0).topk(min(NEAREST, len(mask)), dim=1).indices
+    light = torch.cat([sight.light(mask, block.grey) for block in blocks], dim=1)
+    factors = (1.0,) if one_brightness(pooled) else BRIGHTER
+    return _Pool(light, mask.sum(dim=1), near, torch.tensor(factors, dtype=light.dtype))
+
+
+def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool, price: float) -> int:
+    """Choose for all states of one level, reached with `alphas` (states, objects); returns how many changed."""
+    assert light.rows is not None
+    to = sweep.machine.levels[number].successors
+    gains = torch.cat([beta[to[0]] - beta[to[1]] for beta in sweep.betas], dim=1)  # what no click costs more
+    changed, before = 0, light.scale().flatten().clone()
+    for state in range(len(light.rows)):
+        some = (alphas[state] > HARDLY).nonzero().flatten()
+        if not len(some):
+            continue
+        candidates = pool.near[light.rows[state]]
+        seen, alpha = pool.light[candidates][:, some], alphas[state, some]
+        bright = _brightness(seen @ alpha, before[state], pool.factors).clamp(light.bottom, light.top)
+        lights = seen.unsqueeze(1) * bright.unsqueeze(2)  # (candidates, factors, objects)
+        sent = GLARE * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
+        dark, _ = no_click(lights, sweep.sight.law)
+        costs = dark @ (alpha * gains[state, some]) + price * (lights @ alpha + sent)
+        best = int(costs.argmin())
+        if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE * alpha.sum():
+            light.rows[state] = candidates[best // len(pool.factors)]
+            if len(pool.factors) > 1:
+                light.log_light[state] = bright.flatten()[best].log()
+            changed += 1
+    _keep_new_light(light, number, sweep, pool)
+    return changed
+
+
+def _brightness(mean: Tensor, now: Tensor, factors: Tensor) -> Tensor:
+    """Return what to try, (candidates, factors): about the brightness that keeps the light; the same where all states share one."""
+    keeping = mean[0] / mean.clamp(min=1e-9) * now if len(factors) > 1 else now.expand(len(mean))
+    return keeping.unsqueeze(1) * factors
+
+
+def _keep_new_light(light: Bits, number: int, sweep: Sweep, pool: _Pool) -> None:
+    """Let the sweep step back with the light that the new patterns bring."""
+    first = 0
+    for kept in sweep.kept:
+        alpha = kept[number][0]
+        brought = pool.light[light.rows, first : first + alpha.shape[1]] * light.scale()
+        kept[number] = alpha, brought.bfloat16()
+        first += alpha.shape[1]
+
+
+def _use_all(pooled: list[Bits], masses: list[Tensor]) -> None:
+    """Let patterns that no state shows be copies of those that serve most, and give them half of their states."""
+    pool = pooled[0].lean
+    rows = torch.cat([light.rows for light in pooled if light.rows is not None])
+    weights = torch.cat(masses)
+    served = torch.zeros(len(pool)).index_add_(0, rows, weights)
+    shown = torch.bincount(rows, minlength=len(pool))
+    for empty in (shown == 0).nonzero().flatten().tolist():
+        full = int(torch.where(shown > 1, served, -1.0).argmax())
+        if shown[full] < 2:
+            break
+        states = (rows == full).nonzero().flatten()
+        moved = states[len(states) // 2 :]  # those of later exposures
+        rows[moved] = empty
+        pool[empty] = pool[full]
+        for one in (full, empty):
+            shown[one], served[one] = int((rows == one).sum()), float(weights[rows == one].sum())
+    first = 0
+    for light in pooled:
+        assert light.rows is not None
+        light.rows.copy_(rows[first : first + len(light.rows)])
+        first += len(light.rows)

@@ -11,7 +11,7 @@ on photons (Chen and Perona 2017) and in general (Wald 1945).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,9 @@ from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
-from .figures import Figures, figures
+from .figures import Figures, figures, masses, mean_objects
 from .finished import Finished, bit_grid, dwell_steps, finished, meet_budget, to_grid
-from .grow import GrowOptions, Growth, sum_of
+from .grow import GrowOptions, Growth
 from .light import Bits, Grey, as_bits
 from .machine import COUNT_FLOOR, Machine, Sight, forward
 from .objects import Augmentation, Block, TrainingObjects
@@ -46,12 +46,13 @@ from .options import (
 )
 from .posteriors import Posteriors, calibrated, node_counts
 from .reroute import reroute
-from .share import share_patterns
+from .share import choose_patterns, share_patterns
 from .state import machine_from, machine_state
 from .tune import Price, Tuning
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
+CHOICES, CHOICE_BLOCKS = 3, 20  # of shared patterns, before they are tuned; blocks of objects for one of them
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
 REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
@@ -229,23 +230,12 @@ class _Run:
         right = float(counts.amax(dim=1).sum()) / n
         return Progress("grow", len(growth.levels), self.steps, loss, right, clicks, photons, price)
 
-    def _masses(self) -> list[torch.Tensor]:
-        """How often every state is reached, by some of the objects."""
-        blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)[:REACH_BLOCKS]
-        with torch.no_grad():
-            passes = [forward(self.machine, self.sight(self.products), block.grey) for block in blocks]
-            levels = range(len(self.machine.levels))
-            return [sum_of(passed.steps[level].alpha.sum(dim=1) for passed in passes) for level in levels]
+    def _some_blocks(self) -> list[Block]:
+        """Some of the objects, by which it is judged how often a state is reached."""
+        return self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)[:REACH_BLOCKS]
 
-    def _mean_objects(self) -> Iterator[torch.Tensor]:
-        """Yield level by level the mean transmission of the objects that reach a state, (states, pixels)."""
-        blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)[:REACH_BLOCKS]
-        sight = self.sight(self.products)
-        passes = [forward(self.machine, sight, block.grey) for block in blocks]
-        for level in range(len(self.machine.levels)):
-            alphas = [passed.steps[level].alpha for passed in passes]
-            sums = sum_of(sight.mask_slope(alpha, block.grey) for alpha, block in zip(alphas, blocks))
-            yield sums / sum_of(alpha.sum(dim=1, keepdim=True) for alpha in alphas).clamp(min=1e-9)
+    def _masses(self) -> list[torch.Tensor]:
+        return masses(self.machine, self.sight(self.products), self._some_blocks())
 
     @torch.no_grad()
     def start_showing(self) -> None:
@@ -272,10 +262,10 @@ class _Run:
         return high
 
     def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
-        mean = self.objects.mean_transmission()
         shared = self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
         top = self._highest_top()
-        made = [as_bits(light, own, top) for light, own in zip(lights, self._mean_objects())]
+        means = list(mean_objects(self.machine, self.sight(self.products), self._some_blocks()))
+        made = [as_bits(light, own, top) for light, own in zip(lights, means)]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
         for level, bits in zip(self.machine.levels, made):
             if shared:
@@ -284,7 +274,11 @@ class _Run:
             level.light = bits
         most = patterns_at_most(self.options, self.profile)
         if most < sum(len(light) for light in lights):
-            share_patterns(self.machine, most, self._masses(), mean, new_generator(self.options.seed + 1))
+            share_patterns(self.machine, most, self._masses(), means, new_generator(self.options.seed + 1))
+            for _ in range(CHOICES):
+                self._choose_patterns()
+            # the price would else rise for a whole epoch until the brightness has followed it
+            meet_budget(self.machine, self.price, None, self.sight, self._drawn())
 
     def tune(self, stage: str, epochs: int, rate: float, keep: Callable[[], None]) -> None:
         """Train all levels together for the rest of a stage's epochs."""
@@ -305,6 +299,8 @@ class _Run:
             self.tuning.decide = self.options.decide if stage == "shown" and self.epoch else 0.0
             if stage == "shown" and 1 <= self.epoch <= min(self.options.reroutes, epochs - 2):
                 self._reroute()
+            if stage == "shown" and 1 <= self.epoch <= epochs - 2:
+                self._choose_patterns()
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
             told = self.tuning.epoch(blocks)
             self.epoch += 1
@@ -334,16 +330,22 @@ class _Run:
             with torch.no_grad():
                 light.settle()
 
-    def _reroute(self) -> None:
+    def _sweep_blocks(self) -> list[Block]:
+        """The objects of a sweep over all levels, as many as memory should hold."""
         states = sum(level.n_states for level in self.machine.levels)
-        blocks = self.objects.epoch(FIRST_EPOCH["shown"] + self.epoch - 1, GROWTH_BLOCK, self.products)
-        reroute(
-            self.machine,
-            self.sight(self.products),
-            blocks[: max(1, REROUTE_NUMBERS // (GROWTH_BLOCK * states))],
-            self.price.value,
-            self.options.exposure_price,
-        )
+        blocks = self.objects.epoch(FIRST_EPOCH["shown"] + max(0, self.epoch - 1), GROWTH_BLOCK, self.products)
+        return blocks[: max(1, REROUTE_NUMBERS // (GROWTH_BLOCK * states))]
+
+    def _reroute(self) -> None:
+        sight = self.sight(self.products)
+        reroute(self.machine, sight, self._sweep_blocks(), self.price.value, self.options.exposure_price)
+
+    def _choose_patterns(self) -> None:
+        light = self.machine.levels[0].light
+        if isinstance(light, Bits) and light.rows is not None:
+            sight = self.sight(self.products)
+            blocks = self._sweep_blocks()[:CHOICE_BLOCKS]
+            choose_patterns(self.machine, sight, blocks, self.price.value, self.options.exposure_price)
 
     # ---- the end ----
 

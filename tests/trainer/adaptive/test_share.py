@@ -5,12 +5,19 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from trainings import random_machine
+from trainings import bars_task, random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw
-from pans.trainer.adaptive.light import Bits
-from pans.trainer.adaptive.machine import Sight, brought
-from pans.trainer.adaptive.share import k_means, share_patterns
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive import share as module
+from pans.trainer.adaptive.figures import figures, masses, mean_objects
+from pans.trainer.adaptive.grow import GrowOptions, Growth
+from pans.trainer.adaptive.light import Bits, as_bits
+from pans.trainer.adaptive.machine import Sight, brought, forward, leaf_losses
+from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
+from pans.trainer.adaptive.share import choose_patterns, k_means, one_bit, share_patterns
+
+PRICE = 0.02
 
 
 def test_k_means_finds_groups_that_are_far_apart():
@@ -38,11 +45,12 @@ def test_states_of_a_group_show_one_pattern_and_keep_their_light():
     mean = torch.tensor([0.2, 0.4, 0.9, 0.5, 0.3], dtype=torch.float64)
     before = [brought(level.light, sight, mean.unsqueeze(0)) for level in machine.levels]
     was_dark = [light.sum() == 0 for level in before for light in level]
-    masses = [torch.ones(level.n_states, dtype=torch.float64) for level in machine.levels]
+    weights = [torch.ones(level.n_states, dtype=torch.float64) for level in machine.levels]
     with torch.no_grad():
         torch.set_default_dtype(torch.float64)
         try:
-            share_patterns(machine, 3, masses, mean, torch.Generator().manual_seed(0))
+            own = [mean.expand(level.n_states, 5) for level in machine.levels]
+            share_patterns(machine, 3, weights, own, torch.Generator().manual_seed(0))
         finally:
             torch.set_default_dtype(torch.float32)
     masks = torch.cat([level.light.shown()[0] for level in machine.levels])
@@ -65,3 +73,92 @@ def test_the_gradient_of_a_pool_is_the_sum_over_its_states():
     torch.testing.assert_close(shared.lean.grad[0], single.lean.grad[1])
     torch.testing.assert_close(shared.lean.grad[1], single.lean.grad[0] + single.lean.grad[2])
     torch.testing.assert_close(shared.shown()[0], single.shown()[0])
+
+
+def test_the_pattern_of_a_group_is_the_one_nearest_in_direction_of_all_there_are():
+    random = torch.Generator().manual_seed(3)
+    sums = torch.rand(20, 7, generator=random, dtype=torch.float64) ** 3
+    every = (torch.arange(1, 128).unsqueeze(1) >> torch.arange(7) & 1).double()
+    cosine = sums @ every.T / every.sum(dim=1).sqrt()
+    assert torch.equal((one_bit(sums) > 0).double(), every[cosine.argmax(dim=1)])
+
+
+def test_a_group_of_patterns_that_differ_keeps_many_pixels_lit():
+    points = torch.eye(6).repeat_interleave(3, dim=0) + 0.2  # a mean of +1 and -1 would leave no pixel lit
+    lit = (one_bit(points.sum(dim=0, keepdim=True)) > 0).sum()
+    assert int(lit) == 6
+
+
+@pytest.fixture
+def shared():
+    objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
+    blocks = objects.epoch(0, 200, torch.float32)
+    sight = Sight(ClickLaw(), objects.gain)
+    with torch.no_grad():
+        growth = Growth(blocks, sight, GrowOptions(states=8), torch.Generator().manual_seed(0))
+        for _ in range(5):
+            growth.grow(PRICE)
+        machine = growth.machine()
+        means = list(mean_objects(machine, sight, blocks))
+        for level, mean in zip(machine.levels, means):
+            level.light = as_bits(level.light.shown()[0], mean)
+        share_patterns(machine, 6, masses(machine, sight, blocks), means, torch.Generator().manual_seed(0))
+    return machine, sight, blocks
+
+
+def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
+    machine, sight, blocks = shared
+    monkeypatch.setattr(module, "_use_all", lambda *_: None)  # it changes no figure, but would hide what was chosen
+
+    def cost():
+        found = figures(machine, sight, blocks)
+        return found.loss + PRICE * found.photons
+
+    for level in machine.levels:
+        level.light.rows = torch.zeros_like(level.light.rows)
+    spoiled = cost()
+    told = [choose_patterns(machine, sight, blocks, PRICE) for _ in range(3)]
+    assert told[0] > 0
+    assert cost() < spoiled - 0.05
+    before = cost()
+    choose_patterns(machine, sight, blocks, PRICE)
+    assert cost() <= before + 2e-3  # what the sweep keeps is rounded to bfloat16
+    level = machine.levels[-1]  # behind it stands nothing but leaves: by hand, over all patterns and 200 brightnesses
+    steps = [forward(machine, sight, block.grey).steps[-1] for block in blocks]
+    losses = [leaf_losses(machine.counts[-1], block.one_hot) for block in blocks]
+    for state in range(level.n_states):
+        alpha = torch.cat([step.alpha[state] for step in steps])
+        quiet, click = (torch.cat([loss[level.successors[k, state]] for loss in losses]) for k in (0, 1))
+
+        def of(light, alpha=alpha, quiet=quiet, click=click):
+            dark = torch.exp(-light)
+            return float((alpha * (dark * quiet + (1 - dark) * click + PRICE * light)).sum())
+
+        masks = (level.light.lean > 0).float()
+        seen = torch.cat([sight.light(masks, block.grey) for block in blocks], dim=1)
+        least = min(of(row * 10**power) for row in seen for power in torch.linspace(-3, 2, 100).tolist())
+        now = of(seen[level.light.rows[state]] * level.light.scale()[state])
+        dearest = float((alpha * torch.maximum(quiet, click)).sum())
+        assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE * float(alpha.sum())
+
+
+def test_patterns_that_nothing_shows_take_half_of_the_states_of_others(shared):
+    machine, sight, blocks = shared
+    for level in machine.levels:
+        level.light.rows.zero_()
+    before = figures(machine, sight, blocks).loss
+    lights = [level.light for level in machine.levels]
+    module._use_all(lights, masses(machine, sight, blocks))
+    shown = torch.cat([light.rows for light in lights]).unique()
+    assert len(shown) == 6
+    assert figures(machine, sight, blocks).loss == pytest.approx(before, rel=1e-6)  # they are copies
+
+
+def test_one_brightness_for_all_is_left_as_it_is():
+    machine = random_machine(1, bits=True, shared=True)
+    means = [torch.ones(level.n_states, 5, dtype=torch.float64) for level in machine.levels]
+    weights = [torch.ones(level.n_states, dtype=torch.float64) for level in machine.levels]
+    with torch.no_grad():
+        share_patterns(machine, 3, weights, means, torch.Generator().manual_seed(0))
+    assert [len(level.light.rows) for level in machine.levels] == [level.n_states for level in machine.levels]
+    assert all(level.light.log_light.item() == -1.0 for level in machine.levels)
