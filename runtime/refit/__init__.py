@@ -1,5 +1,6 @@
-"""Refitting what decides to the instrument that it runs on, from recorded clicks of labelled objects.
+"""Fitting a bundle to the instrument that it runs on, by the clicks of labelled objects: what decides, and what is shown.
 
-Owns the way from recordings and labels to a corrected table, head or automaton, the choice between the old one and its corrections by
-held-out log loss, and `pans refit`. Numpy only: a lab's computer refits without torch. Never changes a pattern, and never runs a device.
+Owns `pans refit` (recordings and labels to a corrected table, head or automaton, chosen by held-out log loss) and `pans tune` (patterns
+moved on the device itself, step by step, each accepted by a test on the same objects). Numpy only: a lab's computer needs no torch. Trials
+run through the ordinary driver and loop; nothing here talks to a device by itself.
 """

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import MIB, open_regular
 from pans.runtime.core.decision import Decision, DecisionFlag
-from pans.runtime.decide.verdict import Decider, Verdict
+from pans.runtime.decide.verdict import Decider, Verdict, Verdicts, verdicts_of
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording, replay
 from pans.runtime.record.parts import is_of_parts, parts_in
@@ -50,6 +50,12 @@ class ClickLog:
         self.counts.append(counts.copy())
         self.shots = shots
         return self._back_end.decide(counts, shots)
+
+    def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
+        """Decide many at once, as the compiled steps ask for."""
+        self.counts += list(counts.copy())
+        self.shots = shots
+        return verdicts_of(self._back_end, counts, shots)
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """As `Decider`."""

@@ -32,19 +32,19 @@ def report_of(bundle: Bundle, clicks: Labelled, evidence: Evidence, found: Refit
         "simulated": clicks.simulated,
         "held_out": {
             "folds": FOLDS,
-            "accuracy_old": _interval(judged.old_accuracy),
-            "accuracy_new": _interval(judged.new_accuracy),
-            "accuracy_gain": _interval(judged.accuracy_gain),
-            "log_loss_old": _interval(judged.old_loss),
-            "log_loss_new": _interval(judged.new_loss),
-            "log_loss_gain": _interval(judged.loss_gain),
+            "accuracy_old": estimate_json(judged.old_accuracy),
+            "accuracy_new": estimate_json(judged.new_accuracy),
+            "accuracy_gain": estimate_json(judged.accuracy_gain),
+            "log_loss_old": estimate_json(judged.old_loss),
+            "log_loss_new": estimate_json(judged.new_loss),
+            "log_loss_gain": estimate_json(judged.loss_gain),
             "chosen": list(judged.chosen),
         },
         "kinds": {name: {"log_loss_gain": gain, "error": error} for name, (gain, error) in found.trials.items()},
         "learning_curve": [
-            {"objects": size, **_interval(accuracy)} for size, accuracy in zip(judged.sizes, judged.curve)
+            {"objects": size, **estimate_json(accuracy)} for size, accuracy in zip(judged.sizes, judged.curve)
         ],
-        "more_objects": {"objects": judged.more_objects, "accuracy_gain": _interval(judged.more_gain)},
+        "more_objects": {"objects": judged.more_objects, "accuracy_gain": estimate_json(judged.more_gain)},
         "clicks_mean": float(clicks.counts.sum(axis=1).mean()),
         "photons_mean": _known(clicks.light.photons),
         "illumination": _known(clicks.light.illumination),
@@ -86,14 +86,15 @@ def words_of(report: Mapping[str, Any]) -> str:
         + (f" ({left}: left out)" if left else ""),
         _outcome(report),
         f"on objects held out ({held['folds']} folds; 95 % intervals):",
-        f"  accuracy  old {_percent(held['accuracy_old'])}, new {_percent(held['accuracy_new'])}, "
-        f"gain {_percent(held['accuracy_gain'], '+')}",
+        f"  accuracy  old {percent_words(held['accuracy_old'])}, new {percent_words(held['accuracy_new'])}, "
+        f"gain {percent_words(held['accuracy_gain'], '+')}",
         f"  log loss  old {_plain(held['log_loss_old'])}, new {_plain(held['log_loss_new'])}, gain {_plain(held['log_loss_gain'])}",
         f"  at {_number(report['clicks_mean'])} clicks, {_number(report['photons_mean'])} photons, "
         f"illumination {_number(report['illumination'])} per decision",
         "accuracy by the number of labelled objects: "
         + ", ".join(f"{row['objects']}: {100 * row['value']:.1f} %" for row in report["learning_curve"]),
-        f"with {report['more_objects']['objects']} objects in all, about {_percent(report['more_objects']['accuracy_gain'], '+')} more",
+        f"with {report['more_objects']['objects']} objects in all, about "
+        f"{percent_words(report['more_objects']['accuracy_gain'], '+')} more",
         *report.get("notes", ()),
         f"{report['bundle']}  SHA-256 {report['sha256'][:16]}",
     ]
@@ -108,7 +109,8 @@ def _outcome(report: Mapping[str, Any]) -> str:
     return f"corrected: {report['chosen']}{also}"
 
 
-def _interval(found: Estimate) -> dict[str, float | None]:
+def estimate_json(found: Estimate) -> dict[str, float | None]:
+    """Return an estimate with its 95 % interval; None for what is not known."""
     half = Z_95 * found.error
     return {
         "value": _known(found.value),
@@ -126,8 +128,8 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.4g}"
 
 
-def _percent(found: Mapping[str, float], sign: str = "") -> str:
-    """An accuracy and its interval; with `sign` "+" a gain."""
+def percent_words(found: Mapping[str, float], sign: str = "") -> str:
+    """Return an accuracy and its interval in words; with `sign` "+" a gain."""
     value, low, high = (format(100 * found[name] + 0.0, f"{sign}.1f") for name in ("value", "low", "high"))
     return f"{value} ({low} to {high}) %"
 

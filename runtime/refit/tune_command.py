@@ -1,0 +1,160 @@
+"""`pans tune`: patterns adjusted on the instrument itself, by the clicks of labelled objects.
+
+Owns the command's arguments, files and exit codes; the search is search.py's, a whole tuning tuning.py's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit
+from pans.runtime.errors import UsageError
+from pans.runtime.outputs import check_outputs
+from pans.runtime.ranges import Range
+
+from .moves import BENDS
+
+PARTS = {
+    "shift": ("right_px", "down_px"),
+    "rotation": ("rotation_deg",),
+    "scale": ("scale",),
+    "bends": BENDS,
+    "brightness": ("brightness",),
+}
+USUAL = "shift,rotation,scale"
+OBJECTS_RANGE = Range(100, 1 << 17, whole=True)
+OBJECTS_USUAL = 1000
+PHOTONS_RANGE, MINUTES_RANGE = Range(1.0, 1e15), Range(1e-3, 1e5)
+DRIVES = ("auto", "device", "host")
+
+
+def _configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", type=Path, help="the bundle whose patterns are adjusted")
+    parser.add_argument("--device", required=True, help="device URL; each trial opens it again")
+    parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        metavar="CSV",
+        help="object,label per line (default: the truth that the device's marks tell)",
+    )
+    parser.add_argument(
+        "--objects",
+        type=OBJECTS_RANGE.option,
+        default=0,
+        metavar="N",
+        help=f"objects of each trial (default: the labels' or the scene's, at most {OBJECTS_USUAL})",
+    )
+    parser.add_argument(
+        "--only", default=USUAL, metavar="PARTS", help=f"what is tuned: of {', '.join(PARTS)} (default {USUAL})"
+    )
+    parser.add_argument(
+        "--photons",
+        type=PHOTONS_RANGE.option,
+        default=math.inf,
+        metavar="N",
+        help="most photons of all trials together",
+    )
+    parser.add_argument(
+        "--minutes", type=MINUTES_RANGE.option, default=math.inf, metavar="N", help="most minutes of the instrument"
+    )
+    parser.add_argument("--drive", default="auto", choices=DRIVES, help="of an automaton: who chooses each pattern")
+    parser.add_argument("--resume", action="store_true", help="go on from NEW.pans.tune.json")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW.pans", help="the bundle to write")
+    add_force(parser)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
+
+    names = _parameters(args.only)
+    path, checkpoint = bundle_path(args.bundle), args.out.with_name(f"{args.out.name}.tune.json")
+    if args.resume and not checkpoint.is_file():
+        raise UsageError(f"{checkpoint}: there is no checkpoint", remedy="leave --resume out")
+    replaces = args.force or args.resume
+    check_outputs([args.out, checkpoint], inputs=[path, args.labels], force=replaces)
+    from pans.runtime.instrument.profile import load_profile
+    from pans.runtime.live.continuous import stop_signals
+
+    from .search import Budget
+    from .trial import Bench
+    from .tuning import Tuning, words_of
+
+    bundle, sha256 = load_bundle(path)
+    _demand_tunable(bundle.analyser is not None, bundle.picture_shape is not None, bundle.name)
+    profile = load_profile(args.profile or _profile_of(args.device))
+    with stop_signals(continuous=False) as stop:
+        labels, labels_sha256 = _labels(args, bundle.classes)
+        n_objects = args.objects or _count(args.device, labels)
+        bench = Bench(args.device, profile, bundle, n_objects, labels, stop, args.drive)
+        facts = {
+            "bundle_sha256": sha256,
+            "profile_sha256": profile.sha256,
+            "device": args.device,
+            "labels_sha256": labels_sha256,
+            "objects": n_objects,
+            "parameters": list(names),
+        }
+        tuning = Tuning(bench, names, Budget(args.photons, 60 * args.minutes), checkpoint, facts)
+        tuned = tuning.run(resume=args.resume)
+        written = write_bundle(tuned.bundle, args.out, force=replaces)
+    payload = {"bundle": str(args.out), "sha256": written, "checkpoint": str(checkpoint), **tuned.report}
+    emit(args, payload, words_of(payload))
+    return EXIT_INTERRUPTED if tuned.report["interrupted"] else EXIT_FINE
+
+
+def _parameters(parts: str) -> tuple[str, ...]:
+    chosen = [part.strip() for part in parts.split(",")]
+    unknown = [part for part in chosen if part not in PARTS]
+    if unknown or len(set(chosen)) != len(chosen):
+        raise UsageError(f"--only {parts!r}, allowed: some of {', '.join(PARTS)}, each once")
+    return tuple(name for part in PARTS if part in chosen for name in PARTS[part])
+
+
+def _demand_tunable(passive: bool, returns_pictures: bool, name: str) -> None:
+    if passive:
+        raise UsageError(f"{name} is passive: nothing is shown that could be adjusted", remedy="use pans refit")
+    if returns_pictures:
+        raise UsageError(f"{name} returns pictures", remedy="tune a bundle that decides among classes")
+
+
+def _profile_of(device: str) -> str:
+    if device.startswith("sim:"):
+        return device[4:].partition("?")[0]
+    raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
+
+
+def _labels(args: argparse.Namespace, classes: tuple[str, ...]) -> tuple[dict[int, int | None] | None, str | None]:
+    if args.labels is None:
+        return None, None
+    from .labels import read_labels
+
+    found = read_labels(args.labels, classes)
+    if found.names_recordings:
+        raise UsageError(f"{args.labels}: names recordings, there are none", remedy="write object,label per line")
+    return dict(found.by_recording[""]), found.sha256
+
+
+def _count(device: str, labels: dict[int, int | None] | None) -> int:
+    from .trial import scene_size
+
+    found = max(labels) + 1 if labels else scene_size(device)
+    if found < OBJECTS_RANGE.low:
+        raise UsageError(
+            f"{found} objects, allowed: {OBJECTS_RANGE.low:g} or more",
+            remedy="say with --objects how many pass in one trial",
+        )
+    return min(found, OBJECTS_USUAL)
+
+
+TUNE = Command(
+    "adjust patterns on the instrument itself, by the clicks of labelled objects",
+    _configure,
+    _run,
+    examples=(
+        "pans tune my.pans --device serial:/dev/ttyACM0 --profile my-lab.toml --labels truth.csv --minutes 20 -o my-tuned.pans",
+        "pans tune my.pans --device serial:/dev/ttyACM0 --profile my-lab.toml --labels truth.csv -o my-tuned.pans --resume",
+    ),
+)
