@@ -99,7 +99,7 @@ class Search:
         self.best, self.accepted, self.ended = STILL, 0, ""
         self.steps: dict[str, float] = {name: FIRST_STEP[name] for name in names}
         self.journal: list[Step] = []
-        self.held_out: NDArray[np.bool_] = np.arange(n_objects) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+        self.held_out = held_out_of(n_objects)
         self._measure, self._keep = measure, keep
         self._n, self._followed = n_objects, 0
         self._here: F64 = np.full(n_objects, np.nan)
@@ -171,6 +171,11 @@ class Search:
         self.journal.append(step)
         self._keep(self.journal)
         return _losses(step, self._n)
+
+
+def held_out_of(n_objects: int) -> NDArray[np.bool_]:
+    """Return which objects are kept for the comparison at the end, (objects,)."""
+    return np.asarray(np.arange(n_objects) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1)
 
 
 def paired(old: F64, new: F64, chosen: NDArray[np.bool_]) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from pans.runtime.outputs import write_file
 from .choosing import Estimate
 from .evidence import F64
 from .moves import STILL, Move, moved
-from .search import CLEARLY, Budget, Cost, Search, Step, paired
+from .search import CLEARLY, Budget, Cost, Measure, Search, Step, held_out_of, paired
 from .trial import Bench, Trial, demand_labelled
 from .words import estimate_json, percent_words
 
@@ -71,26 +71,20 @@ class Tuning:
             best = STILL
         return self._tuned(search, best, compared, interrupted=interrupted)
 
-    def _measure_of(self) -> Any:
-        heard: list[float] = []  # the loss of the patterns that were there before
+    def _measure_of(self) -> Measure:
+        held_out = held_out_of(self.bench.n_objects)
 
         def measure(move: Move, number: int) -> tuple[F64, Cost]:
             trial = self.bench.run(moved(self.bench.bundle, move), number)
             self.simulated = trial.simulated
-            if not heard:
-                demand_labelled(trial, self._held_out)
-            mean = float(np.nanmean(trial.loss[~self._held_out]))
-            heard.append(mean)
+            demand_labelled(trial, held_out)
+            mean = float(np.nanmean(trial.loss[~held_out]))
             say(
                 f"pans: trial {number}: {move.words()}: log loss {mean:.4f}, accuracy {100 * np.nanmean(trial.right):.1f} %"
             )
             return trial.loss, cost_of(trial)
 
         return measure
-
-    @property
-    def _held_out(self) -> NDArray[np.bool_]:
-        return Search(self.names, self.bench.n_objects, self.budget, _never, _nothing).held_out
 
     def _keep(self, journal: list[Step]) -> None:
         payload = {"format": FORMAT, **self.facts, "trials": [step.as_json() for step in journal]}
@@ -149,14 +143,6 @@ class Tuning:
         made = replace(moved(old, best), provenance={**old.provenance, "tune": told})
         check_bundle(made)
         return Tuned(parse_bundle(bundle_bytes(made), "the tuned bundle"), report)
-
-
-def _never(move: Move, number: int) -> tuple[F64, Cost]:
-    raise AssertionError(f"trial {number} of {move.words()}")
-
-
-def _nothing(journal: list[Step]) -> None:
-    """A search that measures nothing keeps nothing."""
 
 
 def cost_of(trial: Trial) -> Cost:
