@@ -15,12 +15,13 @@ from pans.trainer.paper.tables import FIRST
 
 from .fixed import FIXED, FIXED_BUDGET, FIXED_LIGHT, PAPER
 from .summary import error_of
-from .ways import AUTOMATON, DIRECT, HADAMARD, HELD_TO_CLICKS, MASKS, SMALL, STOPPING, TASKS
+from .ways import AUTOMATON, DIRECT, EARLY, HADAMARD, HELD_TO_CLICKS, MASKS, SMALL, STOPPING, TASKS
 
 STYLES: dict[str, dict[str, Any]] = {
     AUTOMATON: {"color": "C3", "marker": "o", "lw": 2.2, "zorder": 5},
     SMALL: {"color": "C3", "marker": "o", "mfc": "w", "lw": 1.2, "ls": "--", "zorder": 4},
     HELD_TO_CLICKS: {"color": "C3", "marker": "^", "lw": 1.0, "ls": ":", "zorder": 4},
+    EARLY: {"color": "C6", "marker": "o", "mfc": "w", "lw": 1.0, "ls": ":", "zorder": 4},
     FIXED: {"color": "C1", "marker": "s"},
     FIXED_LIGHT: {"color": "C1", "marker": "s", "mfc": "w", "ls": "--"},
     FIXED_BUDGET: {"color": "C5", "marker": "s"},

@@ -14,7 +14,7 @@ from pans.trainer.paper.page import Row, Rows, at
 from pans.trainer.paper.tables import ACTIVE, FIRST
 
 from .fixed import PAPER
-from .ways import AUTOMATA, DIRECT, STOPPING, TASKS
+from .ways import AUTOMATA, DIRECT, STOPPING, TASKS, TRAINED
 
 SUMMED = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
 
@@ -119,6 +119,6 @@ def commands(rows: Rows) -> Rows:
     first: dict[tuple[str, str, float], Row] = {}
     for row in rows:
         if "command" in row:
-            level = row["level"] if row["way"] in AUTOMATA else 0.0
+            level = row["level"] if row["way"] in TRAINED else 0.0
             first.setdefault((row["task"], row["way"], level), row)
     return list(first.values())

@@ -25,7 +25,10 @@ from .fixed import FIXED_BUDGET, budget_recipe, budget_row
 
 TASKS = tuple(ACTIVE)
 AUTOMATON, SMALL, HELD_TO_CLICKS = "automaton", "small automaton", "automaton, held to clicks"
+EARLY = "small automaton, ends early"
+FEW = {count: f"small automaton, {count} patterns" for count in (96, 1000)}
 AUTOMATA = (AUTOMATON, SMALL, HELD_TO_CLICKS)
+TRAINED = (*AUTOMATA, EARLY, *FEW.values())  # the last are variations of the small one at its budgets
 DIRECT, STOPPING = "direct, exact posterior", "direct, stops when sure"
 MASKS, HADAMARD = "trained masks, counts", "Hadamard pairs, network"
 # Sizes and epochs as long as one training has time for; budgets a little below the level, as test images may take more than others.
@@ -48,6 +51,10 @@ CLICKS_OF = {"fashion-mnist": (1.281, 2.145), "mnist": (2.164,)}  # the automata
 UNDER_CLICKS = 0.97  # of the paper's clicks is what training aims at, so that test images take no more
 SMALL_PHOTONS = (4.0, 6.0, 10.0)
 SMALL_SIZE = (("exposures", 24), ("states", 64))  # trained in about a minute of one core
+EARLY_PRICE = (
+    0.003  # nats per exposure; of 0.001, 0.003 and 0.01 on held-back training images (docs/how-to/automaton.md)
+)
+FEW_PHOTONS = {"fashion-mnist": (6.0,)}
 DIRECT_PHOTONS = (2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 17.0, 25.0, 40.0, 65.0, 100.0)
 STOPPING_PHOTONS = (4.0, 6.0, 10.0, 17.0, 40.0, 65.0, 100.0)
 BUDGET_PHOTONS = (10.0, 17.0, 40.0)  # of fixed patterns held to photons
@@ -87,8 +94,8 @@ class Point:
         given = dict(self.recipe)
         if self.way == FIXED_BUDGET:
             return "pans reproduce frontier"  # the whole recipe is `fixed.budget_recipe`
-        if self.way in AUTOMATA:
-            words = " ".join(f"--{key} {value:g}" for key, value in given.items())
+        if self.way in TRAINED:
+            words = " ".join(f"--{key.replace('_', '-')} {value:g}" for key, value in given.items())
             return f"pans train {self.task} --encoder automaton --profile ideal {words} --seed {seed} -o NAME.pans"
         options = {key: given[key] for key in ("method", "features", "epochs", "trials") if given[key] is not None}
         if given["paradigm"] == "direct":
@@ -125,6 +132,13 @@ def points() -> Iterator[Point]:
         for clicks in CLICKS_OF[name]:
             budget = (("clicks", round(UNDER_CLICKS * clicks, 3)), *SMALL_SIZE)
             yield Point(name, HELD_TO_CLICKS, clicks, budget)
+    for name in TASKS:
+        for photons in SMALL_PHOTONS:
+            yield Point(name, EARLY, photons, (("photons", photons), *SMALL_SIZE, ("exposure_price", EARLY_PRICE)))
+    for name, levels in FEW_PHOTONS.items():
+        for photons in levels:
+            for count, way in FEW.items():
+                yield Point(name, way, photons, (("photons", photons), *SMALL_SIZE, ("patterns", count)))
 
 
 def _baseline(task: str, way: str, photons: float, options: BaselineOptions) -> Point:
@@ -147,7 +161,7 @@ def row_of(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | No
 def made_with(point: Point, seed: int) -> Row:
     """Return the whole recipe of a row, defaults spelt out: one that was made with another is made again."""
     options = dict(point.recipe)
-    if point.way in AUTOMATA:
+    if point.way in TRAINED:
         options = asdict(automaton_recipe(point.task, options, seed))
     elif point.way == FIXED_BUDGET:
         options = plain_options(budget_recipe(point.level, BUDGET_FEATURES, seed))
@@ -175,7 +189,7 @@ def _options(point: Point, seed: int) -> BaselineOptions:
 
 def _made(asked: Asked, point: Point, seed: int, task: Task) -> Row:
     asked.report(f"frontier: {point.task}, {point.way}, {point.level:g}, seed {seed}")
-    if point.way in AUTOMATA:
+    if point.way in TRAINED:
         return automaton_row(asked, point.stem, task, dict(point.recipe), seed)
     if point.way == FIXED_BUDGET:
         path = bundle_path(asked.cache, point.stem, seed)
