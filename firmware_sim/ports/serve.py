@@ -213,9 +213,10 @@ class ChildLink:
 
 
 def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:
-    breaks = parse_faults(options.faults).disconnect is not None  # which a pty cannot do
-    listen = "pty" if hasattr(os, "openpty") and not breaks else "tcp:127.0.0.1:0"
-    words = [sys.executable, "-m", "pans.firmware_sim", *words_of(options), "--listen", listen, "--until-stdin-closes"]
+    # TCP, not a pseudo-terminal: a busy machine's kernel hands the bytes of a terminal on tens of milliseconds late
+    # (docs/measurements/timing.md), and a terminal cannot be unplugged.
+    listen = ["--listen", "tcp:127.0.0.1:0"]
+    words = [sys.executable, "-m", "pans.firmware_sim", *words_of(options), *listen, "--until-stdin-closes"]
     # One BLAS thread: the instrument shares the machine with the host that it is to measure. A session of its own: Ctrl-C is
     # for the host, which then leaves the instrument in a safe state.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
