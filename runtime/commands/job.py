@@ -121,6 +121,7 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "backend_choice": dict(choice_of(decider)),
             "tick_hz": job.profile.clock.tick_hz,
             "realtime_requested": job.realtime,
+            **({"mode": "parallel"} if job.profile.mode == "parallel" else {}),
             **({"drive": drive, "confidence": job.confidence} if drive else {}),
         },
         "versions": {

@@ -27,7 +27,7 @@ from .stream_arrays import DecisionTables, MarkArrays, WalkArrays
 from .window import DecisionWindows
 from .window_kernels import WindowArrays
 
-ROWS_PER_BATCH = 8192
+ROWS_PER_BATCH = 24576
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 _KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}
 _LARGEST = (1 << 62) - 1
@@ -57,9 +57,10 @@ class BulkSteps:
     ) -> None:
         self.core, self.windows = core, windows
         self._decider, self._shots = decider, shots
-        self._rows: Rows = np.zeros(rows_max, DECISION_DTYPE)
+        # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
+        self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
         self.tables = decision_tables(decider, shots, plan)
-        self._counts = np.zeros((0 if self.tables.labels.size else rows_max, decider.n_features), np.int64)
+        self._counts = np.full((0 if self.tables.labels.size else rows_max, decider.n_features), 0, np.int64)
         self._marks, self._told = _no_marks(), _no_marks()  # as the kernel knows them, and as the core does
         sequential = plan.mode != "parallel"
         self._windows = WindowArrays(
@@ -67,8 +68,8 @@ class BulkSteps:
             np.zeros(-(-decider.n_features // 8), np.uint64),
             np.zeros(decider.n_features, np.int64),
             plan.slot_offset_ticks.astype(np.int64),
-            np.zeros(CLICKS_MAX if sequential else 0, np.uint16),
-            np.zeros(CLICKS_MAX if sequential else 0, np.uint8),
+            np.full(CLICKS_MAX if sequential else 0, 0, np.uint16),
+            np.full(CLICKS_MAX if sequential else 0, 0, np.uint8),
         )
         self._state = np.zeros(kernels.N_STATE, np.int64)
         self._state[kernels.EXPOSURE_TICKS] = plan.exposure_ticks
@@ -214,7 +215,7 @@ class BulkSteps:
 
 def _no_marks() -> MarkArrays:
     n = kernels.MARK_SLOTS
-    return MarkArrays(np.full(n, -1, np.int64), np.zeros(n, np.int16), np.zeros(n, np.float32))
+    return MarkArrays(np.full(n, -1, np.int64), np.full(n, 0, np.int16), np.full(n, 0, np.float32))
 
 
 def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:

@@ -73,6 +73,11 @@ class DarkGuard:
         self._made: Decider | None = None
         self._made_for: tuple[Any, ...] = ()
 
+    @property
+    def dark_slot(self) -> NDArray[np.bool_]:
+        """Which slots of a cycle are dark."""
+        return self._dark_slot
+
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming."""
         self.watch.warm_up()
@@ -93,7 +98,11 @@ class DarkGuard:
         if self.lit is not None:
             words = block.words if isinstance(block, FrameBlock) else np.asarray(block.bits).reshape(-1, 1)
             self.lit.take_exposures(words)
-            self._look_for_dead()
+            self.look_for_dead()
+        return self.take_rest(block)
+
+    def take_rest(self, block: ClickBlock | FrameBlock) -> list[Finding]:
+        """As `take`, of a block whose lit exposures have been looked at."""
         events = self._take_dark(block)
         return self.news() + events
 
@@ -106,21 +115,22 @@ class DarkGuard:
             self.take_clicks(int(counts.sum()), number)
         elif self.lit is not None:
             self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
-            self._look_for_dead()
+            self.look_for_dead()
 
     def take_clicks(self, clicks: int, number: int) -> None:
         """As `take_object` with one detector, of which only the sum of its clicks counts."""
         if self.lit is not None:
             self._any_click[0] = clicks
             self.lit.take_object(self._any_click, -1 if number == NO_OBJECT else number)
-            self._look_for_dead()
+            self.look_for_dead()
 
     def news(self) -> list[Finding]:
         """Return what was found with objects, once."""
         news, self._news = self._news, []
         return news
 
-    def _look_for_dead(self) -> None:
+    def look_for_dead(self) -> None:
+        """Ask the test of lit exposures what it has found, if it has."""
         assert self.lit is not None
         if not self.lit.has_news:
             return
@@ -151,7 +161,7 @@ class DarkGuard:
 
     def take_dark_words(self, words: NDArray[np.uint8]) -> list[Finding]:
         """Take dark exposures, words uint8 (n, bytes), in the order of time; return the findings."""
-        return self._found(self.watch.update_words(words)) if len(words) else []
+        return self.found(self.watch.update_words(words)) if len(words) else []
 
     def take_empty(self, frames: int, clicks: NDArray[np.int64]) -> list[Finding]:
         """Take `frames` frames of an empty field of which only the clicks of each channel are known, int64 (n,); return the findings."""
@@ -159,10 +169,11 @@ class DarkGuard:
             return []
         if self.lit is not None:
             self.lit.take_counts(frames, clicks)
-            self._look_for_dead()
-        return self.news() + self._found(self.watch.update(frames, clicks))
+            self.look_for_dead()
+        return self.news() + self.found(self.watch.update(frames, clicks))
 
-    def _found(self, alarms: list[Alarm]) -> list[Finding]:
+    def found(self, alarms: list[Alarm]) -> list[Finding]:
+        """Take alarms that came at once; return the findings."""
         return self._keep(self.health.take(alarms))
 
     def _keep(self, found: list[Finding]) -> list[Finding]:

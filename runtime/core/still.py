@@ -110,22 +110,27 @@ class Core(Follower):
             return []
         block = ClickBlock(0, 0, 0, first, 0, self.windows.position[2], stamps, bits)
         events = self.guard.take(block)
-        for row in rows:
-            if not row["flags"] & _NOT_MEASURED:
-                self.guard.take_clicks(int(row["clicks"]), int(row["object"]))
+        measured = rows[rows["flags"] & _NOT_MEASURED == 0]
+        for clicks, number in zip(measured["clicks"].tolist(), measured["object"].tolist()):
+            self.guard.take_clicks(clicks, number)
         return events
 
     def watch_frames(self, block: FrameBlock) -> list[Finding]:
         """As `watch_blocks` for a block of frames: of its object the guard sees which channels have clicked in lit frames."""
         assert self.guard is not None
         events = self.guard.take(block)
+        self.watch_object(block)
+        return events
+
+    def watch_object(self, block: FrameBlock) -> None:
+        """As `watch_frames`, of the object alone."""
+        assert self.guard is not None
         first = block.exposure_index % self.windows.visit_exposures
         lit = self.windows.lit[first : first + len(block.words)]
         if lit.any():
             seen = np.bitwise_or.reduce(block.words[lit], axis=0)
             clicked = np.unpackbits(seen, count=self._plan.n_patterns, bitorder="little").astype(np.int64)
             self.guard.take_object(clicked, block.object_index)
-        return events
 
     def cycles_left(self, n_cycles: int) -> int:
         """Return how many of a whole run's `n_cycles` cycles stand out when the visit under way is given up."""

@@ -172,11 +172,7 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     if not _is_due(visit, first - visit * state[VISIT_EXPOSURES], state, windows):
         return False
     if visit != state[VISIT]:
-        windows.counts[:] = 0
-        windows.seen[:] = 0
-        windows.walks.nodes[:] = 0
-        windows.walks.need[:] = windows.longest[0]
-        windows.last[:] = windows.longest[1]
+        _begin_visit(windows)
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
     state[OBJECT] = number
@@ -189,6 +185,20 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
     stream.go_on(state, count)
     return True
+
+
+@njit(cache=True, nogil=True)
+def _begin_visit(windows):  # type: ignore[no-untyped-def]
+    """No window has anything yet; element by element: numba takes seconds to compile the assignment of a slice."""
+    counts, seen, nodes = windows.counts, windows.seen, windows.walks.nodes
+    need, last, longest = windows.walks.need, windows.last, windows.longest
+    for window in range(counts.shape[0]):
+        for feature in range(counts.shape[1]):
+            counts[window, feature] = 0
+        seen[window, 0], seen[window, 1] = 0, 0
+        need[window], last[window] = longest[0, window], longest[1, window]
+    for walk in range(nodes.size):
+        nodes[walk] = 0
 
 
 @njit(cache=True, nogil=True)

@@ -122,6 +122,16 @@ class ChannelWatch:
         self.exposures += len(words)
         return self._alarms(int(n))
 
+    @property
+    def arrays(self) -> tuple[I64, I64, I64, I64, I64]:
+        """What compiled code hands to `take_words`, behind the number of exposures before."""
+        return self.clicks, self._state, self._channel_of, self._at_zero, self._room
+
+    def went_on(self, exposures: int, alarms: int) -> list[Alarm]:
+        """Take over what compiled code has given to `take_words`: the exposures of now, and how many alarms it found."""
+        self.exposures = exposures
+        return self._alarms(alarms)
+
     def update(self, dark_exposures: int, clicks_per_channel: I64, first_exposure: int | None = None) -> list[Alarm]:
         """Take a block of which only the counts are known: clicks int64 (n,) in `dark_exposures` exposures.
 

@@ -58,6 +58,21 @@ class Silence(NamedTuple):
     rate: float
 
 
+class DeadArrays(NamedTuple):
+    """What compiled code continues of a DeadChannelTest: its arrays, int64, by their names there."""
+
+    silent: I64
+    clicking: I64
+    limits: I64
+    row: I64
+    clicked: I64
+    quiet: I64
+    then: I64
+    compared: I64
+    first: I64
+    due: I64
+
+
 class DeadChannelTest:
     """Follows the silence of `n` channels; all memory is allocated here, before arming.
 
@@ -105,6 +120,24 @@ class DeadChannelTest:
         self.silent += exposures
         self.silent *= silent
         self._any_due |= bool((self.silent >= self._limits).any())
+
+    @property
+    def arrays(self) -> DeadArrays:
+        """What compiled code continues."""
+        silence = (self.silent, self.clicking, self._limits)
+        return DeadArrays(
+            *silence, self._row, self.clicked, self._quiet, self._then, self._compared, self._first, self._due
+        )
+
+    @property
+    def place(self) -> tuple[int, bool, int]:
+        """The object under way, whether it is, and the objects before it."""
+        return self._object, self._open, self.objects
+
+    def went_on(self, place: tuple[int, bool, int], *, due: bool) -> None:
+        """Take over where compiled code has brought the arrays, and whether `look` is due."""
+        self._object, self._open, self.objects = place
+        self._any_due |= due
 
     @property
     def has_news(self) -> bool:
@@ -207,13 +240,21 @@ def note_silence(words, silent, clicking, limits):  # type: ignore[no-untyped-de
         seen = np.int64(0)
         for i in range(words.shape[0]):
             seen |= np.int64(words[i, byte])
-        for channel in range(8 * byte, min(8 * byte + 8, silent.size)):
-            if (seen >> (channel & 7)) & 1:
-                silent[channel] = 0
-                clicking[channel] += 1
-            else:
-                silent[channel] += words.shape[0]
-                passed |= silent[channel] >= limits[channel]
+        passed |= note_seen(seen, byte, words.shape[0], silent, clicking, limits)
+    return passed
+
+
+@numba.njit(cache=True, nogil=True)
+def note_seen(seen, byte, exposures, silent, clicking, limits):  # type: ignore[no-untyped-def]
+    """As `note_silence` for the eight channels of one byte, of which `seen` has those that clicked in a block of `exposures`."""
+    passed = False
+    for channel in range(8 * byte, min(8 * byte + 8, silent.size)):
+        if (seen >> (channel & 7)) & 1:
+            silent[channel] = 0
+            clicking[channel] += 1
+        else:
+            silent[channel] += exposures
+            passed |= silent[channel] >= limits[channel]
     return passed
 
 

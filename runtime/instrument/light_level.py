@@ -73,19 +73,45 @@ class LightWatch:
             return ""
         return self._compare(total, self.baseline)
 
-    def take_many(self, clicks: npt.NDArray[np.int64]) -> list[dict[str, Any]]:
-        """Take the clicks of many decisions, int64 (n,), as `take` of each; return what has been found."""
-        known, at = len(self.found), 0
-        while at < len(clicks):
-            n = min(self.batch - self._in_batch - 1, len(clicks) - at)  # all but the one that ends a batch
-            self.decisions += n
-            self._in_batch += n
-            self._clicks += int(clicks[at : at + n].sum())
-            at += n
-            if at < len(clicks):
-                self.take(int(clicks[at]))
-                at += 1
-        return self.found[known:]
+    def take_many(
+        self, clicks: npt.NDArray[np.uint32], flags: npt.NDArray[np.uint32], left_out: int
+    ) -> list[dict[str, Any]]:
+        """Take many decisions, uint32 (n,) each, but those with one of the flags `left_out`: as `take` of each; return what was found."""
+        from . import light_kernels as kernels  # numba is loaded only by who takes many at once
+
+        known, at, levels = len(self.found), 0, np.empty(kernels.N_LEVELS)
+        levels[kernels.ERROR :] = BASELINE_ERROR, BASELINE_LEAST, BASELINE_MOST
+        while True:
+            base, sums = self.baseline, (self._n, self._sum, self._squares)
+            since = (*self._since["fall"], *self._since["rise"])
+            batch = (self.decisions, self._clicks, self._in_batch)
+            counts = np.array([*batch, *sums, self._batches, self._total, *since, self.batch], np.int64)
+            levels[: kernels.ERROR] = (
+                self._low,
+                self._high,
+                *((math.nan, 0.0, 0.0) if base is None else (base.mean, base.slack, base.threshold)),
+            )
+            at, why = kernels.take_clicks(clicks, flags, np.uint32(left_out), at, counts, levels)
+            self._go_on(counts.tolist(), levels.tolist())
+            if why == kernels.LEARNT:
+                self._learnt()
+            elif why != kernels.ALL_TAKEN:
+                assert base is not None
+                self._tell("fall" if why == kernels.FELL else "rise", base)
+            else:
+                return self.found[known:]
+
+    def warm_up(self) -> None:
+        """Compile or load what `take_many` needs, before arming."""
+        none = np.ones((2, 2), np.uint32)[:, 0]  # as a column of a table lies
+        self.take_many(none, none, 1)
+
+    def _go_on(self, counts: list[int], levels: list[float]) -> None:
+        self.decisions, self._clicks, self._in_batch, self._n, self._sum, self._squares, self._batches, self._total = (
+            counts[:8]
+        )
+        self._since = {"fall": (counts[8], counts[9], counts[10]), "rise": (counts[11], counts[12], counts[13])}
+        self._low, self._high = levels[:2]
 
     def report(self) -> dict[str, Any]:
         """What is known: the baseline, how long a change of the clicks by STATED_CHANGE takes to be found, and what was found."""
@@ -101,8 +127,11 @@ class LightWatch:
 
     def _learn(self, total: int) -> None:
         self._n, self._sum, self._squares = self._n + 1, self._sum + total, self._squares + total * total
-        if self._n < BASELINE_LEAST:
-            return
+        if self._n >= BASELINE_LEAST:
+            self._learnt()
+
+    def _learnt(self) -> None:
+        """Make the baseline, if its mean is known well enough."""
         mean = self._sum / self._n
         variance = (self._squares - self._sum * mean) / (self._n - 1)
         deviation = math.sqrt(max(variance, mean, 1.0))

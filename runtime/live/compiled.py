@@ -18,21 +18,21 @@ import numpy.typing as npt
 from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.decision import Decision, Output
 from pans.runtime.core.still import Core
+from pans.runtime.core.stream_arrays import MarkArrays
 from pans.runtime.errors import LinkError
 from pans.runtime.link.base import descriptor_of
 from pans.runtime.link.connection import Arrived
 from pans.runtime.link.reader import Chunk
-from pans.runtime.record.format import TIMING_DTYPE, Kind
+from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind, expand_timings
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
+from pans.runtime.turn import settling as kernels
 from pans.runtime.turn.engine import Limits, Turn
 from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
+from pans.runtime.turn.watching import FrameWatch
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import MessageType, Opcode, decode_frames
-from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.session import STREAM_TYPES
-
-from .tally import photons_of
 
 if TYPE_CHECKING:
     from .run import LiveRun
@@ -64,6 +64,9 @@ class CompiledTurns:
             ring.KEPT_BYTES // 2 if core.guard is not None and not core.windows.parallel else 0
         )  # two bytes each
         self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
+        watched = core.guard is not None and core.windows.parallel
+        self._frames = FrameWatch(core) if watched else None
+        self._judged = Judged(run)
         self._error: LinkError | None = None  # met while something is left to take
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
 
@@ -78,6 +81,10 @@ class CompiledTurns:
         self._steps, self._turn = steps, Turn(steps, bulk, drive)
         self._turn.warm_up()
         unpack_blocks(self._turn.kept, self._turn.messages, self._stamps, self._bits)
+        run.tally.warm_up(steps.walk.marks, self._core.windows.n_windows)
+        self._judged.take(self._turn.blocks[:0], self._turn.rows[:0])
+        if self._frames is not None:
+            self._frames.warm_up()
         link = run.connection.link
         self._fd = None if link.virtual else descriptor_of(link)
 
@@ -171,7 +178,7 @@ class CompiledTurns:
             except LinkError as error:
                 self._error = self._error or error
             self._lend(turn)
-            _own(outputs)
+            self._run.tell(outputs)  # before the rings are filled anew
             ended = again()
             self._settle(turn, outputs)
 
@@ -270,15 +277,17 @@ class CompiledTurns:
         events = self._watch(turn, rows)
         for event in events:
             run.journal.take(event)
-        decisions = account_rows(run, blocks, rows)
-        arrivals, ticks = blocks[:, ring.ARRIVAL], blocks[:, ring.END_TICK]
-        clock = run.connection.known_clock()
-        fit = clock.fit
-        if fit is not None:
-            there = fit.reference_host_ns + (ticks - fit.reference_tick) * fit.ns_per_tick
-            for at in np.flatnonzero(there > arrivals).tolist():  # as clock_check.py looks first
-                run.check_tick(int(ticks[at]), int(arrivals[at]))
-        run.block_came(int(arrivals[-1]))
+        runs, marked = self._judged.take(blocks, rows)
+        decisions = account_rows(run, turn.steps.walk.marks, runs, rows)
+        for step, end_ns, uncertainty_ns, look in marked.tolist():
+            arrival_ns, decoded_ns, decided_ns, recorded_ns, end_tick, stop = blocks[step, : ring.ROWS + 1].tolist()
+            if look & kernels.IS_LATE:
+                first = int(blocks[step - 1, ring.ROWS]) if step else 0
+                for number in rows["index"][first:stop].tolist():
+                    run.note_late(number, (end_ns, arrival_ns, decoded_ns, decided_ns, recorded_ns), uncertainty_ns)
+            if look & kernels.IS_AHEAD:
+                run.check_tick(end_tick, arrival_ns)
+        run.block_came(int(blocks[-1, ring.ARRIVAL]))
         outputs.append(Output(decisions, events, self._core.last_tick))
 
     def _watch(self, turn: Turn, rows: Rows) -> list[Any]:
@@ -289,27 +298,17 @@ class CompiledTurns:
         if not core.windows.parallel:
             n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
             return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)
-        events: list[Any] = []
-        for span in turn.messages:
-            if span[ring.WHAT] == MessageType.FRAMES:
-                events += core.watch_frames(decode_frames(turn.bytes_of(span)[HEADER.size :]))
-        return events
+        return [] if self._frames is None else self._frames.take(turn.kept, turn.messages)
 
 
 # -- decisions in rows ------------------------------------------------------------------------------------------------------
 
 
 class RowDecisions(Sequence[Decision]):
-    """Decisions that stand in rows, DECISION_DTYPE (n,), of which each is made when somebody asks for it."""
+    """Decisions that stand in rows, DECISION_DTYPE (n,), valid until the next call, of which each is made when somebody asks for it."""
 
     def __init__(self, rows: Rows) -> None:
         self.rows = rows
-        self._owned = False
-
-    def own(self) -> None:
-        """Copy the rows, once."""
-        if not self._owned:
-            self.rows, self._owned = self.rows.copy(), True
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -328,66 +327,44 @@ class RowDecisions(Sequence[Decision]):
         return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
-def _own(outputs: list[Output]) -> None:
-    """Give outputs rows of their own, before the next call fills the ring anew."""
-    for output in outputs:
-        if isinstance(output.decisions, RowDecisions):
-            output.decisions.own()
+class Judged:
+    """What the ledger says of the decisions of each call; all memory is allocated here, before arming."""
+
+    def __init__(self, run: LiveRun) -> None:
+        self._run = run
+        self._runs: Rows = np.full(ring.MANY, 0, TIMING_RUN_DTYPE)
+        self._marked: I64 = np.full((ring.MANY, kernels.N_MARKED), 0, np.int64)
+        self._sums: I64 = np.full(kernels.N_JUDGED, 0, np.int64)
+        self._histograms = tuple(histogram.numbers for histogram in run.timing.histograms)
+
+    def take(self, blocks: I64, rows: Rows) -> tuple[Rows, I64]:
+        """Judge `rows`, the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
+        timing, clock, sums = self._run.timing, self._run.connection.known_clock(), self._sums
+        sums[:] = 0
+        outputs = (self._histograms, sums, self._runs, self._marked)
+        n_runs, n_marked = kernels.judge_blocks(blocks, rows, *clock.numbers, timing.deadline_ns, *outputs)
+        longest, (uncertainty_ns, late), blame = np.split(sums, (kernels.UNCERTAINTY, kernels.BLAME))
+        if len(rows):
+            timing.went_on(len(rows), longest.tolist(), int(uncertainty_ns), int(late), blame.tolist())
+        return self._runs[:n_runs], self._marked[:n_marked]
 
 
-def account_rows(run: LiveRun, blocks: I64, rows: Rows) -> list[Decision]:
-    """Judge, tally and record the decisions of `blocks` (rings.py's steps); return them."""
-    if not len(rows):
-        return []
-    stops = blocks[:, ring.ROWS]
-    counts = np.diff(stops, prepend=0)
-    of_block = np.flatnonzero(counts)
-    if len(rows) <= FEW_ROWS:
-        return _one_by_one(run, blocks[of_block].tolist(), rows.tolist())
-    _in_columns(run, blocks[of_block], counts[of_block], rows)
-    return cast(list[Decision], RowDecisions(rows))  # read like a list, by whoever looks at an output
-
-
-def _one_by_one(run: LiveRun, blocks: list[list[int]], rows: list[Any]) -> list[Decision]:
-    clock, recorder = run.connection.known_clock(), run.recorder
-    decisions: list[Decision] = []
-    for block in blocks:
-        arrival_ns, decoded_ns, decided_ns, recorded_ns, end_tick, stop = block[: ring.ROWS + 1]
-        end_ns, uncertainty_ns = clock.to_host_ns(end_tick)
-        if end_ns - uncertainty_ns > arrival_ns:  # what has arrived has happened
-            end_ns = arrival_ns
-        marks_ns = (end_ns, arrival_ns, decoded_ns, decided_ns, recorded_ns)
-        for row in rows[len(decisions) : stop]:
-            decision = Decision(*row)
-            decisions.append(decision)
-            mark = run.core.marks.get(decision.object)
-            run.tally.add(decision, math.nan if mark is None else mark.photons)
-            if recorder is not None:
-                recorder.add_decision(decision)
-            if run.timing.judge(marks_ns, uncertainty_ns):
-                run.note_late(decision.number, marks_ns, uncertainty_ns)
-            if recorder is not None:
-                recorder.add_timing((decision.number, end_ns, arrival_ns, decided_ns, recorded_ns))
-    return decisions
-
-
-def _in_columns(run: LiveRun, blocks: I64, counts: I64, rows: Rows) -> None:
-    """As `_one_by_one`, for `counts` int64 (n,) decisions of each of `blocks`; no row is looked at by itself unless it is late."""
-    end_ns, uncertainty_ns = run.connection.known_clock().to_host_many(blocks[:, ring.END_TICK])
-    arrival_ns = blocks[:, ring.ARRIVAL]
-    end_ns = np.where(end_ns - uncertainty_ns > arrival_ns, arrival_ns, end_ns)
-    marks_ns = np.column_stack([end_ns, blocks[:, ring.ARRIVAL : ring.RECORDED + 1]])
-    run.tally.add_rows(rows, photons_of(run.core.marks, rows["object"]))
-    late = run.timing.judge_many(marks_ns, uncertainty_ns, counts)
-    first = np.cumsum(counts) - counts
-    for block in np.flatnonzero(late).tolist():
-        for number in rows["index"][first[block] : first[block] + counts[block]].tolist():
-            run.note_late(number, tuple(marks_ns[block].tolist()), int(uncertainty_ns[block]))
+def account_rows(run: LiveRun, marks: MarkArrays, runs: Rows, rows: Rows) -> list[Decision]:
+    """Tally and record decisions whose times are `runs`; return them."""
     recorder = run.recorder
-    if recorder is not None:
-        recorder.add_decisions(rows)
-        timings: Rows = np.empty(len(rows), TIMING_DTYPE)
-        timings["index"] = rows["index"]
-        for name, column in zip(TIMING_DTYPE.names[1:], (0, 1, 3, 4)):  # type: ignore[index]
-            timings[name] = np.repeat(marks_ns[:, column], counts)
-        recorder.add_timings(timings)
+    if len(rows) > FEW_ROWS:
+        run.tally.add_rows(rows, marks)
+        if recorder is not None:
+            recorder.add_decisions(rows)
+            recorder.add_timing_runs(runs)
+        return cast(list[Decision], RowDecisions(rows))  # read like a list, by whoever looks at an output
+    decisions = [Decision(*row) for row in rows.tolist()]
+    for decision in decisions:
+        mark = run.core.marks.get(decision.object)
+        run.tally.add(decision, math.nan if mark is None else mark.photons)
+        if recorder is not None:
+            recorder.add_decision(decision)
+    if recorder is not None and decisions:
+        for timing in expand_timings(runs).tolist():
+            recorder.add_timing(timing)
+    return decisions

@@ -119,6 +119,8 @@ class DarkRun:
 
     def check_device(self, run: LiveRun) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
+        if run.compiled is not None:
+            self.light.warm_up()
         welcome = run.connection.session.welcome
         serial = None if welcome is None else welcome.facts.get("serial")
         if self.calibration is not None:
@@ -130,7 +132,7 @@ class DarkRun:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""
         rows = getattr(output.decisions, "rows", None)  # of many at once
         if rows is not None:
-            for found in self.light.take_many(rows["clicks"][rows["flags"] & int(NOT_MEASURED) == 0].astype(np.int64)):
+            for found in self.light.take_many(rows["clicks"], rows["flags"], int(NOT_MEASURED)):
                 run.journal.note("light_changed", **found)
             return
         for decision in output.decisions:

@@ -11,6 +11,7 @@ from collections import Counter
 from typing import Any
 
 from pans.runtime.core.decision import CoreEvent
+from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Connection
 from pans.runtime.logs import log_event
 from pans.runtime.record import AnyRecorder
@@ -86,8 +87,21 @@ class Reconciled:
     decoded: Counter[str]  # what the connections that are gone have counted
     contradictions: Counter[str]  # between messages and the clock, or the host's own books
     failed: list[Connection]  # those that broke before they could be armed
+    recorder: AnyRecorder | None
+    ended: str
+    link_lost: bool
     taken_here: int  # messages of the present connection that the core was given, or came before ARM
     _counted: Connection | None = None
+
+    def lose_link(self, error: LinkError) -> None:
+        """End the run because the link is gone; what was decided so far stands."""
+        self.ended = self.ended or f"the link was lost: {error.message}"
+        self.link_lost = True
+
+    def drop_recorder(self) -> None:
+        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
+        self.recorder = self.journal.recorder = None
+        self.connection.on_sent = self.connection.on_answer = None
 
     def count_decoded(self) -> None:
         """Add up what the present connection's decoder has counted, once: before it goes, or at the end; those that failed too."""

@@ -90,6 +90,8 @@ class LiveRun(Reconciled):
         self.failed: list[Connection] = []  # those that broke before they could be armed
         self.taken_here = 0  # messages of the present connection that the core was given, or came before ARM
         self.recorder = recorder
+        self._watch: Watcher | None = None  # of the turn under way
+        self._idle = True  # nothing has come in it
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self.turn_choice = TurnChoice()
         self.compiled: Turns | None = None  # where they are taken in the place of Python's
@@ -181,11 +183,6 @@ class LiveRun(Reconciled):
         status = self.connection.session.status
         return status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE)
 
-    def lose_link(self, error: LinkError) -> None:
-        """End the run because the link is gone; what was decided so far stands."""
-        self.ended = self.ended or f"the link was lost: {error.message}"
-        self.link_lost = True
-
     # -- acting --------------------------------------------------------------------------------------------------------
 
     @property
@@ -210,15 +207,15 @@ class LiveRun(Reconciled):
         self.turned_s = time.monotonic()
         looked_ns = self.now_ns()
         poll_s = self.lateness.poll_s(looked_ns)
+        self._watch, self._idle = watch, True
         outputs = self.take(self.connection.pump(poll_s)) if self.compiled is None else self.compiled.turn(poll_s)
+        idle = self._idle and not outputs
         now_ns = self.now_ns()
         self._act(now_ns)
-        if (verdict := self.lateness.settled(self.connection, now_ns, idle=not outputs)) is not None:
+        if (verdict := self.lateness.settled(self.connection, now_ns, idle=idle)) is not None:
             self.journal.take(verdict)
         self.journal.refusals(self.connection)
-        if watch is not None:
-            for output in outputs:
-                watch(self, output)
+        self.tell(outputs)
         if now_ns >= self._probe_due_ns:
             self.connection.session.probe(now_ns)
             self._probe_due_ns = now_ns + PROBE_EVERY_NS
@@ -229,7 +226,15 @@ class LiveRun(Reconciled):
             self.recorder.flush()
             self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         self._turn_page(now_ns)
-        self.ended = self._why_ended(now_ns, looked_ns, idle=not outputs)
+        self.ended = self._why_ended(now_ns, looked_ns, idle=idle)
+
+    def tell(self, outputs: list[Output]) -> None:
+        """Show outputs to the watcher of this turn, and forget them."""
+        self._idle = self._idle and not outputs
+        if self._watch is not None:
+            for output in outputs:
+                self._watch(self, output)
+        outputs.clear()
 
     def _why_ended(self, now_ns: int, looked_ns: int, *, idle: bool) -> str:
         """Return why the run is over ("" while it is not); LinkError when the device is lost in a way that may be recovered from.
@@ -388,11 +393,6 @@ class LiveRun(Reconciled):
             recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())
             self.journal.session(self.connection)
-
-    def drop_recorder(self) -> None:
-        """Go on without a recording, which cannot be written any further, so that the device can be told to stop."""
-        self.recorder = self.journal.recorder = None
-        self.connection.on_sent = self.connection.on_answer = None
 
     def _renew(self, now_ns: int) -> None:
         self._granted_until = self.core.tracker.next_seq + RECEIVE_WINDOW

@@ -8,17 +8,20 @@ having measured only these objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
-from pans.runtime.wire.messages import Mark
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
+
+if TYPE_CHECKING:
+    from pans.runtime.core.stream_arrays import MarkArrays
 
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
+RUNS_AT_ONCE = 1 << 13  # decisions in a row on one object
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,7 @@ class RunTally:
         self._trials: npt.NDArray[np.int64] = np.zeros((64, 2), np.int64)  # by window within the visit: decided, right
         self._objects: dict[int, list[int]] = {}  # object -> [decided, right]
         self._past = [0.0, 0.0, 0.0]  # objects that are summed up: how many, accuracies, their squares
+        self._runs: npt.NDArray[np.int64] = np.zeros((RUNS_AT_ONCE, 3), np.int64)
 
     def add(self, decision: Decision, photons_per_shot: float) -> None:
         """Count one decision; `photons_per_shot` is NaN where the instrument does not know it."""
@@ -83,50 +87,47 @@ class RunTally:
         sums[0] += 1
         sums[1] += right
 
-    def add_rows(self, rows: npt.NDArray[np.void], photons_per_shot: npt.NDArray[np.float32]) -> None:
-        """Count many decisions, DECISION_DTYPE (n,), with the photons of one shot on each object, NaN where unknown; as `add` does."""
-        flags, labels, truths = rows["flags"], rows["label"].astype(np.int64), rows["truth"].astype(np.int64)
-        self.decisions += len(rows)
-        self.clicks += int(rows["clicks"].sum(dtype=np.int64))
-        self.exposures += int(rows["exposures"].sum(dtype=np.int64))
-        photons = photons_per_shot[~np.isnan(photons_per_shot)].astype(np.float64) * self.shots
-        self.photons = float(np.add.accumulate(np.concatenate([[self.photons], photons]))[-1])  # in the order of `add`
-        self.photons_known += len(photons)
-        silent = (flags & _ABSTAINED != 0) | (labels == NO_LABEL)
-        self.abstained += int(silent.sum())
-        self.unsure += int((silent & (flags & _AMBIGUOUS != 0)).sum())
-        known = (truths >= 0) & (truths < len(self.confusion))
-        labels, truths = labels[known], truths[known]
-        right = labels == truths
-        self.known += len(right)
-        self.right += int(right.sum())
-        named = labels != NO_LABEL
-        n = len(self.confusion)
-        cells = np.bincount(truths[named] * n + labels[named], minlength=n * n)
-        self.confusion += cells.reshape(n, n)
-        trials = (rows["shot"][known] // self.shots).astype(np.int64)
-        self._make_room(int(trials.max(initial=0)))
-        n = len(self._trials)
-        self._trials[:, 0] += np.bincount(trials, minlength=n)
-        self._trials[:, 1] += np.bincount(trials[right], minlength=n)
-        numbers = rows["object"][known].astype(np.int64)
-        self._add_objects(numbers % self.distinct if self.distinct else numbers, right)
+    def warm_up(self, marks: MarkArrays, trials: int) -> None:
+        """Compile or load what `add_rows` needs, and make room for `trials` of an object, before arming."""
+        self._make_room(trials - 1)
+        self._runs[:] = 0  # touched
+        self._add_part(np.zeros(0, DECISION_DTYPE), marks)
+
+    def add_rows(self, rows: npt.NDArray[np.void], marks: MarkArrays) -> None:
+        """Count many decisions, DECISION_DTYPE (n,), on objects of which `marks` tell; as `add` does for each."""
+        for first in range(0, len(rows), RUNS_AT_ONCE):
+            part = rows[first : first + RUNS_AT_ONCE]
+            self._make_room(int(part["shot"].max()) // self.shots)
+            self._add_part(part, marks)
+
+    def _add_part(self, rows: npt.NDArray[np.void], marks: MarkArrays) -> None:
+        from pans.runtime.turn import settling as kernels  # numba is loaded only by who counts many at once
+
+        plan, sums, photons = np.array([self.shots, self.distinct]), np.zeros(kernels.N_SUMS, np.int64), np.zeros(1)
+        photons[0] = self.photons
+        tables = (self.confusion, self._trials, self._runs)
+        n_runs = kernels.add_rows(rows, marks.objects, marks.photons, plan, sums, photons, *tables)
+        self._take_sums(len(rows), sums.tolist(), float(photons[0]))
+        for number, decided, right in self._runs[:n_runs].tolist():
+            mine = self._object_sums(number)
+            mine[0] += decided
+            mine[1] += right
+
+    def _take_sums(self, decisions: int, sums: list[int], photons: float) -> None:
+        clicks, exposures, photons_known, abstained, unsure, known, right = sums
+        self.decisions += decisions
+        self.clicks += clicks
+        self.exposures += exposures
+        self.photons, self.photons_known = photons, self.photons_known + photons_known
+        self.abstained += abstained
+        self.unsure += unsure
+        self.known += known
+        self.right += right
 
     def _make_room(self, trial: int) -> None:
         """Make the sums of trials long enough for one more, twice as long each time; a visit has at most 2^24 exposures."""
         while trial >= len(self._trials):
             self._trials = np.concatenate([self._trials, np.zeros_like(self._trials)])
-
-    def _add_objects(self, numbers: npt.NDArray[np.int64], right: npt.NDArray[np.bool_]) -> None:
-        """Add decisions and right ones to the sums of each object, in the order in which they come: runs of the same one at a time."""
-        starts = np.flatnonzero(np.diff(numbers, prepend=-1))
-        totals = np.concatenate([[0], np.cumsum(right)])
-        stops = np.append(starts[1:], len(numbers))
-        decided, well = (stops - starts).tolist(), (totals[stops] - totals[starts]).tolist()
-        for number, count, good in zip(numbers[starts].tolist(), decided, well):
-            sums = self._object_sums(number)
-            sums[0] += count
-            sums[1] += good
 
     def _which(self, decision: Decision) -> int:
         """Return which object a decision is about: one that is shown again keeps its number."""
@@ -180,10 +181,3 @@ class RunTally:
             clicks_mean=self.clicks / self.decisions if self.decisions else None,
             photons_mean=self.photons / self.photons_known if self.photons_known else None,
         )
-
-
-def photons_of(marks: Mapping[int, Mark], objects: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:
-    """Return the photoelectrons of one shot on each of `objects`, float32 (n,), NaN where no mark told them."""
-    found, places = np.unique(objects, return_inverse=True)
-    known = [marks.get(number) for number in found.tolist()]
-    return np.array([np.nan if mark is None else mark.photons for mark in known], np.float32)[places]

@@ -20,7 +20,7 @@ class RowBuffer:
 
     def __init__(self, kind: Kind, dtype: np.dtype[np.void]) -> None:
         self.kind = kind
-        self.rows = np.zeros(BUFFER_ROWS, dtype=dtype)
+        self.rows = np.full(BUFFER_ROWS, 0, dtype=dtype)  # touched, which np.zeros leaves to the first use
         self.used = 0
 
     def add(self, row: Sequence[Any]) -> bool:
@@ -49,6 +49,7 @@ class ByteBuffer:
         self.kind = kind
         self.data = bytearray(size)
         self.array = np.frombuffer(self.data, np.uint8)  # the same bytes
+        self.array[:] = 0  # touched
         self.used = 0
 
     def room(self) -> int:

@@ -12,13 +12,15 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pans.runtime.container import FILE_MAX_BYTES, MIB
 
 MAGIC = b"PANSRECD"
 FORMAT_VERSION = 3
 WALKS_VERSION = 4  # of runs with an automaton: verdicts have exposures
-READABLE_VERSIONS = (2, 3, 4)  # 2 has no ANSWERS
+RUNS_VERSION = 5  # of parallel frames, many decisions a block: TIMING_RUNS
+READABLE_VERSIONS = (2, 3, 4, 5)  # 2 has no ANSWERS
 MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
 RUN_ROWS_MAX = 1 << 31
@@ -38,21 +40,27 @@ class Kind(IntEnum):
     EVENTS = 8
     END = 9
     ANSWERS = 10
+    TIMING_RUNS = 11
 
 
 LIMITS = {int(kind): 2 * MIB for kind in Kind} | {int(Kind.HEADER): 4 * MIB, int(Kind.BUNDLE): FILE_MAX_BYTES}
-_LIMITS_2 = {kind: limit for kind, limit in LIMITS.items() if kind != Kind.ANSWERS}
+_LIMITS_3 = {kind: limit for kind, limit in LIMITS.items() if kind != Kind.TIMING_RUNS}
+_LIMITS_2 = {kind: limit for kind, limit in _LIMITS_3.items() if kind != Kind.ANSWERS}
 
 
 def version_for(header: Mapping[str, Any]) -> int:
     """Return the lowest format version that holds what a run with this `header` records."""
     config = header.get("config")
-    return WALKS_VERSION if isinstance(config, Mapping) and config.get("drive") else FORMAT_VERSION
+    if not isinstance(config, Mapping):
+        return FORMAT_VERSION
+    if config.get("mode") == "parallel":
+        return RUNS_VERSION
+    return WALKS_VERSION if config.get("drive") else FORMAT_VERSION
 
 
 def limits_of(version: int) -> dict[int, int]:
     """Return the most bytes of a payload by the kinds that a recording of this version may have."""
-    return _LIMITS_2 if version == 2 else LIMITS
+    return _LIMITS_2 if version == 2 else LIMITS if version >= RUNS_VERSION else _LIMITS_3
 
 
 TIMING_DTYPE = np.dtype(
@@ -64,3 +72,15 @@ TIMING_DTYPE = np.dtype(
         ("recorded_ns", "<i8"),
     ]
 )
+TIMING_RUN_DTYPE = np.dtype([*TIMING_DTYPE.descr, ("count", "<u4")])  # decisions from `index` on that share their times
+TIMING_ROWS_MAX = 1 << 20  # of one block of runs, so that a small file cannot ask for much memory
+
+
+def expand_timings(runs: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the rows, TIMING_DTYPE, that `runs`, TIMING_RUN_DTYPE (n,), stand for."""
+    counts = runs["count"].astype(np.int64)
+    rows: NDArray[np.void] = np.empty(int(counts.sum()), TIMING_DTYPE)
+    for name in TIMING_DTYPE.names or ():
+        rows[name] = np.repeat(runs[name], counts)
+    rows["index"] += (np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)).astype(np.uint64)
+    return rows

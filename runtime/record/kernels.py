@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pans.runtime.wire.kernels import copy_span
+
 from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
 # state, uint64 (N_STATE,): the run that is open, as its next row would have to be, and the verdicts known so far
@@ -198,6 +200,5 @@ def _pack(buffer, begin, end, host_ns, out, used):  # type: ignore[no-untyped-de
     for i in range(4):
         out[used + 8 + i] = np.uint8(end - begin >> 8 * i & 0xFF)
     used += _MESSAGE_HEAD
-    for i in range(end - begin):
-        out[used + i] = buffer[begin + i]
+    copy_span(buffer, _U(begin), _U(end), out, _U(used))
     return used + end - begin

@@ -73,12 +73,14 @@ class LogEncoder:
         self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
         self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
-        self._keys = np.zeros((LONG_VERDICT, 3), np.uint64)
+        self._keys = np.full((LONG_VERDICT, 3), 0, np.uint64)
         self._slots = np.full(_SLOTS, LONG_VERDICT, np.uint16)
-        self._runs: NDArray[np.void] = np.zeros(BLOCK_ROWS, RUN_DTYPE)
-        self._verdicts: NDArray[np.void] = np.zeros(BLOCK_ROWS, VERDICT_DTYPE)
-        self._exposures = np.zeros(BLOCK_ROWS, EXPOSURES_DTYPE)
-        self._codes = np.zeros(BLOCK_ROWS, np.uint16)
+        self._runs: NDArray[np.void] = np.full(
+            BLOCK_ROWS, 0, RUN_DTYPE
+        )  # touched, which np.zeros leaves to the first use
+        self._verdicts: NDArray[np.void] = np.full(BLOCK_ROWS, 0, VERDICT_DTYPE)
+        self._exposures = np.full(BLOCK_ROWS, 0, EXPOSURES_DTYPE)
+        self._codes = np.full(BLOCK_ROWS, 0, np.uint16)
         self._take(np.zeros(0, DECISION_DTYPE))  # compiles the kernel, or loads it
 
     def block(self, rows: NDArray[np.void]) -> bytes:

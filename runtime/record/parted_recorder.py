@@ -120,9 +120,9 @@ class PartedRecorder:
         """See `Recorder`."""
         self.open_part.add_timing(record)
 
-    def add_timings(self, rows: NDArray[np.void]) -> None:
+    def add_timing_runs(self, runs: NDArray[np.void]) -> None:
         """See `Recorder`."""
-        self.open_part.add_timings(rows)
+        self.open_part.add_timing_runs(runs)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """See `Recorder`."""

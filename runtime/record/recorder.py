@@ -26,7 +26,19 @@ from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
 from .buffers import BUFFER_ROWS, ByteBuffer, RowBuffer
-from .format import LIMITS, MAGIC, MESSAGE, MESSAGE_MAX_BYTES, TIMING_DTYPE, Kind, version_for
+from .format import (
+    LIMITS,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_MAX_BYTES,
+    RUNS_VERSION,
+    TIMING_DTYPE,
+    TIMING_ROWS_MAX,
+    TIMING_RUN_DTYPE,
+    Kind,
+    expand_timings,
+    version_for,
+)
 from .log import BLOCK_ROWS, LogEncoder
 
 _MESSAGE_BUFFER_BYTES = MIB // 4
@@ -62,8 +74,11 @@ class Recorder:
         self._events = ByteBuffer(Kind.EVENTS, _EVENT_BUFFER_BYTES)
         self._decisions = RowBuffer(Kind.DECISIONS, DECISION_DTYPE)
         self._timings = RowBuffer(Kind.TIMINGS, TIMING_DTYPE)
+        self._timing_runs = RowBuffer(Kind.TIMING_RUNS, TIMING_RUN_DTYPE)
+        self._in_runs = 0  # decisions in these
         # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
-        self._in_order = (self._commands, self._answers, self._messages, self._decisions, self._timings)
+        first = (self._commands, self._answers, self._messages, self._decisions)
+        self._in_order = (*first, self._timings, self._timing_runs)
         self._log = LogEncoder()
         from .kernels import pack_messages, pack_stamped  # numba is loaded only by who records
 
@@ -72,7 +87,7 @@ class Recorder:
         pack_stamped(self._messages.array, np.zeros((0, 4), np.int64), 0, self._messages.array, 0)
         self._n_decisions = 0
         self._n_blocks = 0
-        version = version_for(header)
+        self._version = version = version_for(header)
         facts = {"format_version": version, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
         facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
         text = canonical_json({**facts, **header})
@@ -177,16 +192,32 @@ class Recorder:
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
+        self._end_runs()
         if self._timings.add(record):
             self._empty(self._timings)
 
-    def add_timings(self, rows: NDArray[np.void]) -> None:
-        """Keep the host times of many decisions, TIMING_DTYPE (n,)."""
+    def add_timing_runs(self, runs: NDArray[np.void]) -> None:
+        """Keep the host times of many decisions, TIMING_RUN_DTYPE (n,), at most 2^16 of each run."""
+        if self._version < RUNS_VERSION:
+            self._add_rows(self._timings, expand_timings(runs))
+            return
+        if self._timings.used:
+            self._empty(self._timings)  # the order of time
+        self._in_runs += int(runs["count"].sum())
+        self._add_rows(self._timing_runs, runs)
+        if self._in_runs > TIMING_ROWS_MAX // 2:
+            self._end_runs()
+
+    def _end_runs(self) -> None:
+        if self._timing_runs.used:
+            self._empty(self._timing_runs)
+
+    def _add_rows(self, buffer: RowBuffer, rows: NDArray[np.void]) -> None:
         done = 0
         while done < len(rows):
-            done += self._timings.add_many(rows[done:])
-            if self._timings.used == BUFFER_ROWS:
-                self._empty(self._timings)
+            done += buffer.add_many(rows[done:])
+            if buffer.used == BUFFER_ROWS:
+                self._empty(buffer)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Keep one JSON-able event: a gap, an alarm, a late decision, a link that went away."""
@@ -283,6 +314,8 @@ class Recorder:
             rows = self._decisions.rows[: self._decisions.used]
             self._decisions.used = 0
             return b"".join(self._framed(Kind.DECISIONS, self._log.block(rows)))
+        if buffer is self._timing_runs:
+            self._in_runs = 0
         return b"".join(self._framed(buffer.kind, buffer.take()))
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:

@@ -32,7 +32,17 @@ from pans.runtime.html_card import html_card
 from pans.runtime.timing.clock import CLOCK_DTYPE
 from pans.runtime.wire.frame import Messages
 
-from .format import MAGIC, MESSAGE, READABLE_VERSIONS, TIMING_DTYPE, Kind, limits_of
+from .format import (
+    MAGIC,
+    MESSAGE,
+    READABLE_VERSIONS,
+    TIMING_DTYPE,
+    TIMING_ROWS_MAX,
+    TIMING_RUN_DTYPE,
+    Kind,
+    expand_timings,
+    limits_of,
+)
 from .log import LogReader
 
 MESSAGES_AT_ONCE = 1 << 14
@@ -116,11 +126,16 @@ class Recording:
 
     def timings(self) -> NDArray[np.void]:
         """Return the host times of all decisions, TIMING_DTYPE (n,)."""
-        return self._rows(Kind.TIMINGS, TIMING_DTYPE)
+        parts = list(self.iter_timings())
+        return np.concatenate(parts) if parts else np.zeros(0, TIMING_DTYPE)
 
     def iter_timings(self) -> Iterator[NDArray[np.void]]:
         """Yield the host times block by block, TIMING_DTYPE (n,); memory holds one block."""
-        return self._iter_rows(Kind.TIMINGS, TIMING_DTYPE)
+        for block in self.iter_blocks(Kind.TIMINGS, Kind.TIMING_RUNS):
+            if block.kind == Kind.TIMINGS:
+                yield np.frombuffer(_whole_rows(block, TIMING_DTYPE, self.path), TIMING_DTYPE)
+            else:
+                yield expand_timings(_checked_runs(block, self.path))
 
     def clock_samples(self) -> NDArray[np.void]:
         """Return all clock samples, CLOCK_DTYPE (n,)."""
@@ -188,6 +203,18 @@ def _whole_rows(block: Block, dtype: np.dtype[np.void], path: Path) -> bytes:
         size = len(block.payload)
         raise DamagedFileError(f"{path}: block {block.index} has {size} bytes, allowed: a multiple of {dtype.itemsize}")
     return block.payload
+
+
+def _checked_runs(block: Block, path: Path) -> NDArray[np.void]:
+    """Return the runs of a block that do not ask for more memory than such a block may."""
+    runs = np.frombuffer(_whole_rows(block, TIMING_RUN_DTYPE, path), TIMING_RUN_DTYPE)
+    rows = int(runs["count"].sum(dtype=np.uint64))
+    if rows > TIMING_ROWS_MAX or not runs["count"].all():
+        raise DamagedFileError(
+            f"{path}: block {block.index} has the times of {rows} decisions in {len(runs)} runs, allowed: 1 or more in each, "
+            f"{TIMING_ROWS_MAX} at most"
+        )
+    return runs
 
 
 def _checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:

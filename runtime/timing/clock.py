@@ -35,6 +35,10 @@ MAX_RATE_ERROR = (
 )
 LARGEST_NS = 1 << 62  # 146 years: a tick that claims more is no time, and must still fit the recording's int64
 
+# reference tick and host time, ns per tick and uncertainty per tick, where anchors lie and their bounds
+ClockNumbers = tuple[
+    tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]], tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]
+]
 CLOCK_DTYPE = np.dtype([("host_ns", "<i8"), ("tick", "<u8"), ("round_trip_ns", "<i8")])
 
 
@@ -87,6 +91,7 @@ class ClockModel:
         self.fit: ClockFit | None = None
         self._kept = 0  # since the last jump
         self._strange = 0
+        self._numbers: tuple[ClockFit, ClockNumbers] | None = None
         self._unrecorded: deque[tuple[int, int, int]] = deque(maxlen=MAX_UNRECORDED)
 
     def add_probe(self, sent_ns: int, rx_tick: int, tx_tick: int, received_ns: int) -> ClockStep | None:
@@ -122,17 +127,16 @@ class ClockModel:
         host_ns = fit.reference_host_ns + round(elapsed * fit.ns_per_tick)
         return max(-LARGEST_NS, min(host_ns, LARGEST_NS)), min(int(uncertainty) + 1, LARGEST_NS)
 
-    def to_host_many(self, ticks: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Return the host times of many ticks below 2^62 and their uncertainties, int64 (n,), as `to_host_ns` of each."""
+    @property
+    def numbers(self) -> ClockNumbers:
+        """What compiled code makes host times and their uncertainties of, as `to_host_ns` does."""
         fit = self._ready()
-        elapsed = ticks - fit.reference_tick
-        rate = fit.ns_per_tick * fit.rate_uncertainty
-        bounds = [bound + np.abs(elapsed - at) * rate for at, bound in fit.anchors]
-        host = fit.reference_host_ns + np.clip(np.rint(elapsed * fit.ns_per_tick), -LARGEST_NS, LARGEST_NS).astype(
-            np.int64
-        )
-        uncertainty = np.minimum(np.minimum.reduce(bounds), LARGEST_NS - 1).astype(np.int64) + 1
-        return np.clip(host, -LARGEST_NS, LARGEST_NS), uncertainty
+        if self._numbers is None or self._numbers[0] is not fit:
+            line = (fit.ns_per_tick, fit.ns_per_tick * fit.rate_uncertainty)
+            places = (np.array([at for at, _ in fit.anchors], np.int64), np.array([bound for _, bound in fit.anchors]))
+            numbers = ((np.array([fit.reference_tick, fit.reference_host_ns]), np.array(line)), places)
+            self._numbers = (fit, numbers)
+        return self._numbers[1]
 
     def to_tick(self, host_ns: int) -> int:
         """Return the device tick at a host time (for commands with absolute ticks)."""

@@ -12,6 +12,7 @@ import gc
 import os
 import sys
 import threading
+from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -19,7 +20,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .page_faults import held_heap
 
@@ -34,7 +34,8 @@ class LatencyHistogram:
     """Log-linear counts of durations in ns; integer, exact maximum, no allocation in `add`."""
 
     def __init__(self) -> None:
-        self.counts = [0] * N_BUCKETS
+        self.counts = array("q", bytes(8 * N_BUCKETS))
+        self.numbers = np.frombuffer(self.counts, np.int64)  # the same, for compiled code
         self.total = 0
         self.max_ns = 0
 
@@ -47,16 +48,10 @@ class LatencyHistogram:
         if value > self.max_ns:
             self.max_ns = value
 
-    def add_many(self, durations_ns: NDArray[np.int64], weights: NDArray[np.int64]) -> None:
-        """Count many durations, each `weights` times, both int64 (n,); as `add` for each."""
-        values = np.maximum(durations_ns, 0)
-        shift = np.maximum(np.frexp(values.astype(np.float64))[1] - SUB_BITS - 1, 0)  # exact below 2^53 ns
-        buckets = (shift << SUB_BITS) + (values >> shift)
-        found, places = np.unique(buckets, return_inverse=True)
-        for bucket, count in zip(found.tolist(), np.bincount(places, weights).astype(np.int64).tolist()):
-            self.counts[bucket] += count
-        self.total += int(weights.sum())
-        self.max_ns = max(self.max_ns, int(values.max(initial=0)))
+    def went_on(self, more: int, longest_ns: int) -> None:
+        """Take over `more` durations that compiled code has counted in `numbers`."""
+        self.total += more
+        self.max_ns = max(self.max_ns, longest_ns)
 
     def quantile_ns(self, q: float) -> int:
         """Return the upper edge of the bucket that holds quantile `q` (never above the exact maximum); 0 without data."""
@@ -115,21 +110,22 @@ class TimingLedger:
         self.blame[STAGES[slowest]] = self.blame.get(STAGES[slowest], 0) + 1
         return True
 
-    def judge_many(
-        self, marks_ns: NDArray[np.int64], uncertainty_ns: NDArray[np.int64], weights: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
-        """Take the times of many decisions, int64 (n, 5) as `judge` takes them, each of `weights` (n,) decisions; return which are late."""
-        steps = np.diff(marks_ns, axis=1)
-        for column, name in enumerate(STAGES):
-            self.stages[name].add_many(steps[:, column], weights)
-        latency = marks_ns[:, 3] - marks_ns[:, 0]
-        self.total.add_many(latency, weights)
-        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, int(uncertainty_ns.max(initial=0)))
-        late: NDArray[np.bool_] = latency - uncertainty_ns > self.deadline_ns
-        self.late += int(weights[late].sum())
-        for stage, count in zip(steps[late, :3].argmax(axis=1).tolist(), weights[late].tolist()):
-            self.blame[STAGES[stage]] = self.blame.get(STAGES[stage], 0) + count
-        return late
+    @property
+    def histograms(self) -> tuple[LatencyHistogram, ...]:
+        """The stages in their order, and the total."""
+        return (*self.stages.values(), self.total)
+
+    def went_on(
+        self, decisions: int, longest_ns: Sequence[int], uncertainty_ns: int, late: int, blame: Sequence[int]
+    ) -> None:
+        """Take over what compiled code has judged as `judge` would: the longest of `histograms`, the late ones by slowest stage."""
+        for histogram, longest in zip(self.histograms, longest_ns):
+            histogram.went_on(decisions, longest)
+        self.worst_uncertainty_ns = max(self.worst_uncertainty_ns, uncertainty_ns)
+        self.late += late
+        for name, count in zip(STAGES, blame):
+            if count:
+                self.blame[name] = self.blame.get(name, 0) + count
 
 
 class _Heap:

@@ -36,8 +36,7 @@ def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-unty
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     control, scratch = bare(control), bare(scratch)
-    control[ring.ERRNO : ring.N_CONTROL] = 0
-    walk.state[core.N_ROWS] = 0
+    _begin(walk, control)
     ended = take_bodies(decoder, walk, drive, rings, control, scratch)
     if ended != ring.ALL_TAKEN or not control[ring.READS]:
         return ended
@@ -90,8 +89,7 @@ def feed(data, reads, decoder, walk, drive, rings, control, scratch):  # type: i
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     data, reads, control, scratch = bare(data), bare(reads), bare(control), bare(scratch)
-    control[ring.ERRNO : ring.N_CONTROL] = 0
-    walk.state[core.N_ROWS] = 0
+    _begin(walk, control)
     while True:
         ended = take_bodies(decoder, walk, drive, rings, control, scratch)
         if ended != ring.ALL_TAKEN or control[ring.NEXT_READ] == reads.shape[0]:
@@ -103,11 +101,19 @@ def feed(data, reads, decoder, walk, drive, rings, control, scratch):  # type: i
         control[ring.NEXT_READ] += 1
         held = _make_room(decoder)
         at = control[ring.READ_AT]
-        decoder.buffer[held : held + size] = data[at : at + size]
+        wire.copy_span(data, _U(at), _U(at + size), decoder.buffer, _U(held))
         control[ring.READ_AT] += size
         _decode(decoder, control, held, size)
         rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
         control[ring.N_ARRIVALS] += 1
+
+
+@njit(cache=True, nogil=True)
+def _begin(walk, control):  # type: ignore[no-untyped-def]
+    """Nothing has come in this call yet."""
+    for column in range(ring.ERRNO, ring.N_CONTROL):
+        control[column] = 0
+    walk.state[core.N_ROWS] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -224,7 +230,7 @@ def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
 def _keep(buffer, start, stop, kept, spans, count, control):  # type: ignore[no-untyped-def]
     """Copy a body behind what is kept, and say where it stands; `count` is the column of `control` that counts the spans."""
     at = control[ring.KEPT]
-    kept[at : at + stop - start] = buffer[start:stop]
+    wire.copy_span(buffer, _U(start), _U(stop), kept, _U(at))
     span = spans[control[count]]
     span[ring.BEGIN], span[ring.END], span[ring.TIME] = at, at + stop - start, control[ring.ARRIVAL_NS]
     span[ring.WHAT] = buffer[start]

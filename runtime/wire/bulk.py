@@ -28,8 +28,9 @@ class BulkDecoder:
     def __init__(self) -> None:
         self._raw = bytearray(MAX_FRAME_BYTES + CHUNK_BYTES)
         self.buffer: U8 = np.frombuffer(self._raw, np.uint8)
+        self.buffer[:] = 0  # touched, as what np.full makes: else each page is a fault when it is first used
         self._view = memoryview(self._raw)
-        self._bodies: I64 = np.zeros((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), np.int64)
+        self._bodies: I64 = np.full((len(self.buffer) // SMALLEST_FRAME_BYTES + 1, 2), 0, np.int64)
         self._tally: I64 = np.zeros(kernels.N_TALLIES, np.int64)
 
     @property

@@ -66,6 +66,13 @@ def load4(data, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def copy_span(source, start, stop, target, at):  # type: ignore[no-untyped-def]
+    """Copy source[start:stop] to target[at:], uint8, places uint64; numba takes seconds to compile the assignment of a slice."""
+    for i in range(stop - start):
+        target[at + i] = source[start + i]
+
+
+@njit(cache=True, nogil=True)
 def crc32_span(data, start, stop, seed):  # type: ignore[no-untyped-def]
     """CRC-32 of data[start:stop], uint8, continued from `seed`, as zlib.crc32 gives it; a uint64 below 2^32.
 

@@ -16,8 +16,8 @@ import numpy as np
 from lab_bundle import MIB, demand, strict_json
 from numpy.typing import NDArray
 
-HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS = range(1, 11)
-LIMITS = {kind: 2 * MIB for kind in range(1, 11)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
+HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS, TIMING_RUNS = range(1, 12)
+LIMITS = {kind: 2 * MIB for kind in range(1, 12)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
 ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:], ("exposures", "<u4")])
@@ -73,8 +73,8 @@ def iter_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, payload) of every block, with the chain of checksums checked."""
     magic, version, chain = struct.unpack_from("<8sII", data)
     demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain, "no recording")
-    demand(version in (2, 3, 4), f"version {version}")
-    known = set(LIMITS) - ({ANSWERS} if version == 2 else set())
+    demand(version in (2, 3, 4, 5), f"version {version}")
+    known = set(LIMITS) - ({ANSWERS} if version == 2 else set()) - ({TIMING_RUNS} if version < 5 else set())
     at, index, kind = 16, 0, 0
     while at < len(data):
         demand(kind != END, "bytes behind END")
@@ -106,6 +106,10 @@ def _take(recording: Recording, kind: int, payload: bytes) -> None:
         recording.clock += struct.iter_unpack("<qQq", payload)
     elif kind == TIMINGS:
         recording.timings += struct.iter_unpack("<Qqqqq", payload)
+    elif kind == TIMING_RUNS:
+        for first, *times, count in struct.iter_unpack("<QqqqqI", payload):
+            demand(count > 0, "a run of no decisions")
+            recording.timings += [(first + k, *times) for k in range(count)]
     elif kind == EVENTS:
         recording.events += [strict_json(line) for line in payload.splitlines()]
     elif kind == DECISIONS:

@@ -97,7 +97,9 @@ def record(folder: Path, case: Case, bundle: Path) -> Path:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.mode}-{case.backend}-{bool(case.faults)}")
 def test_decisions_come_out_the_same(tmp_path: Path, case: Case) -> None:
     write_bundle(small_bundle(case.backend), tmp_path / "small.pans")
-    recording = read_recording(record(tmp_path, case, tmp_path / "small.pans").read_bytes())
+    path = record(tmp_path, case, tmp_path / "small.pans")
+    recording = read_recording(path.read_bytes())
+    assert recording.timings == our_reader(path).timings().tolist()
     assert recording.bundle == (tmp_path / "small.pans").read_bytes()
     assert recording.header["config"]["backend"] == case.backend
     rows = decide_again(recording, read_bundle(recording.bundle))

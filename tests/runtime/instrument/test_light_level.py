@@ -111,8 +111,10 @@ def test_many_decisions_at_once_are_those_one_by_one() -> None:
         one.take(number)
     at = 0
     while at < len(clicks):
-        n = int(rng.integers(0, 700))
-        many.take_many(clicks[at : at + n])
+        n = min(int(rng.integers(0, 700)), len(clicks) - at)
+        columns = np.zeros((2 * n, 2), np.uint32)
+        columns[:n, 0], columns[n:] = clicks[at : at + n], (9, 6)  # the second half is left out
+        many.take_many(columns[:, 0], columns[:, 1], 4)
         at += n
     assert one.found
     assert (one.found, one.report()) == (many.found, many.report())

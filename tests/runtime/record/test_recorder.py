@@ -21,7 +21,7 @@ from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.errors import DamagedFileError, PansError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
-from pans.runtime.record.format import TIMING_DTYPE, Kind
+from pans.runtime.record.format import TIMING_DTYPE, TIMING_RUN_DTYPE, Kind
 from pans.runtime.record.log import decision_log_sha256
 from pans.runtime.record.sent_plan import automaton_of
 from pans.runtime.timing.clock import CLOCK_DTYPE
@@ -79,6 +79,36 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert found.bundle_data() == b""
     with pytest.raises(UsageError, match="no bundle"):
         found.bundle()
+
+
+def test_times_that_decisions_share_stand_once(tmp_path: Path) -> None:
+    """Between single ones, in the order of time; a recording of another version has them one by one."""
+    runs = np.array([(1, 10, 20, 30, 40, 3), (4, 11, 21, 31, 41, 1), (5, 12, 22, 32, 42, 9000)], TIMING_RUN_DTYPE)
+    single = [(0, 9, 19, 29, 39), (9005, 13, 23, 33, 43)]
+    shared = [(first + k, *times) for first, *times, count in runs.tolist() for k in range(count)]
+    sizes = []
+    for name, config in (("runs", {"mode": "parallel"}), ("rows", {})):
+        with Recorder(tmp_path / name, {"config": config}) as recorder:
+            recorder.add_timing(single[0])
+            recorder.add_timing_runs(runs)
+            recorder.add_timing(single[1])
+            recorder.close({})
+        found = read_recording(tmp_path / name)
+        assert found.version == (5 if config else 3)
+        assert found.timings().tolist() == [single[0], *shared, single[1]]
+        sizes.append(found.size)
+    assert sizes[0] < 2000 < 300_000 < sizes[1]
+
+
+@pytest.mark.parametrize("counts", [[0], [1 << 20, 1], [0xFFFFFFFF] * 3])
+def test_runs_that_ask_for_much_memory_are_refused(tmp_path: Path, counts: list[int]) -> None:
+    runs = np.zeros(len(counts), TIMING_RUN_DTYPE)
+    runs["count"] = counts
+    with Recorder(tmp_path / "a", {"config": {"mode": "parallel"}}) as recorder:
+        recorder.add_timing_runs(runs)
+        recorder.close({})
+    with pytest.raises(DamagedFileError, match="allowed: 1 or more in each, 1048576 at most"):
+        read_recording(tmp_path / "a").timings()
 
 
 def test_the_bytes_are_those_of_the_document(tmp_path: Path) -> None:

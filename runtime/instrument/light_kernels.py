@@ -1,0 +1,77 @@
+"""The compiled kernel of the light watch: the clicks of many decisions at once.
+
+Owns the twin of `LightWatch.take` up to where something is to be done: a baseline may be known, or a sum has passed its threshold.
+light_level.py owns what is done then. Never allocates.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+# counts, int64 (N_COUNTS,): LightWatch's own, by their names there; decisions, batches and clicks when each sum last was 0
+DECISIONS, CLICKS, IN_BATCH, N, SUM, SQUARES, BATCHES, TOTAL, FALL, RISE, BATCH, N_COUNTS = *range(9), 11, 14, 15
+# levels, float64 (N_LEVELS,): the two sums; of the baseline mean, slack and threshold; before it, its least error and batches
+LOW, HIGH, MEAN, SLACK, THRESHOLD, ERROR, LEAST, MOST, N_LEVELS = range(9)
+ALL_TAKEN, LEARNT, FELL, ROSE = range(4)  # why a call ended
+
+
+@njit(cache=True, nogil=True)
+def take_clicks(clicks, flags, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
+    """Take decisions from `first` on, but those with one of the flags `left_out`; return where it ended, behind which, and why.
+
+    clicks and flags uint32 (n,). LEARNT: the batches so far may make a baseline (levels[MEAN] is NaN without one). FELL, ROSE: that sum
+    has passed the threshold; the other one has not been looked at, if it is the later.
+    """
+    batch = counts[BATCH]
+    for i in range(first, clicks.size):
+        if flags[i] & left_out:
+            continue
+        counts[DECISIONS] += 1
+        counts[CLICKS] += np.int64(clicks[i])
+        counts[IN_BATCH] += 1
+        if counts[IN_BATCH] < batch:
+            continue
+        total = counts[CLICKS]
+        counts[CLICKS], counts[IN_BATCH] = 0, 0
+        if math.isnan(levels[MEAN]):
+            if _learn(total, counts, levels):
+                return i + 1, LEARNT
+        else:
+            why = _compare(total, counts, levels)
+            if why != ALL_TAKEN:
+                return i + 1, why
+    return clicks.size, ALL_TAKEN
+
+
+@njit(cache=True, nogil=True)
+def _learn(total, counts, levels):  # type: ignore[no-untyped-def]
+    """Add a batch; whether its mean is known well enough."""
+    counts[N] += 1
+    counts[SUM] += total
+    counts[SQUARES] += total * total
+    n = counts[N]
+    if n < levels[LEAST]:
+        return False
+    mean = counts[SUM] / n
+    variance = (counts[SQUARES] - counts[SUM] * mean) / (n - 1)
+    error = math.sqrt(max(variance, mean, 1.0)) / math.sqrt(n)
+    return mean > 0 and (error <= levels[ERROR] * mean or n >= levels[MOST])
+
+
+@njit(cache=True, nogil=True)
+def _compare(total, counts, levels):  # type: ignore[no-untyped-def]
+    """Add a batch to both sums; which of them has passed."""
+    counts[BATCHES] += 1
+    counts[TOTAL] += total
+    levels[LOW] = max(0.0, levels[LOW] + levels[MEAN] - total - levels[SLACK])
+    levels[HIGH] = max(0.0, levels[HIGH] + total - levels[MEAN] - levels[SLACK])
+    for side in range(2):
+        since = FALL if side == 0 else RISE
+        if levels[LOW + side] == 0.0:
+            counts[since], counts[since + 1], counts[since + 2] = counts[DECISIONS], counts[BATCHES], counts[TOTAL]
+        elif levels[LOW + side] >= levels[THRESHOLD]:
+            return FELL + side
+    return ALL_TAKEN

@@ -1,0 +1,137 @@
+"""The compiled kernels of what a call of the compiled turn brought: its decisions added up row by row, its blocks judged by the clock.
+
+Owns the twins of `RunTally.add`, of `TimingLedger.judge` and of `ClockModel.to_host_ns` for many; tally.py, ledger.py and clock.py own
+the sums and their meaning. Never allocates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.stream_kernels import MARK_SLOTS
+from pans.runtime.timing.clock import LARGEST_NS, STEP_MARGIN_NS
+from pans.runtime.timing.ledger import SUB_BITS
+
+from . import rings as ring
+
+# sums, int64 (N_SUMS,), of the rows that a call has taken
+CLICKS, EXPOSURES, PHOTONS_KNOWN, ABSTAINED, UNSURE, KNOWN, RIGHT, N_SUMS = range(8)
+NUMBER, DECIDED, WELL = range(3)  # objects, int64 (n, 3): which one, its decisions, the right ones among them
+# judged, int64 (N_JUDGED,): the longest of each stage and in total, the largest uncertainty, late decisions, those by slowest stage
+LONGEST, UNCERTAINTY, LATE, BLAME, N_JUDGED = 0, 5, 6, 7, 10
+# marked, int64 (n, N_MARKED): a block's number among the steps, when it ended and how unsure that is, and what is to be looked at
+STEP, ENDED_NS, UNSURE_NS, LOOK, N_MARKED = range(5)
+IS_LATE, IS_AHEAD = 1, 2
+_ABSTAINED, _AMBIGUOUS = np.uint32(DecisionFlag.ABSTAINED), np.uint32(DecisionFlag.AMBIGUOUS)
+_NO_LABEL = NO_LABEL
+
+
+@njit(cache=True, nogil=True)
+def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objects):  # type: ignore[no-untyped-def]
+    """Add rows, DECISION_DTYPE (n,), to what decisions add up to; return how many runs of one object they were.
+
+    marked int64 and photons_of float32 (MARK_SLOTS,): MarkArrays; plan int64 (2,): K and after how many objects the first one is shown
+    again (0: never). sums int64 (N_SUMS,), photons float64 (1,), table int64 (classes, classes), trials int64 (m, 2) with room for all
+    are added to; objects int64 (n, 3) is filled from its beginning.
+    """
+    numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
+    truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
+    n_clicks, n_walked, n_photons, n_silent, n_unsure, n_known, n_right = 0, 0, 0, 0, 0, 0, 0
+    total, per_decision, object_before, n_objects = photons[0], plan[0], np.int64(-1), 0
+    for i in range(rows.size):
+        number, label, truth = np.int64(numbers[i]), np.int64(labels[i]), np.int64(truths[i])
+        n_clicks += np.int64(clicks[i])
+        n_walked += np.int64(walked[i])
+        slot = number % MARK_SLOTS
+        if marked[slot] == number and not np.isnan(photons_of[slot]):
+            total += np.float64(photons_of[slot]) * per_decision
+            n_photons += 1
+        if flags[i] & _ABSTAINED or label == _NO_LABEL:
+            n_silent += 1
+            n_unsure += (flags[i] & _AMBIGUOUS) != 0
+        if truth < 0 or truth >= table.shape[0]:
+            continue
+        right = np.int64(label == truth)
+        n_known += 1
+        n_right += right
+        if label != _NO_LABEL:
+            table[truth, label] += 1
+        trial = np.int64(shots[i]) // plan[0]
+        trials[trial, 0] += 1
+        trials[trial, 1] += right
+        which = number % plan[1] if plan[1] else number
+        if which != object_before:
+            objects[n_objects, NUMBER], objects[n_objects, DECIDED], objects[n_objects, WELL] = which, 0, 0
+            n_objects, object_before = n_objects + 1, which
+        objects[n_objects - 1, DECIDED] += 1
+        objects[n_objects - 1, WELL] += right
+    photons[0] = total
+    sums[CLICKS], sums[EXPOSURES], sums[PHOTONS_KNOWN], sums[ABSTAINED] = n_clicks, n_walked, n_photons, n_silent
+    sums[UNSURE], sums[KNOWN], sums[RIGHT] = n_unsure, n_known, n_right
+    return n_objects
+
+
+@njit(cache=True, nogil=True)
+def judge_blocks(steps, rows, fit, anchors, deadline_ns, histograms, judged, runs, marked):  # type: ignore[no-untyped-def]
+    """Judge the times of the decisions of many blocks, `steps` int64 (n, N_STEP); return how many runs and how many marked blocks.
+
+    fit: ClockModel.numbers, int64 (2,) and float64 (2,); anchors: its anchors, int64 (k,) and float64 (k,); histograms: the counts of four
+    stages and of the total, int64 each, and judged int64 (N_JUDGED,) are added to. runs TIMING_RUN_DTYPE (n,): one for each block with
+    decisions. marked int64 (n, N_MARKED): late blocks, and those whose end lies in the future, which may have no decisions.
+    """
+    tick_0, host_0, ns_per_tick, rate = fit[0][0], fit[0][1], fit[1][0], fit[1][1]
+    at, bounds = anchors
+    n_runs, n_marked, before = 0, 0, np.int64(0)
+    for i in range(steps.shape[0]):
+        arrival_ns, elapsed = steps[i, ring.ARRIVAL], steps[i, ring.END_TICK] - tick_0
+        away = min(max(np.rint(elapsed * ns_per_tick), -np.float64(LARGEST_NS)), np.float64(LARGEST_NS))
+        end_ns = max(-LARGEST_NS, min(host_0 + np.int64(away), LARGEST_NS))
+        unsure = bounds[0] + abs(elapsed - at[0]) * rate
+        for k in range(1, at.size):
+            unsure = min(unsure, bounds[k] + abs(elapsed - at[k]) * rate)
+        unsure_ns = np.int64(min(unsure, np.float64(LARGEST_NS - 1))) + 1
+        look = IS_AHEAD if end_ns - unsure_ns - STEP_MARGIN_NS > arrival_ns else 0
+        count = steps[i, ring.ROWS] - before
+        if count:
+            if end_ns - unsure_ns > arrival_ns:  # what has arrived has happened
+                end_ns = arrival_ns
+            marks = (end_ns, arrival_ns, steps[i, ring.DECODED], steps[i, ring.DECIDED], steps[i, ring.RECORDED])
+            if _judge(marks, count, unsure_ns, deadline_ns, histograms, judged):
+                look |= IS_LATE
+            run = runs[n_runs]
+            run["index"], run["count"] = rows[before]["index"], count
+            run["device_end_ns"], run["arrival_ns"], run["decided_ns"], run["recorded_ns"] = (
+                end_ns,
+                arrival_ns,
+                marks[3],
+                marks[4],
+            )
+            n_runs, before = n_runs + 1, before + count
+        if look:
+            marked[n_marked, STEP], marked[n_marked, ENDED_NS] = i, end_ns
+            marked[n_marked, UNSURE_NS], marked[n_marked, LOOK] = unsure_ns, look
+            n_marked += 1
+    return n_runs, n_marked
+
+
+@njit(cache=True, nogil=True)
+def _judge(marks, count, unsure_ns, deadline_ns, histograms, judged):  # type: ignore[no-untyped-def]
+    """Count the stages and the total of a block's `count` decisions; whether they are late."""
+    slowest, longest_ns = 0, marks[1] - marks[0]
+    for stage in range(5):
+        step_ns = marks[3] - marks[0] if stage == 4 else marks[stage + 1] - marks[stage]
+        if stage < 3 and step_ns > longest_ns:
+            slowest, longest_ns = stage, step_ns
+        value, shift = max(step_ns, np.int64(0)), np.int64(0)
+        while value >> shift >> SUB_BITS >> 1:
+            shift += 1
+        histograms[stage][(shift << SUB_BITS) + (value >> shift)] += count
+        judged[LONGEST + stage] = max(judged[LONGEST + stage], value)
+    judged[UNCERTAINTY] = max(judged[UNCERTAINTY], unsure_ns)
+    late = marks[3] - marks[0] - unsure_ns > deadline_ns
+    if late:
+        judged[LATE] += count
+        judged[BLAME + slowest] += count
+    return late
