@@ -38,7 +38,8 @@ def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objec
     """
     numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
     truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
-    n_clicks, n_walked, n_photons, n_silent, n_unsure, n_known, n_right = 0, 0, 0, 0, 0, 0, 0
+    n_clicks, n_walked, n_right = np.int64(0), np.int64(0), np.int64(0)
+    n_photons, n_silent, n_unsure, n_known = 0, 0, 0, 0
     total, per_decision, object_before, n_objects = photons[0], plan[0], np.int64(-1), 0
     for i in range(rows.size):
         number, label, truth = np.int64(numbers[i]), np.int64(labels[i]), np.int64(truths[i])
