@@ -62,11 +62,18 @@ def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
     if not path.is_file():
         return None
     bundle, _ = load_bundle(path)
-    found, wanted = bundle.provenance.get("options"), asdict(options)
-    # what is newer than the bundle was not done in it, or at its default; `pans train` adds threads and device
-    same = isinstance(found, dict) and wanted.items() <= (asdict(type(options)()) | OLDER | found).items()
-    same = same and bundle.provenance.get("profile") == PROFILE
+    same = made_so(asdict(options), bundle.provenance.get("options")) and bundle.provenance.get("profile") == PROFILE
     return bundle if same and bundle.automaton is not None else None
+
+
+def made_so(wanted: Mapping[str, Any], found: Any) -> bool:
+    """Return whether what `found` was made with is what is `wanted`: an option newer than it was not used in it, or at its default.
+
+    More than that may stand in `found`: `pans train` adds threads and device.
+    """
+    from pans.trainer.adaptive.options import AutomatonOptions
+
+    return isinstance(found, dict) and wanted.items() <= (asdict(AutomatonOptions()) | OLDER | found).items()
 
 
 def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions) -> float:

@@ -6,21 +6,23 @@ with the recipe it was made by. Recipes here were chosen on the last 10 000 trai
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from pans.trainer.baselines.common import silent
 from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.options import plain_options
-from pans.trainer.paper.page import Asked, Row, kept
+from pans.trainer.paper.page import Asked, Row, cached_row, kept
 from pans.trainer.paper.paradigms import MEASURED
 from pans.trainer.paper.tables import ACTIVE, FIRST
 from pans.trainer.tasks.registry import Task
 
-from .automata import automaton_recipe, automaton_row, bundle_path
+from .automata import automaton_recipe, automaton_row, bundle_path, made_so
 from .fixed import FIXED_BUDGET, budget_recipe, budget_row
 
 TASKS = tuple(ACTIVE)
@@ -154,7 +156,7 @@ def row_of(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | No
         return _stopping_row(asked, point, seed, task)
     path = asked.cache / f"{point.stem}-seed{seed}.json"
     make = dict if task is None else partial(_made, asked, point, seed, task)
-    found = kept(path, made_with(point, seed), make, collect=task is None)
+    found = kept(path, _recipe_kept(path, point, seed), make, collect=task is None)
     return None if found is None else _plain(found, point, seed)
 
 
@@ -166,6 +168,13 @@ def made_with(point: Point, seed: int) -> Row:
     elif point.way == FIXED_BUDGET:
         options = plain_options(budget_recipe(point.level, BUDGET_FEATURES, seed))
     return {**options, "way": point.way, "seed": seed}
+
+
+def _recipe_kept(path: Path, point: Point, seed: int) -> Row:
+    """Return the recipe of a row; that of an automaton as it stands in the cache, if the same but for options newer than it."""
+    wanted = json.loads(json.dumps(made_with(point, seed)))
+    found = cached_row(path, "made_with") if point.way in TRAINED else None
+    return found["made_with"] if found is not None and made_so(wanted, found["made_with"]) else wanted
 
 
 def _stopping_row(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,12 @@ def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_p
     with monkeypatch.context() as patch:  # another default of the trainer: another recipe, and no row of it
         patch.setattr("pans.trainer.adaptive.options.AutomatonOptions", lambda **given: quick(**given, half=5.0))
         assert ways.row_of(asked, point, 0, None) is None
+    file = tmp_path / f"{point.stem}-seed0.json"
+    older = json.loads(file.read_text())
+    del older["made_with"]["patterns"]  # a row from before there was that option: it was not used
+    file.write_text(json.dumps(older))
+    assert ways.row_of(asked, point, 0, None) == kept
+    assert ways.row_of(asked, replace(point, recipe=(*point.recipe, ("patterns", 3))), 0, None) is None
     with pytest.raises(AssertionError, match="trained again"):  # another seed, another recipe
         automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=1)
     with pytest.raises(AssertionError, match="trained again"):
@@ -91,8 +98,6 @@ def test_fixed_patterns_are_held_to_photons(halves, tmp_path, monkeypatch):
     whole = fixed.budget_recipe
 
     def short(photons, features, seed):
-        from dataclasses import replace
-
         return replace(whole(photons, features, seed), epochs=60, hidden=16, batch=128)
 
     monkeypatch.setattr(fixed, "budget_recipe", short)
