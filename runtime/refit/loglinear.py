@@ -143,15 +143,12 @@ def _maximised(standard: _Standard, scores: F64, counts: F64, prior: Prior, step
 
 
 def _hessian(features: F64, total: F64, chance: F64, precision: F64) -> F64:
+    """Second derivatives by all weights, (size, size): the sum over rows of n (diag(p) - p p^T), taken with the features."""
     n_features, n_classes = features.shape[1], chance.shape[1]
-    found: NDArray[np.float64] = np.zeros((n_features, n_classes, n_features, n_classes))
-    for first in range(n_classes):
-        for second in range(first, n_classes):
-            weight = total * chance[:, first] * ((first == second) - chance[:, second])
-            block = (features * weight[:, None]).T @ features
-            found[:, first, :, second] = block
-            found[:, second, :, first] = block
-    size = n_features * n_classes
-    flat = found.reshape(size, size)
-    flat[np.diag_indices(size)] += np.repeat(precision, n_classes)
+    both = (features[:, :, None] * chance[:, None, :]).reshape(len(features), -1)
+    flat: NDArray[np.float64] = -(both * total[:, None]).T @ both
+    found = flat.reshape(n_features, n_classes, n_features, n_classes)
+    for label in range(n_classes):
+        found[:, label, :, label] += (features * (total * chance[:, label])[:, None]).T @ features
+    flat[np.diag_indices(len(flat))] += np.repeat(precision, n_classes)
     return flat

@@ -38,12 +38,12 @@ def test_the_old_scores_stay_where_the_instrument_is_the_old_one() -> None:
         found = choose(evidence, kinds_for(evidence, rows=True))
         stayed += found.name == OLD
         assert exact(found.scores, chance)[1] < exact(scores, chance)[1] + 0.01
-    assert stayed >= 10  # two standard errors: one in forty for each kind
+    assert stayed >= 11  # three standard errors: one in several hundred for each kind
 
 
 def test_a_changed_instrument_is_followed_and_the_estimate_is_right() -> None:
     offs = []
-    for seed in range(3):
+    for seed in range(2):
         scores, chance = world(seed, 0.7)
         evidence = drawn(scores, chance, 400, seed)
         kinds = kinds_for(evidence, rows=True)

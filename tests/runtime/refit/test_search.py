@@ -44,6 +44,22 @@ def test_the_table_is_found_within_what_the_objects_can_tell() -> None:
     assert len(found.journal) < 80
 
 
+def test_steps_that_are_not_clear_alone_are_taken_together() -> None:
+    """Each of three ways is worth 1.7 standard errors, all of them 5: the noise spreads the differences and adds nothing to their mean."""
+    table = Table(1.0, -1.0, 2.0, slope=0.03)
+    spread = np.zeros(1000)
+    spread[np.arange(1000) % 5 < 4] = 0.25 * (-1.0) ** np.arange(800)
+
+    def measure(move: Move, number: int):
+        there = (move.right_px - 1, move.down_px + 1, move.rotation_deg / 2 - 1)
+        return HARD + table.slope * np.square(there).sum() + (spread if number else -spread), Cost(1000.0, 2.0)
+
+    search = Search(NAMES, 1000, Budget(photons=11_000), measure, lambda journal: None)
+    search.run()
+    assert search.journal[7].move == search.best == Move(right_px=1.0, down_px=-1.0, rotation_deg=2.0)
+    assert search.accepted == 1
+
+
 def test_a_table_that_is_right_is_left_alone() -> None:
     tables = [Table(slope=0.0) for _ in range(3)]
     tried = [searched(table) for table in tables]

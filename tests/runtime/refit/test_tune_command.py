@@ -36,18 +36,17 @@ def test_a_budget_ends_it_whole_and_it_can_be_resumed(
     device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "tuned.pans"
-    first = tune(capsys, device, out, "--photons", 43_000)  # 200 objects of 41 photons: a trial takes 8300
-    assert (first["trials"], first["ended"], first["objects"]) == (3, "the budget is spent", 200)
-    assert first["spent"]["photons_or_clicks"] < 43_000
-    assert first["move"]["right_px"] == 1.0
+    first = tune(capsys, device, out, "--objects", 100, "--photons", 21_500)  # of 41 photons: a trial takes 4150
+    assert (first["trials"], first["ended"], first["objects"]) == (3, "the budget is spent", 100)
+    assert first["spent"]["photons_or_clicks"] < 21_500
     told = load_bundle(out)[0].provenance["tune"]
     assert told["from_bundle_sha256"] == load_bundle(BUNDLE)[1]
     kept = json.loads((tmp_path / "tuned.pans.tune.json").read_text())
     assert len(kept["trials"]) == 3
-    again = tune(capsys, device, out, "--photons", 60_000, "--resume")
-    assert again["trials"] == 5
+    again = tune(capsys, device, out, "--objects", 100, "--photons", 26_000, "--resume")
+    assert again["trials"] == 4
     assert json.loads((tmp_path / "tuned.pans.tune.json").read_text())["trials"][:3] == kept["trials"]
-    other = tune(capsys, device.replace("seed=1", "seed=2"), out, "--resume", code=2)
+    other = tune(capsys, device.replace("seed=1", "seed=2"), out, "--objects", 100, "--resume", code=2)
     assert "its device is" in other["error"]["message"]
 
 
