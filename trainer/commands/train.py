@@ -32,7 +32,7 @@ from pans.trainer.options import (
 
 from .arguments import add_data_dir, add_threads, needing, torch_with, usage_errors
 from .course import shown_course
-from .evaluate import words_of
+from .evaluate import passive_light, words_of
 from .train_own import Chosen, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ NUMBERS = (
 )
 OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher")
 AS_GIVEN = (
-    *("features", "photons", "budget", "complex_field", "conserving"),
+    *("features", "photons", "budget", "complex_field"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
 )
 
@@ -151,7 +151,15 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
 def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     """Optics, estimator and head; the budget of light, which automata have too."""
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
-    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
+    made = parser.add_mutually_exclusive_group()
+    made.add_argument(
+        "--conserving", action="store_true", help="a passive encoder gives no more light than it gets (default)"
+    )
+    made.add_argument(
+        "--unconstrained",
+        action="store_true",
+        help="a passive encoder may give more light than it gets, as the paper's does",
+    )
     parser.add_argument(
         "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
     )
@@ -251,10 +259,10 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
     from pans.trainer.evaluate.held_out import HeldOut, measure, trials_needed
 
     bundle = exported.bundle
-    trials = trials_needed(bundle)
-    measured, of_first = (
-        measure(bundle, HeldOut(task, task.test.first(count), profile), trials=trials) for count in (None, 200)
-    )
+    trials, every = trials_needed(bundle), HeldOut(task, task.test, profile)
+    measured = measure(bundle, every, trials=trials)
+    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials)
+    light = passive_light(bundle, every)
     figures = {
         "sha256": exported.sha256,
         **asdict(measured),
@@ -265,8 +273,9 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
         "words_compared": exported.words_compared,
         "dead_patterns": exported.dead_patterns,
         "validation_losses": trained.validation_losses,
+        **light,
     }
-    return figures, words_of(measured)
+    return figures, words_of(measured, light)
 
 
 def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task: Task) -> History | None:
@@ -298,6 +307,10 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     estimator = args.estimator or ("ste" if is_picture else best)
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
     given = {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
+    if encoder != "active":
+        given["conserving"] = not args.unconstrained
+    elif args.unconstrained:
+        raise UsageError("--unconstrained belongs to a passive encoder", remedy="leave it out")
     return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
 
 
