@@ -120,7 +120,7 @@ def demo_rows(settings: Settings) -> Iterator[dict[str, Any]]:
                 # the demo's two processes go where the scheduler puts them, as they do for a user
                 watched = Watched(None, False, settings.canary_us, 0.0, FINISHED)
                 outcome = run_watched(None, partial(_same, [*words, *settings.more]), watched, Path(scratch))
-                row = _row(f"demo {number + 1} beside a busy core {core}", "pty", outcome, DEMO_DEADLINE_US)
+                row = _row(f"demo {number + 1} beside a busy core {core}", "tcp", outcome, DEMO_DEADLINE_US)
                 row |= _kept(outcome)
             yield row | {"broken": demo_broken(row)}
 

@@ -19,13 +19,14 @@ ALL_TAKEN, LEARNT, FELL, ROSE = range(4)  # why a call ended
 
 
 @njit(cache=True, nogil=True)
-def take_clicks(clicks, flags, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
+def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
     """Take decisions from `first` on, but those with one of the flags `left_out`; return where it ended, behind which, and why.
 
-    clicks and flags uint32 (n,). LEARNT: the batches so far may make a baseline (levels[MEAN] is NaN without one). FELL, ROSE: that sum
-    has passed the threshold; the other one has not been looked at, if it is the later.
+    rows (n,) have fields `clicks` and `flags`, uint32: rows, since numba tells a column of one from a column of many. LEARNT: the batches
+    so far may make a baseline (levels[MEAN] is NaN without one). FELL, ROSE: that sum has passed the threshold; the other one has not
+    been looked at, if it is the later.
     """
-    batch = counts[BATCH]
+    clicks, flags, batch = rows["clicks"], rows["flags"], counts[BATCH]
     for i in range(first, clicks.size):
         if flags[i] & left_out:
             continue

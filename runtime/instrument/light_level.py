@@ -73,10 +73,11 @@ class LightWatch:
             return ""
         return self._compare(total, self.baseline)
 
-    def take_many(
-        self, clicks: npt.NDArray[np.uint32], flags: npt.NDArray[np.uint32], left_out: int
-    ) -> list[dict[str, Any]]:
-        """Take many decisions, uint32 (n,) each, but those with one of the flags `left_out`: as `take` of each; return what was found."""
+    def take_many(self, rows: npt.NDArray[np.void], left_out: int) -> list[dict[str, Any]]:
+        """Take many decisions, rows (n,) with fields `clicks` and `flags`, but those with one of the flags `left_out`: as `take` of each.
+
+        Returns what was found.
+        """
         from . import light_kernels as kernels  # numba is loaded only by who takes many at once
 
         known, at, levels = len(self.found), 0, np.empty(kernels.N_LEVELS)
@@ -91,7 +92,7 @@ class LightWatch:
                 self._high,
                 *((math.nan, 0.0, 0.0) if base is None else (base.mean, base.slack, base.threshold)),
             )
-            at, why = kernels.take_clicks(clicks, flags, np.uint32(left_out), at, counts, levels)
+            at, why = kernels.take_clicks(rows, np.uint32(left_out), at, counts, levels)
             self._go_on(counts.tolist(), levels.tolist())
             if why == kernels.LEARNT:
                 self._learnt()
@@ -100,11 +101,6 @@ class LightWatch:
                 self._tell("fall" if why == kernels.FELL else "rise", base)
             else:
                 return self.found[known:]
-
-    def warm_up(self) -> None:
-        """Compile or load what `take_many` needs, before arming."""
-        none = np.ones((2, 2), np.uint32)[:, 0]  # as a column of a table lies
-        self.take_many(none, none, 1)
 
     def _go_on(self, counts: list[int], levels: list[float]) -> None:
         self.decisions, self._clicks, self._in_batch, self._n, self._sum, self._squares, self._batches, self._total = (

@@ -6,7 +6,6 @@ it would have them, so that either goes on where the other stopped. What is not 
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -21,9 +20,9 @@ from pans.runtime.core.still import Core
 from pans.runtime.core.stream_arrays import MarkArrays
 from pans.runtime.errors import LinkError
 from pans.runtime.link.base import descriptor_of
-from pans.runtime.link.connection import Arrived
+from pans.runtime.link.connection import Arrived, Connection
 from pans.runtime.link.reader import Chunk
-from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind, expand_timings
+from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import settling as kernels
@@ -36,8 +35,6 @@ from pans.runtime.wire.session import STREAM_TYPES
 
 if TYPE_CHECKING:
     from .run import LiveRun
-
-FEW_ROWS = 48  # taking columns apart costs about as much as so many rows one by one
 
 I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
@@ -58,6 +55,7 @@ class CompiledTurns:
     def __init__(self, run: LiveRun, core: Core, *, prompt: bool) -> None:
         self._run, self._core, self._prompt = run, core, prompt
         self._turn: Turn | None = None
+        self._attached: Connection | None = None
         self._steps: BulkSteps | None = None
         self._fd: int | None = None
         exposures = (
@@ -71,8 +69,11 @@ class CompiledTurns:
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
 
     def attach(self) -> None:
-        """Lend the run's present connection to the compiled turn; kernels are compiled or loaded."""
+        """Lend the run's present connection to the compiled turn, once; kernels are compiled or loaded."""
         run = self._run
+        if self._attached is run.connection:
+            return
+        self._attached = run.connection
         nonce = run.connection.session.nonce
         steps, bulk = self._core.bulk_steps(nonce), run.connection.decoder.bulk
         assert steps is not None
@@ -226,8 +227,7 @@ class CompiledTurns:
                 evidence.worked(INFERENCE, began, ended)
             else:
                 evidence.waited(began, (asked - began) / NS_PER_S, ended)
-        for arrival_ns in rings.arrivals[: counts.arrivals].tolist():
-            evidence.arrived(arrival_ns)
+        evidence.arrived(*rings.arrivals[: counts.arrivals].tolist())
 
     def _settle(self, turn: Turn, outputs: list[Output]) -> None:
         """Account for what a call took and sent: session, driver, marks, recording, decisions."""
@@ -241,9 +241,10 @@ class CompiledTurns:
         run.taken_here += counts.messages
         if counts.shows or counts.answers:
             self._settle_commands(turn)
-        for mark in turn.marks():
-            self._core.remember(mark)
-            turn.steps.told(mark)
+        if counts.messages > counts.steps:
+            for mark in turn.marks():
+                self._core.remember(mark)
+                turn.steps.told(mark)
         recorder = run.recorder
         if recorder is not None:
             recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
@@ -267,7 +268,7 @@ class CompiledTurns:
         session.next_id = first + len(shows)
         if run.driver is not None:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
-            run.driver.went_on((exposure, state), (shows[:, ring.TIME] - shows[:, ring.WHAT]).tolist())
+            run.driver.went_on((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])
 
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
         """Account for the blocks of a call and their decisions."""
@@ -288,7 +289,7 @@ class CompiledTurns:
             if look & kernels.IS_AHEAD:
                 run.check_tick(end_tick, arrival_ns)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
-        outputs.append(Output(decisions, events, self._core.last_tick))
+        outputs.append(Output(cast(list[Decision], decisions), events, self._core.last_tick))
 
     def _watch(self, turn: Turn, rows: Rows) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
@@ -343,28 +344,19 @@ class Judged:
         sums[:] = 0
         outputs = (self._histograms, sums, self._runs, self._marked)
         n_runs, n_marked = kernels.judge_blocks(blocks, rows, *clock.numbers, timing.deadline_ns, *outputs)
-        longest, (uncertainty_ns, late), blame = np.split(sums, (kernels.UNCERTAINTY, kernels.BLAME))
         if len(rows):
-            timing.went_on(len(rows), longest.tolist(), int(uncertainty_ns), int(late), blame.tolist())
+            found = sums.tolist()
+            longest, blame = found[: kernels.UNCERTAINTY], found[kernels.BLAME :]
+            timing.went_on(len(rows), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
         return self._runs[:n_runs], self._marked[:n_marked]
 
 
-def account_rows(run: LiveRun, marks: MarkArrays, runs: Rows, rows: Rows) -> list[Decision]:
+def account_rows(run: LiveRun, marks: MarkArrays, runs: Rows, rows: Rows) -> Sequence[Decision]:
     """Tally and record decisions whose times are `runs`; return them."""
-    recorder = run.recorder
-    if len(rows) > FEW_ROWS:
-        run.tally.add_rows(rows, marks)
-        if recorder is not None:
-            recorder.add_decisions(rows)
-            recorder.add_timing_runs(runs)
-        return cast(list[Decision], RowDecisions(rows))  # read like a list, by whoever looks at an output
-    decisions = [Decision(*row) for row in rows.tolist()]
-    for decision in decisions:
-        mark = run.core.marks.get(decision.object)
-        run.tally.add(decision, math.nan if mark is None else mark.photons)
-        if recorder is not None:
-            recorder.add_decision(decision)
-    if recorder is not None and decisions:
-        for timing in expand_timings(runs).tolist():
-            recorder.add_timing(timing)
-    return decisions
+    if not len(rows):
+        return []
+    run.tally.add_rows(rows, marks)
+    if run.recorder is not None:
+        run.recorder.add_decisions(rows)
+        run.recorder.add_timing_runs(runs)
+    return RowDecisions(rows)  # read like a list, by whoever looks at an output

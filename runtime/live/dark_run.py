@@ -13,7 +13,7 @@ import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
-from pans.runtime.core.decision import DecisionFlag, Output
+from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag, Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.calibration import (
@@ -120,7 +120,7 @@ class DarkRun:
     def check_device(self, run: LiveRun) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
         if run.compiled is not None:
-            self.light.warm_up()
+            self.light.take_many(np.zeros(0, DECISION_DTYPE), int(NOT_MEASURED))  # compiles or loads its kernel
         welcome = run.connection.session.welcome
         serial = None if welcome is None else welcome.facts.get("serial")
         if self.calibration is not None:
@@ -132,7 +132,7 @@ class DarkRun:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""
         rows = getattr(output.decisions, "rows", None)  # of many at once
         if rows is not None:
-            for found in self.light.take_many(rows["clicks"], rows["flags"], int(NOT_MEASURED)):
+            for found in self.light.take_many(rows, int(NOT_MEASURED)):
                 run.journal.note("light_changed", **found)
             return
         for decision in output.decisions:

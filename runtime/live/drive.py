@@ -101,11 +101,10 @@ class HostDriver:
         """Exposure and state that were named last."""
         return self._sent
 
-    def went_on(self, sent: tuple[int, int], turns_ns: list[int]) -> None:
-        """Take over what a compiled turn has named, and how long each turn took from the arrival of its block."""
+    def went_on(self, sent: tuple[int, int], turns_ns: npt.NDArray[np.int64]) -> None:
+        """Take over what a compiled turn has named, and how long each turn took from the arrival of its block, int64 (n,)."""
         self._sent = sent
-        for turn_ns in turns_ns:
-            self.turns.add(turn_ns)
+        self.turns.add_many(turns_ns)
 
     def _submit(self, connection: Connection) -> bool:
         core = self._core

@@ -99,6 +99,7 @@ def run_live(
             block_us = plan.cycle_us * min(plan.block_exposures / plan.slots_per_cycle, 1.0)
             spare = not link.virtual and block_us >= SETTLED_WITHIN_US
             run.compiled = CompiledTurns(run, core, prompt=spare or (observers.acts and observers.watch is not None))
+            run.compiled.attach()  # before the heap is touched: loading kernels takes memory
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
         with (
@@ -110,8 +111,8 @@ def run_live(
             try:
                 if observers.prepared is not None:
                     observers.prepared(run)
-                counts.restart()
                 run.arm()
+                counts.restart()  # the first exposure begins when ARM has had its time to arrive
                 _until_ended(run, recovery, prepare, observers)
             except KeyboardInterrupt as interrupt:
                 run.ended = str(interrupt) or INTERRUPTED

@@ -181,7 +181,10 @@ class Recorder:
             self._empty(self._decisions)
 
     def add_decisions(self, rows: NDArray[np.void]) -> None:
-        """Keep many decisions, DECISION_DTYPE (n,), behind those already added; whole blocks go out at once."""
+        """Keep many decisions, DECISION_DTYPE (n,), behind those already added; more than a buffer holds go out at once."""
+        if self._decisions.used + len(rows) < BUFFER_ROWS:
+            self._decisions.add_many(rows)
+            return
         self._empty(self._decisions)
         for start in range(0, len(rows), BLOCK_ROWS):
             self._write_decisions(rows[start : start + BLOCK_ROWS])

@@ -122,9 +122,9 @@ class Evidence:
         if end_ns - asked_ns >= OVERSLEPT_NS:
             self._spans.append(Span(OVERSLEPT, asked_ns, end_ns))
 
-    def arrived(self, arrival_ns: int) -> None:
+    def arrived(self, *arrivals_ns: int) -> None:
         """Note when bytes were stamped by whoever read them."""
-        self._arrivals.append(arrival_ns)
+        self._arrivals.extend(arrivals_ns)
 
     def stamped(self, message: Stamped) -> None:
         """Note a message that says when it left the device."""

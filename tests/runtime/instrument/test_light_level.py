@@ -112,9 +112,9 @@ def test_many_decisions_at_once_are_those_one_by_one() -> None:
     at = 0
     while at < len(clicks):
         n = min(int(rng.integers(0, 700)), len(clicks) - at)
-        columns = np.zeros((2 * n, 2), np.uint32)
-        columns[:n, 0], columns[n:] = clicks[at : at + n], (9, 6)  # the second half is left out
-        many.take_many(columns[:, 0], columns[:, 1], 4)
+        rows = np.zeros(2 * n, [("clicks", np.uint32), ("flags", np.uint32)])
+        rows["clicks"][:n], rows[n:] = clicks[at : at + n], (9, 6)  # the second half is left out
+        many.take_many(rows, 4)
         at += n
     assert one.found
     assert (one.found, one.report()) == (many.found, many.report())
