@@ -9,7 +9,8 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.errors import PlanError, UsageError, as_usage_error
+from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
@@ -61,6 +62,7 @@ class Options:
     shift_px: int = 0  # training images are moved by up to that much along the rows, for objects in flow
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
+    optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
 
 
 SLOPE_MAX = 1e6  # times the light that is meant: far beyond what annealing needs
@@ -107,6 +109,12 @@ def check_options(options: Options, profile: Profile) -> None:
     _check_fits(options, profile)
 
 
+def check_optics(text: str) -> None:
+    """Raise UsageError unless `text` is a tolerance of optics."""
+    with as_usage_error():
+        tolerance_of(text)
+
+
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
@@ -123,6 +131,13 @@ def _check_together(options: Options) -> None:
             f"{EXACT_FEATURES_MAX} patterns",
             remedy="use --estimator local",
         )
+    if options.optics is not None:
+        check_optics(options.optics)
+        if options.encoder != "active":
+            raise UsageError(
+                f"--optics: a {options.encoder} encoder shows no patterns that could miss the object",
+                remedy="leave it out, or use --encoder active or automaton",
+            )
     if options.mix > 0 and options.shots < 2:
         raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
 

@@ -17,6 +17,7 @@ from pans.firmware_sim.scene.light import Table
 from pans.firmware_sim.scene.moving import SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
+from pans.runtime.imaging import IDENTITY
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.scene_fit import scene_facts
 from pans.runtime.wire import messages as wire
@@ -251,6 +252,7 @@ class Instrument:
         automata = {} if self.extension is None else announcement(self.extension)
         return (
             passive
+            | _table_facts(scene)
             | automata
             | _scene_facts(scene)
             | {
@@ -388,6 +390,12 @@ class Instrument:
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)
+
+
+def _table_facts(scene: SceneFile) -> dict[str, Any]:
+    """Return what WELCOME says of optics that are not perfect: a run against a hidden truth must not pass for another one."""
+    imaging = scene.what.imaging if isinstance(scene.what, Scene) else IDENTITY
+    return {} if imaging.is_identity else {"simulated_optics": imaging.words()[:200]}
 
 
 def _scene_facts(scene: SceneFile) -> dict[str, Any]:

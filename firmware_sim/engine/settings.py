@@ -13,6 +13,7 @@ from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_PATTERN_PIXELS, MAX_SLOTS, MAX_UPLOAD_BYTES
 from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.scene.moving import SceneFile
+from pans.firmware_sim.scene.still import Scene
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.messages import MAX_PAYLOAD_BYTES
@@ -68,8 +69,14 @@ def _settings(
         "firmware": FIRMWARE,
         "serial": f"SIM-{options.seed & 0xFFFFFFFF:08X}",
         "profile": profile.name,
-        "scene": scene.name[:60],
+        "scene": _scene_words(scene),
     }
+
+
+def _scene_words(scene: SceneFile) -> str:
+    """The scene's name, and that its optics are not perfect where they are not; the engine takes some 60 bytes of text."""
+    perfect = not isinstance(scene.what, Scene) or scene.what.imaging.is_identity
+    return scene.name[:60] if perfect else f"{scene.name[:40]} (hidden optics)"
 
 
 def _numeric(listen: str) -> str:
@@ -83,6 +90,11 @@ def _check(profile: Profile, scene: SceneFile) -> None:
     if scene.moves:
         raise ConfigError(
             f"scene {scene.name!r} moves: the C engine shows still objects",
+            remedy="leave --engine out",
+        )
+    if scene.changes:
+        raise ConfigError(
+            f"{scene.name!r} changes, or the source of {profile.name} drifts: not on the C engine",
             remedy="leave --engine out",
         )
     detector = profile.detector

@@ -12,9 +12,9 @@ import tempfile
 from pathlib import Path
 
 from pans.firmware_sim.device.view import View
+from pans.firmware_sim.ports.on_table import scene_on_table
 from pans.firmware_sim.ports.serve import SimOptions
 from pans.firmware_sim.scene.moving import SceneFile
-from pans.firmware_sim.scene.scene_file import open_scene
 from pans.runtime.instrument.profile import Profile, load_profile
 
 from .build import engine_library
@@ -39,7 +39,7 @@ class SteppedEngine:
         library: Path | None = None,
     ) -> None:
         profile = profile or load_profile(options.profile)
-        scene = scene or open_scene(options.scene, options.changes)
+        scene = scene or scene_on_table(options.scene, options.changes, options.optics, profile)
         text = settings_text(options, profile, scene)
         view = View(profile, scene, None, options.seed)
         view.check_and_warm_up()

@@ -17,15 +17,16 @@ from urllib.parse import parse_qsl
 from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
 from pans.firmware_sim.device.instrument import BUFFER_MESSAGES, Instrument
 from pans.firmware_sim.options import option, words_of
-from pans.firmware_sim.scene.scene_file import open_scene
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.errors import ConfigError, LinkError, UsageError
+from pans.runtime.errors import ConfigError, LinkError, UsageError, as_usage_error
+from pans.runtime.imaging import imaging_of, is_spec
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, descriptor_of, open_link
 
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
+from .on_table import scene_on_table
 from .virtual import START_NS, VirtualLink
 
 DEFAULT_SCENE = "fashion200"
@@ -47,13 +48,18 @@ class SimOptions:
     drift_ppm: float = option(DEFAULT_DRIFT_PPM, "rate error of the device's clock")
     faults: str = option("", "like loss:0.01,stall:600ms/5s, or all, or a .toml file")
     buffer: int = option(BUFFER_MESSAGES, f"stream messages that the device can hold back (default {BUFFER_MESSAGES})")
-    optics: str = option("", "look through the passive optics of this bundle: no projector", metavar="BUNDLE")
+    optics: str = option(
+        "",
+        "hidden truth of the optics, like shift=0.7,0.3:rotate=1.5:psf=0.7:gain=5%%:black=0.002; or a bundle, whose passive optics"
+        " take the place of a projector",
+        metavar="SPEC|BUNDLE",
+    )
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
     engine: str = option("python", "python, or c: the reference firmware, built with the system's compiler")
 
 
 def parse_sim_url(url: str) -> SimOptions:
-    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&changes=...&optics=BUNDLE&...]`, or raise UsageError."""
+    """Read `sim:PROFILE[?scene=...&seed=N&pace=real|fast&faults=...&changes=...&optics=...&...]`, or raise UsageError."""
     scheme, _, rest = url.partition(":")
     profile, _, query = rest.partition("?")
     if scheme != "sim" or not profile:
@@ -87,6 +93,9 @@ def check_options(options: SimOptions) -> SimOptions:
     if not 0 <= options.offset < 1 << 60:
         raise UsageError(f"offset={options.offset}: allowed are 0..2^60-1 ticks")
     check_possible(parse_faults(options.faults), pace=options.pace)
+    if is_spec(options.optics):
+        with as_usage_error():
+            imaging_of(options.optics)
     _check_engine(options)
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
@@ -101,7 +110,7 @@ def _check_engine(options: SimOptions) -> None:
     if options.pace == "fast":
         raise UsageError("engine=c runs at real pace only", remedy="leave pace=fast out, or engine=c")
     for name in ("faults", "changes", "optics"):
-        if getattr(options, name):
+        if getattr(options, name) and not is_spec(options.optics if name == "optics" else ""):
             raise UsageError(f"engine=c has no {name}", remedy=f"leave {name} out, or engine=c")
 
 
@@ -114,7 +123,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
         raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
-    scene = open_scene(options.scene, options.changes)
+    scene = scene_on_table(options.scene, options.changes, options.optics, profile)
     faults = parse_faults(options.faults)
     optics = _optics(options.optics)
 
@@ -136,7 +145,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
 
 
 def _optics(path: str) -> Analyser | None:
-    if not path:
+    if not path or is_spec(path):
         return None
     found = load_bundle(path)[0].analyser
     if found is None:
@@ -148,8 +157,8 @@ def open_sim(url: str) -> Link:
     """Open a `sim:` URL (entry point of `pans.devices`); the link's `close` ends what it started."""
     options = parse_sim_url(url)
     if options.pace == "real":
-        load_profile(options.profile)  # a mistake in either is better told here than by the child
-        open_scene(options.scene, options.changes)
+        profile = load_profile(options.profile)  # a mistake in either is better told here than by the child
+        scene_on_table(options.scene, options.changes, options.optics, profile)
         _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)

@@ -1,9 +1,9 @@
 """From projector levels and objects to light: expected photoelectrons of every object under every pattern.
 
 Owns the optical model and computes it once per loaded pattern set; never draws a random number, never runs per exposure.
-Only what the profile declares is modelled: the projector's photon scale, and the object modulator where there is one; or passive
-optics, as a bundle states them.
-Sums of level times grey are integers below 2^53: exact, whatever the BLAS, its threads and the block size are.
+Only what the profile declares is modelled: the projector's photon scale, the object modulator where there is one, and where a scene's
+images stand on the grid of the patterns (pans.runtime.imaging); or passive optics, as a bundle states them.
+On perfect optics sums of level times grey are integers below 2^53: exact, whatever the BLAS, its threads and the block size are.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.optics import Analyser
+from pans.runtime.imaging import levelled, met
 from pans.runtime.instrument.profile import Profile
 
 from .still import Scene
@@ -47,6 +48,8 @@ def expected_photoelectrons(
         )
     if not scene.lit:
         return np.zeros((scene.n_objects, n_patterns))
+    if not scene.imaging.is_identity:
+        return _imaged(profile, scene, pattern_levels) * photons_per_level(profile, exposure_us)
     t_min = profile.min_transmission
     total = pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64)
     grey, white = grey_steps(profile)
@@ -55,6 +58,29 @@ def expected_photoelectrons(
     light *= 1.0 - t_min
     light += t_min * total
     light *= photons_per_level(profile, exposure_us)
+    return light
+
+
+def _imaged(profile: Profile, scene: Scene, pattern_levels: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Level times transmission, float64 (n_objects, n_patterns), where the scene's images stand as `scene.imaging` says.
+
+    A target fills the field and what lies around it, so that neither shift nor blur change it.
+    """
+    imaging, full = scene.imaging, profile.projector.levels - 1.0
+    grey, white = grey_steps(profile)
+    clear = profile.min_transmission + (1.0 - profile.min_transmission) * grey / white
+    levels = pattern_levels.astype(np.float64)
+    if scene.any_shape:
+        shape = (1, levels.shape[1]) if imaging.flat is None else imaging.flat.shape
+        total = levelled(imaging, levels, (shape[0], shape[1]), full).sum(axis=1)
+        return np.asarray(clear[scene.images.reshape(-1, 1)] * total)
+    height, width = scene.images.shape[1:]
+    as_met = met(imaging, levels, (height, width), full).T
+    light = np.empty((scene.n_objects, len(levels)))
+    at_once = max(1, _VALUES_PER_BLOCK // scene.n_pixels)
+    for first in range(0, scene.n_objects, at_once):
+        part = scene.images[first : first + at_once]
+        light[first : first + at_once] = clear[part.reshape(len(part), -1)] @ as_met
     return light
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.images import read_class_folder
+from pans.runtime.imaging import IDENTITY, Imaging
 from pans.runtime.npz_file import read_arrays
 
 MAX_OBJECTS = 1 << 17
@@ -33,7 +34,8 @@ TARGETS = ("uniform", "dark")
 class Scene:
     """Objects in the order in which they pass: images uint8 (n, height, width), labels int16 (n,) with -1 for unknown.
 
-    A target has one image of one pixel that stands for any shape; `lit` is False when no light reaches the detector.
+    A target has one image of one pixel that stands for any shape; `lit` is False when no light reaches the detector. `imaging` is
+    where the images stand on the grid of the patterns, and how sharply.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Scene:
     labels: NDArray[np.int16]
     classes: tuple[str, ...]
     lit: bool = True
+    imaging: Imaging = IDENTITY
 
     @property
     def n_objects(self) -> int:

@@ -65,6 +65,21 @@ class Tolerance:
         """Return every span by name, as lists for JSON."""
         return {name: [low, high] for name, (low, high) in self._spans()}
 
+    def words(self) -> str:
+        """Return every span that is not perfect, in words."""
+        perfect = Tolerance()
+        said = [
+            f"{name} {low:g}" + (f" to {high:g}" if high > low else "")
+            for name, (low, high) in self._spans()
+            if (low, high) != getattr(perfect, name)
+        ]
+        return ", ".join(said) or "perfect optics"
+
+    def spelled(self) -> str:
+        """Return the tolerance as `--optics` spells it; `tolerance_of` reads it back."""
+        right, down, turn, scale, psf, black, gain = (f"{low!r}..{high!r}" for _, (low, high) in self._spans())
+        return f"shift={right},{down}:rotate={turn}:scale={scale}:psf={psf}:black={black}:gain={gain}"
+
     def _spans(self) -> list[tuple[str, Span]]:
         return [(name, getattr(self, name)) for name in _NAMES]
 

@@ -11,17 +11,23 @@ from __future__ import annotations
 import difflib
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 
-from pans.runtime.errors import ConfigError
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.html_card import html_card
+from pans.runtime.imaging import IDENTITY, Imaging, Tolerance, checked_flat
+from pans.runtime.npz_file import read_arrays
 
 from .checked_toml import read_toml
 from .profile_schema import GATED, NON_PARALYSABLE, ProfileCheck
 
 MAX_PROFILE_BYTES = 1 << 20
+MAX_FLAT_BYTES = 1 << 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +60,46 @@ class ObjectModulator:
     contrast: float
     levels: int
     black_transmission: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """Where the object stands on the pattern grid and how sharply, each with what it may be off by to either side.
+
+    `dark_pixel` is the light of a dark projector pixel over that of a full one, `gain_tolerance` relative; `source_fluctuation` is
+    the relative standard deviation of the light from exposure to exposure. `flat_field_file` stands beside the profile's file.
+    """
+
+    psf_px: float = 0.0
+    psf_tolerance_px: float = 0.0
+    right_px: float = 0.0
+    down_px: float = 0.0
+    shift_tolerance_px: float = 0.0
+    rotation_deg: float = 0.0
+    rotation_tolerance_deg: float = 0.0
+    scale: float = 1.0
+    scale_tolerance: float = 0.0
+    dark_pixel: float = 0.0
+    gain_tolerance: float = 0.0
+    flat_field_file: str | None = None
+    source_fluctuation: float = 0.0
+    source_drift_percent_per_hour: float = 0.0
+
+    def tolerance(self) -> Tolerance:
+        """Return from where to where every fact may lie."""
+        return Tolerance(
+            _about(self.right_px, self.shift_tolerance_px),
+            _about(self.down_px, self.shift_tolerance_px),
+            _about(self.rotation_deg, self.rotation_tolerance_deg),
+            _about(self.scale, self.scale_tolerance),
+            _about(self.psf_px, self.psf_tolerance_px),
+            _about(self.dark_pixel, 0.0),
+            _about(1.0, self.gain_tolerance),
+        )
+
+
+def _about(value: float, off: float) -> tuple[float, float]:
+    return value - off, value + off
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +165,8 @@ class Profile:
     sources: Mapping[str, str]
     measure: tuple[str, ...]
     text: str = field(repr=False)
+    optics: Optics | None = None
+    folder: Path | None = field(default=None, repr=False, compare=False)  # of the file, where there is one
 
     @property
     def sha256(self) -> str:
@@ -142,6 +190,16 @@ class Profile:
         }
         return html_card(f"Profile {self.name}", rows)
 
+    def imaging(self) -> Imaging:
+        """Return the optics as stated, perfect ones where nothing is; ConfigError for a flat field that cannot be read."""
+        stated = self.optics
+        if stated is None:
+            return IDENTITY
+        middle = stated.tolerance().middle
+        if stated.flat_field_file is None:
+            return middle
+        return replace(middle, flat=_read_flat((self.folder or Path()) / stated.flat_field_file))
+
     @property
     def min_transmission(self) -> float:
         """Transmission of a black object pixel: as declared, else 1/contrast of the modulator, 0 without one."""
@@ -156,7 +214,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
     Raises ConfigError if there is neither, or if the file is not a valid profile (then it starts with file:line:col).
     """
-    return parse_profile(profile_text(name_or_path), _where(name_or_path))
+    folder = None if _is_shipped(name_or_path) else Path(name_or_path).parent
+    return replace(parse_profile(profile_text(name_or_path), _where(name_or_path)), folder=folder)
 
 
 def _where(name_or_path: str | Path) -> str:
@@ -207,6 +266,7 @@ def parse_profile(text: str, where: str) -> Profile:
         mode=facts["profile"]["mode"],
         projector=Projector(**facts["projector"]),
         object_modulator=ObjectModulator(**facts["object"]) if "object" in facts else None,
+        optics=Optics(**facts["optics"]) if "optics" in facts else None,
         detector=Detector(**facts["detector"]),
         exposure=Exposure(**facts["exposure"]),
         clock=Clock(**facts["clock"]),
@@ -215,6 +275,20 @@ def parse_profile(text: str, where: str) -> Profile:
         measure=facts["profile"]["measure"],
         text=text,
     )
+
+
+def _read_flat(path: Path) -> NDArray[np.float64]:
+    """Return the array `flat` (rows, columns) of a .npz file; ConfigError."""
+    try:
+        arrays = read_arrays(path, ("flat",), MAX_FLAT_BYTES)
+        if "flat" not in arrays or arrays["flat"].dtype.kind not in "fiu":
+            raise ValueError("no array `flat` of numbers in it")
+        return checked_flat(arrays["flat"])
+    except (ValueError, OSError, UsageError) as error:
+        raise ConfigError(
+            f"{path}: not a readable flat field: {error}",
+            remedy="write it with numpy.savez(FILE, flat=FLAT / FLAT.mean())",
+        ) from error
 
 
 def _decoded(data: bytes, where: str) -> str:

@@ -19,10 +19,12 @@ from .checked_toml import Key, KeyPath, Position, found, near, position_of, type
 MODES = ("sequential", "parallel")
 NON_PARALYSABLE, PARALYSABLE = "non-paralysable", "paralysable"
 GATED, FREE_RUNNING = "gated", "free-running"
+MAX_FLUCTUATION = 0.3  # of the light from exposure to exposure: beyond it a Gaussian factor would often be below 0
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
 
 
 _PROBABILITY = Key("number", 0, 1, required=False)
+_OFF = Key("number", 0, 1000, required=False)
 SCHEMA: dict[str, dict[str, Key]] = {
     "profile": {
         "name": Key("text"),
@@ -45,6 +47,22 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "contrast": Key("number", 1, 1e12, above=True, infinite=True),
         "levels": Key("whole", 2, 65536),
         "black_transmission": Key("number", 0, 0.99, required=False),
+    },
+    "optics": {
+        "psf_px": Key("number", 0, 1000, required=False),
+        "psf_tolerance_px": _OFF,
+        "right_px": Key("number", -10_000, 10_000, required=False),
+        "down_px": Key("number", -10_000, 10_000, required=False),
+        "shift_tolerance_px": _OFF,
+        "rotation_deg": Key("number", -360, 360, required=False),
+        "rotation_tolerance_deg": Key("number", 0, 360, required=False),
+        "scale": Key("number", 0.1, 10, required=False),
+        "scale_tolerance": Key("number", 0, 0.9, required=False),
+        "dark_pixel": Key("number", 0, 0.99, required=False),
+        "gain_tolerance": Key("number", 0, 0.99, required=False),
+        "flat_field_file": Key("text", required=False),
+        "source_fluctuation": Key("number", 0, MAX_FLUCTUATION, required=False),
+        "source_drift_percent_per_hour": Key("number", -100, 100, required=False),
     },
     "detector": {
         "kind": Key("text"),
@@ -72,7 +90,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "host_turn_us": Key("number", 0, 1e9, required=False),
     },
 }
-_OPTIONAL_SECTIONS = ("object", "sources")
+_OPTIONAL_SECTIONS = ("object", "optics", "sources")
 _UNIT = re.compile(r"_(?:ps|ns|us|ms|s|sec|hz|khz|mhz|ghz|cps|e|nm|um|mm|m|px|percent|pct)$")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -90,7 +108,7 @@ class ProfileCheck:
         self._sections()
         values = {name: self._section(name) for name in SCHEMA if name in self.tables}
         sources, measure = self._sources(values), self._measure(values)
-        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease):
+        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease, _check_optics):
             check(values, self.fault)
         return {**values, "profile": {**values["profile"], "measure": measure}, "sources": sources}
 
@@ -262,6 +280,20 @@ def _check_lease(values: _Values, fault: _Fault) -> None:
             f"timing.lease_ms must be above timing.decision_deadline_us = {deadline_us / 1000:g} ms, found {lease_ms}",
             "the lease is what the device waits before it goes dark: some hundred ms",
         )
+
+
+def _check_optics(values: _Values, fault: _Fault) -> None:
+    stated = values.get("optics", {})
+    for name, default in (("psf", 0.0), ("scale", 1.0)):
+        key, off = ("psf_px", "psf_tolerance_px") if name == "psf" else ("scale", "scale_tolerance")
+        value, tolerance = stated.get(key, default), stated.get(off, 0.0)
+        least = 0.0 if name == "psf" else 0.1
+        if value - tolerance < least:
+            raise fault(
+                ("optics", off),
+                f"optics.{off} must be at most optics.{key} - {least:g} = {value - least:g}, found {tolerance:g}",
+                "state the tolerance to either side of the value",
+            )
 
 
 def _listed(names: list[str]) -> str:

@@ -30,6 +30,20 @@ MEANINGS = {
     "object.contrast": "brightest over darkest transmission of the object's modulator; inf: perfectly black",
     "object.levels": "levels of the object's modulator",
     "object.black_transmission": "what black lets through where it was measured, in place of 1/contrast; few figures matter more",
+    "optics.psf_px": "blur of a point between projector and object: standard deviation of a Gaussian, in object pixels",
+    "optics.psf_tolerance_px": "by how much the blur may differ, to either side",
+    "optics.right_px": "how far the object stands to the right on the pattern grid, in object pixels",
+    "optics.down_px": "how far it stands below",
+    "optics.shift_tolerance_px": "by how much either may differ, to either side",
+    "optics.rotation_deg": "how far the object is turned counter-clockwise about the middle of the grid",
+    "optics.rotation_tolerance_deg": "by how much the rotation may differ, to either side",
+    "optics.scale": "magnification of the object on the pattern grid",
+    "optics.scale_tolerance": "by how much the magnification may differ, to either side",
+    "optics.dark_pixel": "light of a dark projector pixel over that of a full one; the object's black is object.black_transmission",
+    "optics.gain_tolerance": "by which part all light may differ from peak_photoelectrons_hz, to either side",
+    "optics.flat_field_file": "a .npz with `flat` (rows, columns) of mean 1: light of every pattern pixel over the mean",
+    "optics.source_fluctuation": "standard deviation of the light from exposure to exposure, relative",
+    "optics.source_drift_percent_per_hour": "slow change of the light",
     "detector.kind": "for people: SPAD, SNSPD, PMT, qCMOS, ...",
     "detector.channels": "detectors that click independently: 1 if sequential, one per pattern if parallel",
     "detector.efficiency": "photoelectrons per photon",
@@ -53,6 +67,7 @@ MEANINGS = {
 _TITLES = {
     "projector": "what shows the patterns",
     "object": "the modulator that shows test images; leave the section out where real objects stand before the detector",
+    "optics": "where the object stands on the pattern grid, and how sharply; what is left out is perfect",
     "detector": "what clicks; an effect that is left out is absent",
     "exposure": "",
     "clock": "",
@@ -77,18 +92,19 @@ def profile_template(name: str, base: str) -> str:
 
 def _lines(name: str, base: str, tables: dict[str, Any]) -> Iterator[str]:
     for section, rules in SCHEMA.items():
-        if section not in tables:
+        if section not in tables and section != "optics":  # which few profiles have, and every table should
             continue
         if section != "profile":
             title = _TITLES[section]
             yield ""
-            yield f"[{section}]{f'  # {title}' if title else ''}"
+            hidden = "" if section in tables else "# "
+            yield f"{hidden}[{section}]{f'  # {title}' if title else ''}"
         else:
             yield "[profile]"
         for key, rule in rules.items():
             full = f"{section}.{key}"
             value = {"profile.name": name, "profile.description": f"begun from {base}"}.get(
-                full, tables[section].get(key)
+                full, tables.get(section, {}).get(key)
             )
             yield f"# {MEANINGS[full]} [{rule.allowed}]"
             # what is absent stays absent, ready to be filled in

@@ -145,7 +145,7 @@ class Growth:
                 here_silent = (alpha * dark) @ block.one_hot.T
                 gain = (log_posterior(whole - silent) - log_posterior(silent)).float() @ block.one_hot
                 slope = torch.mul(fall, gain).neg_().add_(price).mul_(alpha).mul_(1.0 / len(block))
-                light.take(self.sight.mask_slope(slope, block.grey), None)
+                light.take(self.sight.mask_slope(slope, block.grey, light), None)
                 optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()

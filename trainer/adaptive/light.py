@@ -43,6 +43,18 @@ class Grey:
         """Return the scale alone."""
         return torch.full((len(self.root), 1), self.top / (self.levels - 1)) if self.levels else None
 
+    def full(self, mask: Tensor) -> Tensor:
+        """Return what a full pixel has in `mask`, (states, 1): the top level, before there are levels the brightest pixel."""
+        if self.levels:
+            return torch.full((len(mask), 1), float(self.levels - 1), dtype=mask.dtype)
+        return mask.amax(dim=1, keepdim=True)
+
+    def add_full(self, slope: Tensor, of_full: Tensor) -> Tensor:
+        """Return the gradient of the mask with that of `full` (states, 1) added; `slope` is used up."""
+        if self.levels:
+            return slope
+        return slope.scatter_add_(1, self.root.abs().argmax(dim=1, keepdim=True), of_full)
+
     def take(self, slope: Tensor, _: Tensor | None) -> None:
         """Set the gradients from that of the mask times the scale; `slope` is used up."""
         factor = 2.0 * (self.levels - 1) / self.top if self.levels else 2.0
@@ -85,6 +97,14 @@ class Bits:
     def scale(self) -> Tensor:
         """Return the brightness of every state, (states, 1)."""
         return self.log_light.exp().expand(len(self.lean) if self.rows is None else len(self.rows), 1)
+
+    def full(self, mask: Tensor) -> Tensor:
+        """Return what a full pixel has in `mask`, (states, 1): 1."""
+        return torch.ones(len(mask), 1, dtype=mask.dtype)
+
+    def add_full(self, slope: Tensor, of_full: Tensor) -> Tensor:
+        """Return `slope`: what a full pixel has does not depend on the parameters."""
+        return slope
 
     def take(self, slope: Tensor, light_slope: Tensor | None) -> None:
         """Set the gradients from those of the mask (times the scale) and of the logarithm of the scale; `slope` is used up.

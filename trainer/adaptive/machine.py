@@ -68,30 +68,46 @@ class Machine:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """How light meets objects: transmission = floor + gain * grey; the law of one exposure; the type of the matrix products."""
+    """How light meets objects: transmission = floor + gain * grey; the law of one exposure; the type of the matrix products.
+
+    With `dark_pixels` grey values have one more column, the light that dark pixels bring where a full one has 1 (model/imaging.py).
+    """
 
     law: ClickLaw
     gain: float
     floor: float = 0.0
     products: torch.dtype = torch.float32
+    dark_pixels: bool = False
 
     @property
     def sums(self) -> torch.dtype:
         """The type of everything but the products: float32, or wider where these are."""
         return torch.promote_types(self.products, torch.float32)
 
-    def light(self, mask: Tensor, grey: Tensor) -> Tensor:
-        """Return mask @ transmission, (states, objects), of grey values `grey` (objects, pixels) in the type of the products."""
+    def light(self, mask: Tensor, grey: Tensor, full: Tensor | None = None) -> Tensor:
+        """Return mask @ transmission, (states, objects), of grey values `grey` (objects, pixels) in the type of the products.
+
+        `full` (states, 1) is what a full pixel has in the mask; None: as much as the brightest one.
+        """
+        if self.dark_pixels:
+            mask = torch.cat([mask, mask.amax(dim=1, keepdim=True) if full is None else full], dim=1)
         brought = (mask.to(self.products) @ grey.T).to(self.sums).mul_(self.gain)
         if self.floor:
             brought += self.floor * mask.sum(dim=1, keepdim=True)
         return brought
 
-    def mask_slope(self, slope: Tensor, grey: Tensor) -> Tensor:
-        """Return the gradient of the mask (states, pixels) from that of the light, (states, objects)."""
+    def mask_slope(self, slope: Tensor, grey: Tensor, light: Light | None = None) -> Tensor:
+        """Return the gradient of the mask (states, pixels) from that of the light, (states, objects).
+
+        With `light` that of what a full pixel has is in it; without, it is the sum of the transmission of `grey`, weighted by `slope`.
+        """
         result = (slope.to(self.products) @ grey).to(slope.dtype).mul_(self.gain)
         if self.floor:
             result += self.floor * slope.sum(dim=1, keepdim=True)
+        if self.dark_pixels:
+            of_full, result = result[:, -1:], result[:, :-1].contiguous()
+            if light is not None:
+                result = light.add_full(result, of_full)
         return result
 
 
@@ -124,7 +140,7 @@ class Pass:
 def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
     """Return the light (states, objects) that the patterns of `light` bring from objects of `grey`."""
     mask, scale = light.shown()
-    result = sight.light(mask, grey)
+    result = sight.light(mask, grey, light.full(mask) if sight.dark_pixels else None)
     return result if scale is None else result.mul_(scale)
 
 
@@ -190,7 +206,7 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         after_click = beta[level.successors[1]]
         gain = beta[level.successors[0]].sub_(after_click)  # what no click costs more than a click
         slope = torch.mul(step.fall, gain).neg_().add_(aim.price).mul_(step.alpha).mul_(share)
-        mask_slope = sight.mask_slope(slope, grey)
+        mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
         level.light.take(mask_slope if scale is None else mask_slope.mul_(scale), light_slope)

@@ -2,7 +2,8 @@
 
 Owns the split into objects to fit and objects held back (they set prices and calibrate, no pattern is trained on them), the random
 order, soft targets in place of the labels (train/teacher.py), and blocks of one size. Grey values stay whole
-numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey.
+numbers, exact in bfloat16 up to 256; the transmission is floor + gain * grey. Through drawn optics (model/imaging.py) they are
+transmission / gain with one more column, the light of dark pattern pixels.
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pans.runtime.imaging import Tolerance
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
+from pans.trainer.model.imaging import DrawnOptics
 from pans.trainer.tasks.distort import DISTORT_STREAM, distorted
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.tasks.shifts import shifted
 
 HELD_BACK_PART = 12  # one in 12 training objects, the last ones
 ORDER_STREAM = 0xA07
+HELD_BACK_DRAW = (1 << 62) - 1  # of optics; beyond all epochs
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,7 @@ class Augmentation:
     offset_px: int = 0
     copies: int = 0
     strength: float = 1.0
+    optics: Tolerance | None = None  # seen through optics drawn within it, anew in every epoch
 
 
 class TrainingObjects:
@@ -66,9 +71,12 @@ class TrainingObjects:
         self.image_shape = task.image_shape
         modulator = profile.object_modulator
         self._levels = 256 if modulator is None else min(256, modulator.levels)
-        self.floor = profile.min_transmission
-        self.gain = (1.0 - self.floor) / (self._levels - 1)
+        self._black = profile.min_transmission
+        self.gain = (1.0 - self._black) / (self._levels - 1)
         self._seed, self._augmentation = seed, augmentation
+        tolerance = augmentation.optics
+        self._optics = None if tolerance is None else DrawnOptics(tolerance, task.image_shape, seed)
+        self.floor = self._black if self._optics is None else 0.0  # which drawn optics show like all other light
         self._targets: NDArray[np.float32] | None = None
 
     @property
@@ -86,11 +94,14 @@ class TrainingObjects:
     def mean_transmission(self) -> Tensor:
         """Return the mean transmission of every pixel over the first objects, float32 (pixels,)."""
         grey = torch.from_numpy(self._grey(self._fit.images[:10_000]).copy())
-        return here(self.floor + self.gain * grey.float().mean(dim=0))
+        return here(self._black + self.gain * grey.float().mean(dim=0))
 
     def wide(self, objects: Objects) -> Tensor:
-        """Return the grey values of any objects of the task, float64 (objects, pixels)."""
-        return here(torch.from_numpy(self._grey(objects.images).astype(np.float64)))
+        """Return the grey values of any objects of the task on perfect optics, float64 (objects, pixels), as blocks have them."""
+        grey = torch.from_numpy(self._grey(objects.images).astype(np.float64))
+        if self._optics is not None:
+            grey = torch.cat([grey + self._black / self.gain, torch.zeros(len(grey), 1, dtype=torch.float64)], dim=1)
+        return here(grey)
 
     def epoch(self, number: int, size: int, dtype: torch.dtype, plain: bool = False) -> list[Block]:
         """Return the objects to fit in an order of their own, augmented unless `plain`; the last block may be smaller."""
@@ -98,11 +109,12 @@ class TrainingObjects:
         order = random.permutation(self.n_fit)
         objects = self._fit if plain else self._augmented(number)
         targets = None if self._targets is None else self._targets[order]
-        return list(self._blocks(Objects(objects.images[order], objects.labels[order]), size, dtype, targets))
+        chosen = Objects(objects.images[order], objects.labels[order])
+        return list(self._blocks(chosen, size, dtype, targets, draw=number))
 
     def held_back(self, size: int, dtype: torch.dtype) -> list[Block]:
-        """Return the objects held back, as they are."""
-        return list(self._blocks(self._back, size, dtype))
+        """Return the objects held back, as they are, or through optics that no epoch has drawn."""
+        return list(self._blocks(self._back, size, dtype, draw=HELD_BACK_DRAW))
 
     def _augmented(self, number: int) -> Objects:
         objects, way = self._fit, self._augmentation
@@ -120,12 +132,23 @@ class TrainingObjects:
         table = np.rint(np.arange(256) / 255.0 * (self._levels - 1)).astype(np.uint8)
         return np.asarray(table[flat])
 
+    def _shown(self, images: np.ndarray, draw: int) -> Tensor:
+        """Grey values of images, or what optics of that number of draw show of them in the same unit."""
+        grey = torch.from_numpy(self._grey(images).copy())
+        return grey if self._optics is None else self._optics.through(grey.float() + self._black / self.gain, draw)
+
     def _blocks(
-        self, objects: Objects, size: int, dtype: torch.dtype, targets: NDArray[np.float32] | None = None
+        self,
+        objects: Objects,
+        size: int,
+        dtype: torch.dtype,
+        targets: NDArray[np.float32] | None = None,
+        *,
+        draw: int,
     ) -> Iterator[Block]:
-        grey, labels = self._grey(objects.images), objects.labels
+        grey, labels = self._shown(objects.images, draw), objects.labels
         for first in range(0, len(labels), size):
-            part = torch.from_numpy(grey[first : first + size].copy())
+            part = grey[first : first + size].clone()
             if targets is None:
                 one_hot = torch.zeros(self.n_classes, len(part))
                 one_hot[here(torch.from_numpy(labels[first : first + size])), torch.arange(len(part))] = 1.0

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import Profile
+from pans.trainer.options import check_optics
 from pans.trainer.tasks.registry import Task
 
 PHOTONS_PER_CLICK = 1.85  # of a trained automaton, about; only to choose defaults for a budget of clicks
@@ -59,6 +60,7 @@ class AutomatonOptions:
     soft: float | None = None  # weight of a network's answers in the targets, the labels have the rest; None: SOFT_OF
     teacher_epochs: int = 6  # of that network
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
+    optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
 
 
 LIMITS = {
@@ -153,6 +155,8 @@ def check_automaton_options(options: AutomatonOptions, task: Task, profile: Prof
         )
     if options.dark is not None and not 0 <= options.dark < math.inf:
         raise UsageError(f"--dark is {options.dark}, allowed: finite and at least 0")
+    if options.optics is not None:
+        check_optics(options.optics)
     _check_task(task)
     _check_fits(options, profile)
 

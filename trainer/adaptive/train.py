@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
@@ -151,7 +152,8 @@ class _Run:
     ) -> None:
         self.profile, self.options, self.report = profile, for_task(options, task.name), report
         options = self.options
-        changes = Augmentation(options.shift_px, options.offset_px, options.copies or 0, options.strength)
+        tolerance = None if options.optics is None else tolerance_of(options.optics)
+        changes = Augmentation(options.shift_px, options.offset_px, options.copies or 0, options.strength, tolerance)
         self.objects = TrainingObjects(task, profile, options.seed, changes, held_back)
         self.exposures, self.states = with_defaults(options, profile)
         self.stage, self.epoch = "grow", 0
@@ -177,7 +179,8 @@ class _Run:
         law = click_law(self.profile, exposure_us_of(self.profile, min(high, max(low, top))))
         if self.options.dark is not None:
             law = replace(law, dark_per_exposure=self.options.dark)
-        return Sight(law, self.objects.gain, self.objects.floor, products)
+        through = self.options.optics is not None
+        return Sight(law, self.objects.gain, self.objects.floor, products, through)
 
     # ---- the stages ----
 

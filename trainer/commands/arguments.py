@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from pans.runtime.errors import UsageError
+from pans.runtime.imaging import Tolerance
+from pans.runtime.instrument.profile import Profile
 
 
 def add_data_dir(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +34,14 @@ def torch_with(threads: int, what: str = "training") -> Any:
         ) from error
     torch.set_num_threads(threads)
     return torch
+
+
+def stated_tolerance(profile: Profile) -> str | None:
+    """Return the tolerance that `profile` states for its optics, as `--optics` spells it; None where it states perfect ones."""
+    if profile.optics is None:
+        return None
+    tolerance = profile.optics.tolerance()
+    return None if tolerance == Tolerance() else tolerance.spelled()
 
 
 @contextmanager

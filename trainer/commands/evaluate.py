@@ -15,12 +15,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.automaton import CONFIDENCE_RANGE
-from pans.runtime.bundle.optics import amplification
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
 from .arguments import add_data_dir, needing, usage_errors
+from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pans.trainer.evaluate.walks import MeasuredWalks
 
 
-PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png", "reliability.png")
+PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png", "reliability.png", "optics.png")
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -64,6 +64,7 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
         help="draw confusion, a map of the clicks, patterns, reliability (extra plot)",
     )
     add_force(parser)
+    add_optics(parser)
     parser.add_argument(
         "--data-seed", type=int, metavar="N", help="of a drawn task (default: that of the bundle's training)"
     )
@@ -72,7 +73,7 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle
-    from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, measure, walks_on
+    from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, imaging_on, measure, walks_on
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
     from pans.trainer.tasks.remembered import remembered_task
 
@@ -90,7 +91,10 @@ def _evaluate(args: argparse.Namespace) -> int:
     bundle, digest = load_bundle(args.bundle)
     if args.exact and bundle.picture_shape is not None:
         raise UsageError("--exact: pictures are compared by trials", remedy="use --trials")
-    conditions = Conditions(args.profile, args.eta, args.dark, args.seed, args.data_seed, args.confidence)
+    several = several_tables(args)
+    with usage_errors():
+        imaging = None if several else one_table(args.optics)
+    conditions = Conditions(args.profile, args.eta, args.dark, args.seed, args.data_seed, args.confidence, imaging)
     trials = args.trials
     if trials is None and not args.exact and bundle.automaton is None:
         trials = default_trials(bundle)
@@ -101,6 +105,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         _check_data_seed(args, held_out)
         assumed = not args.profile and "profile" not in bundle.provenance
         note(f"evaluating {bundle.name} on {held_out.task.name}")
+        if several:
+            return evaluate_tables(args, bundle, digest, held_out, conditions)
         started = time.perf_counter()
         if bundle.automaton is None:
             measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
@@ -112,13 +118,13 @@ def _evaluate(args: argparse.Namespace) -> int:
                 **walk_payload(walks),
                 **_compared(bundle, measured, held_out, args),
             }
-        more |= passive_light(bundle, held_out)
     payload = {
         **asdict(measured),
         **more,
         "task": held_out.task.name,
         "profile": held_out.profile.name,
         "profile_assumed": assumed,
+        "optics": imaging_on(held_out, conditions).numbers(),
         "sha256": digest,
         "seconds": time.perf_counter() - started,
         "simulated": True,
@@ -154,7 +160,7 @@ def _compared(bundle: Bundle, measured: MeasuredWalks, held_out: HeldOut, args: 
     """What the bundle says that it achieves, and where that is not what was found under the same conditions."""
     from pans.trainer.evaluate.walks import expected_differences, expected_figures
 
-    same = args.eta == 1 and args.dark is None and not args.confidence and not measured.trials
+    same = args.optics is None and args.eta == 1 and args.dark is None and not args.confidence and not measured.trials
     kept = bundle.expected
     if kept is None or not same:
         return {"expected": None if kept is None else dict(kept), "expected_differences": None}
@@ -164,7 +170,7 @@ def _compared(bundle: Bundle, measured: MeasuredWalks, held_out: HeldOut, args: 
 
 def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions) -> list[str]:
     from pans.trainer.evaluate.accuracy import light_of
-    from pans.trainer.evaluate.held_out import walks_on
+    from pans.trainer.evaluate.held_out import imaging_on, walks_on
 
     with needing("--pictures", "plot"):
         from pans.trainer.evaluate.pictures import write_pictures, write_walk_pictures
@@ -173,22 +179,18 @@ def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, condition
         if bundle.automaton is not None:
             walks = walks_on(bundle, held_out, conditions=conditions)
             return [str(path) for path in write_walk_pictures(args.pictures, bundle, walks, force=args.force)]
-        light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
+        light = light_of(
+            bundle,
+            held_out.profile,
+            objects.images,
+            eta=conditions.eta,
+            dark=conditions.dark,
+            imaging=imaging_on(held_out, conditions),
+        )
         written = write_pictures(
             args.pictures, bundle, light, objects, shots=args.shots, seed=args.seed, force=args.force
         )
     return [str(path) for path in written]
-
-
-def passive_light(bundle: Bundle, held_out: HeldOut) -> dict[str, Any]:
-    """Return what a passive sensor's figures stand on: how much light its W makes, and how much must reach real optics for it."""
-    if bundle.analyser is None:
-        return {}
-    reaching = bundle.analyser.reaching(held_out.objects.images)
-    return {
-        "amplification": amplification(bundle.analyser.kind, bundle.analyser.matrix),
-        "reaching_photons": reaching,
-    }
 
 
 def words_of(
@@ -199,8 +201,6 @@ def words_of(
     if "exposures_mean" in figures:
         return _walk_words(figures, more)
     light = f"  clicks {measured.clicks_mean:.3f}   photons {measured.photons_mean:.2f}   illumination {measured.illumination:.1f}"
-    if "reaching_photons" in more:
-        light += f"\n  {_reaching_words(more)}"
     if "ssim_mean" in figures:
         return (
             f"SIMULATED SSIM {figures['ssim_mean']:.4f}, mean squared error {figures['mse_mean']:.4f}  "
@@ -214,13 +214,6 @@ def words_of(
         f"  spread over trials      {100 * figures['accuracy_std']:.2f} points\n"
         f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}"
     )
-
-
-def _reaching_words(more: Mapping[str, Any]) -> str:
-    words = f"at least {more['reaching_photons']:,.0f} photoelectrons per object must reach the optics"
-    if more["amplification"] > 1:
-        words += f": W is unconstrained and gives up to {more['amplification']:,.3g} times its light"
-    return words
 
 
 def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:

@@ -30,9 +30,9 @@ from pans.trainer.options import (
     plain_options,
 )
 
-from .arguments import add_data_dir, add_threads, needing, torch_with, usage_errors
+from .arguments import add_data_dir, add_threads, needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
-from .evaluate import passive_light, words_of
+from .evaluate import words_of
 from .train_own import Chosen, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ NUMBERS = (
 )
 OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher")
 AS_GIVEN = (
-    *("features", "photons", "budget", "complex_field"),
+    *("features", "photons", "budget", "complex_field", "conserving", "optics"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
 )
 
@@ -103,6 +103,11 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
         flag, default = "--" + name.replace("_", "-"), defaults.get(name)
         kind = float if default is None else type(default)
         parser.add_argument(flag, type=kind, metavar=metavar, help=words)
+    parser.add_argument(
+        "--optics",
+        metavar="SPEC",
+        help="train through optics drawn within this tolerance, like shift=1:rotate=2:psf=0.5..0.8:black=0.002",
+    )
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
     parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
     parser.add_argument(
@@ -151,15 +156,7 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
 def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     """Optics, estimator and head; the budget of light, which automata have too."""
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
-    made = parser.add_mutually_exclusive_group()
-    made.add_argument(
-        "--conserving", action="store_true", help="a passive encoder gives no more light than it gets (default)"
-    )
-    made.add_argument(
-        "--unconstrained",
-        action="store_true",
-        help="a passive encoder may give more light than it gets, as the paper's does",
-    )
+    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
     parser.add_argument(
         "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
     )
@@ -205,7 +202,7 @@ def _train(args: argparse.Namespace) -> int:
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else Chosen(task, {})
-    options = _options(args, task)
+    options = _options(args, task, profile)
     check_options(options, profile)
     started = time.perf_counter()
     history = _history(args, options, checkpoint, chosen.task)
@@ -259,10 +256,10 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
     from pans.trainer.evaluate.held_out import HeldOut, measure, trials_needed
 
     bundle = exported.bundle
-    trials, every = trials_needed(bundle), HeldOut(task, task.test, profile)
-    measured = measure(bundle, every, trials=trials)
-    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials)
-    light = passive_light(bundle, every)
+    trials = trials_needed(bundle)
+    measured, of_first = (
+        measure(bundle, HeldOut(task, task.test.first(count), profile), trials=trials) for count in (None, 200)
+    )
     figures = {
         "sha256": exported.sha256,
         **asdict(measured),
@@ -273,9 +270,8 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
         "words_compared": exported.words_compared,
         "dead_patterns": exported.dead_patterns,
         "validation_losses": trained.validation_losses,
-        **light,
     }
-    return figures, words_of(measured, light)
+    return figures, words_of(measured)
 
 
 def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task: Task) -> History | None:
@@ -289,7 +285,7 @@ def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task:
     return History(checkpoint, options, task.sha256)
 
 
-def _options(args: argparse.Namespace, task: Task) -> Options:
+def _options(args: argparse.Namespace, task: Task, profile: Profile) -> Options:
     """What the arguments mean for this task: its physics chooses the encoder, its question the head."""
     from pans.trainer.tasks.registry import physical_encoder
 
@@ -306,11 +302,8 @@ def _options(args: argparse.Namespace, task: Task) -> Options:
     best = "exact" if args.features <= EXACT_FEATURES_MAX else "local"
     estimator = args.estimator or ("ste" if is_picture else best)
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
-    given = {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
-    if encoder != "active":
-        given["conserving"] = not args.unconstrained
-    elif args.unconstrained:
-        raise UsageError("--unconstrained belongs to a passive encoder", remedy="leave it out")
+    given: dict[str, Any] = {"optics": stated_tolerance(profile) if encoder == "active" else None}
+    given |= {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
     return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
 
 

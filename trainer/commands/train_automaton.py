@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, emit, say
 from pans.runtime.errors import UsageError
 
-from .arguments import needing, torch_with, usage_errors
+from .arguments import needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
 from .train_own import After, Chosen, choose, finish
 
 if TYPE_CHECKING:
+    from pans.runtime.instrument.profile import Profile
     from pans.trainer.adaptive.options import AutomatonOptions
     from pans.trainer.adaptive.train import Progress, TrainedAutomaton
     from pans.trainer.export.automaton import ExportedAutomaton, WalkFigures
@@ -45,21 +46,11 @@ TAKEN = (
     "exposure_price",
     "soft",
     "dark",
+    "optics",
 )
 FOREIGN = (
     *("features", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
-    *(
-        "polish",
-        "similarity",
-        "mix",
-        "shots",
-        "hidden",
-        "slope",
-        "clamp",
-        "complex_field",
-        "conserving",
-        "unconstrained",
-    ),
+    *("polish", "similarity", "mix", "shots", "hidden", "slope", "clamp", "complex_field", "conserving"),
 )
 
 
@@ -76,7 +67,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else Chosen(task, {})
-    options = _options(args)
+    options = _options(args, profile)
     check_automaton_options(options, task, profile)
     if args.teacher is not None and not for_task(options, task.name).soft:
         raise UsageError("--teacher: no soft targets are wanted", remedy="add --soft 0.5, say, or leave it out")
@@ -125,10 +116,11 @@ def _refuse_foreign(args: argparse.Namespace) -> None:
         raise UsageError(f"{flags}: not of an automaton", remedy="leave it out, or choose another --encoder")
 
 
-def _options(args: argparse.Namespace) -> AutomatonOptions:
+def _options(args: argparse.Namespace, profile: Profile) -> AutomatonOptions:
     from pans.trainer.adaptive.options import AutomatonOptions
 
-    given = {name: value for name in TAKEN if (value := getattr(args, name)) is not None}
+    given: dict[str, Any] = {"optics": stated_tolerance(profile)}
+    given |= {name: value for name in TAKEN if (value := getattr(args, name)) is not None}
     return AutomatonOptions(grey=args.grey, **given)
 
 

@@ -19,6 +19,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
+from pans.runtime.imaging import IDENTITY, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
@@ -55,11 +56,18 @@ class Light:
 
 
 def light_of(
-    bundle: Bundle, profile: Profile, images: NDArray[np.uint8], *, eta: float = 1.0, dark: float | None = None
+    bundle: Bundle,
+    profile: Profile,
+    images: NDArray[np.uint8],
+    *,
+    eta: float = 1.0,
+    dark: float | None = None,
+    imaging: Imaging = IDENTITY,
 ) -> Light:
     """Show the patterns of `bundle` on `images` (n, height, width) through `profile`, or look at them through its passive optics.
 
-    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure. ValueError for images of another shape.
+    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `imaging` is how the object stands on the
+    grid of the patterns. ValueError for images of another shape, and for an `imaging` of passive optics.
     """
     if images.shape[1:] != bundle.image_shape:
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
@@ -67,16 +75,22 @@ def light_of(
         raise ValueError(f"{bundle.name} has an automaton: what it shows depends on the clicks (walks.walks_of)")
     law = law_of(bundle, profile, eta, dark)
     if bundle.analyser is not None:
+        if not imaging.is_identity:
+            raise ValueError(f"{bundle.name} is passive: it shows no patterns that could miss the object")
         with as_usage_error():
             light = bundle.analyser.photoelectrons(images) * eta
         return Light(light, click_probability(law, light), law, 0.0)
-    patterns = bundle.patterns() * eta
+    patterns, illumination = bundle.patterns() * eta, bundle.illumination() * eta
+    if not imaging.is_identity:
+        full = bundle.photons_per_level * (bundle.levels - 1) * eta
+        patterns = met(imaging, patterns, bundle.image_shape, full)
+        illumination = float(patterns.sum())
     light = np.empty((len(images), bundle.n_features))
     step = max(1, _CHUNK_NUMBERS // bundle.n_pixels)
     for start in range(0, len(images), step):
         part = images[start : start + step]
         light[start : start + step] = object_transmission(profile, part.reshape(len(part), -1)) @ patterns.T
-    return Light(light, click_probability(law, light), law, bundle.illumination() * eta)
+    return Light(light, click_probability(law, light), law, illumination)
 
 
 def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None) -> ClickLaw:

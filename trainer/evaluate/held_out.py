@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
+from pans.runtime.imaging import Imaging
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.tasks.remembered import remembered_task
@@ -39,6 +40,7 @@ class Conditions:
     seed: int = 0  # of the trials
     data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
     confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
+    imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +108,11 @@ def held_out_of(
     return HeldOut(found, (found.everything() if whole else found.test).first(count), profile)
 
 
+def imaging_on(held_out: HeldOut, conditions: Conditions) -> Imaging:
+    """Return how the objects stand on the grid of the patterns."""
+    return held_out.profile.imaging() if conditions.imaging is None else conditions.imaging
+
+
 def measure(
     bundle: Bundle,
     held_out: HeldOut,
@@ -120,7 +127,14 @@ def measure(
         return measured_walks(walks_on(bundle, held_out, shots=shots, trials=trials, conditions=conditions))
     if conditions.confidence:
         raise ValueError(f"confidence is {conditions.confidence:g}, but {bundle.name} has no automaton")
-    light = light_of(bundle, held_out.profile, objects.images, eta=conditions.eta, dark=conditions.dark)
+    light = light_of(
+        bundle,
+        held_out.profile,
+        objects.images,
+        eta=conditions.eta,
+        dark=conditions.dark,
+        imaging=imaging_on(held_out, conditions),
+    )
     if bundle.picture_shape is not None:
         if trials is None:
             raise ValueError("pictures are compared by trials, there is no exact expectation")
@@ -154,6 +168,7 @@ def walks_on(
         confidence=told.confidence,
         trials=trials,
         seed=told.seed,
+        imaging=imaging_on(held_out, told),
     )
 
 

@@ -20,6 +20,7 @@ from pans.runtime.bundle.walks import EXPECTED_KEYS
 from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
+from pans.runtime.imaging import IDENTITY, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, object_transmission
 from pans.runtime.instrument.profile import Profile
 
@@ -97,11 +98,12 @@ def walks_of(
     confidence: float = 0.0,
     trials: int | None = None,
     seed: int = 0,
+    imaging: Imaging = IDENTITY,
 ) -> Walks:
     """Show the automaton of `bundle` to `images` (n, height, width) through `profile`; exact, or `trials` walks per object.
 
-    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `confidence` stops early. ValueError for what
-    does not fit.
+    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `confidence` stops early, `imaging`
+    is how the object stands on the grid of the patterns. ValueError for what does not fit.
     """
     if bundle.automaton is None:
         raise ValueError(f"{bundle.name} has no automaton")
@@ -116,15 +118,18 @@ def walks_of(
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
     rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
     afterpulse = profile.detector.afterpulse_probability
+    patterns: NDArray[Any] = bundle.pattern_levels
+    if not imaging.is_identity:
+        patterns = met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
     for start in range(0, len(images), step):
         part = images[start : start + step]
         seen = object_transmission(profile, part.reshape(len(part), -1))
         sums: _Sums
         if trials is None:
-            found = expected_walk(automaton, bundle.pattern_levels, seen, law, scale, afterpulse=afterpulse)
+            found = expected_walk(automaton, patterns, seen, law, scale, afterpulse=afterpulse)
             sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
         else:
-            sums = _sampled(automaton, bundle.pattern_levels, seen, (law, afterpulse), scale, trials, rng)
+            sums = _sampled(automaton, patterns, seen, (law, afterpulse), scale, trials, rng)
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     return _together(parts, trials or 0)
 

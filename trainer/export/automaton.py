@@ -28,6 +28,7 @@ from pans.trainer.evaluate.accuracy import law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
+from .tolerance import with_tolerance
 from .writer import origin, programs
 
 COMPARED_OBJECTS = 100
@@ -72,9 +73,12 @@ def export_automaton(
 ) -> ExportedAutomaton:
     """Write what `train_automaton` returned to `path`; UsageError if it exists, unless `force`. A wrong bundle never stands there."""
     bundle = bundle_of(trained, task, profile, name, provenance)
+    bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
     dark = trained.options.dark
-    found = measured_walks(walks_of(bundle, profile, task.test.images, task.test.labels, dark=dark))
+    found = measured_walks(
+        walks_of(bundle, profile, task.test.images, task.test.labels, dark=dark, imaging=profile.imaging())
+    )
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
     expected = expected_figures(found, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
@@ -114,7 +118,9 @@ def bundle_of(
 
 def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> WalkFigures:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
-    return walk_figures(measured_walks(walks_of(bundle, profile, objects.images, objects.labels, dark=dark)))
+    return walk_figures(
+        measured_walks(walks_of(bundle, profile, objects.images, objects.labels, dark=dark, imaging=profile.imaging()))
+    )
 
 
 def walk_figures(found: MeasuredWalks) -> WalkFigures:

@@ -33,6 +33,7 @@ from pans.trainer.train.loop import Trained
 
 from .int8_onnx import int8_onnx
 from .onnx_heads import DEAD_VARIANCE, head_onnx
+from .tolerance import with_tolerance
 
 ALL_WORDS_MAX = 12  # 4096 words; a bundle holds a table up to here too
 RANDOM_WORDS = 10_000  # beyond it
@@ -72,12 +73,14 @@ def export(
     check: Callable[[Bundle], None] = lambda _: None,
     *,
     force: bool = False,
+    finish: Callable[[Bundle], Bundle] = lambda bundle: bundle,
 ) -> Exported:
     """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ.
 
     UsageError if `path` exists, unless `force`. A wrong bundle never stands there.
 
-    A head that returns pictures decides among no classes. `check` may refuse what was read, by PansError.
+    A head that returns pictures decides among no classes. `check` may refuse what was read, by PansError; `finish` may add facts to
+    the bundle before it is written.
     """
     graph, dead = head_onnx(head, click_mean)
     picture_shape = head.image_shape if isinstance(head, Decoders) else None
@@ -95,7 +98,7 @@ def export(
         provenance={**about.provenance, "trained_with": programs()},
     )
     with whole_file(path, force=force) as unchecked:
-        write_bundle(bundle, unchecked)
+        write_bundle(finish(bundle), unchecked)
         bundle, digest = load_bundle(unchecked)
         words, difference = compare(bundle, head, click_mean)
         check(bundle)
@@ -146,7 +149,10 @@ def export_trained(
     def check(bundle: Bundle) -> None:
         compare_optics(bundle, trained, task, profile)
 
-    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check, force=force)
+    def finish(bundle: Bundle) -> Bundle:
+        return with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
+
+    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check, force=force, finish=finish)
 
 
 def analyser_of(trained: Trained, task: Task, profile: Profile) -> Analyser:

@@ -33,6 +33,8 @@ class ActiveIllumination(nn.Module):
     `top_limits` are the least and most photoelectrons that the brightest level may give: the projector's peak times the
     exposures that the profile allows. With `levels` set, the forward pass shows whole levels, and the gradient passes the
     rounding straight through; the photoelectrons of the top level are then trained too.
+
+    Transmissions may have one more column, the light that dark pixels bring where a full one gives 1 (imaging.py).
     """
 
     def __init__(
@@ -86,6 +88,9 @@ class ActiveIllumination(nn.Module):
     def forward(self, transmission: Tensor, floor: float = 0.0) -> Tensor:
         """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""
         patterns = self.patterns()
+        if transmission.shape[1] > patterns.shape[1]:
+            full = patterns.max() if self.levels is None else self.top()
+            patterns = torch.cat([patterns, full.expand(len(patterns), 1)], dim=1)
         photoelectrons: Tensor = (1 - floor) * (transmission @ patterns.T) + floor * patterns.sum(dim=1)
         return photoelectrons
 

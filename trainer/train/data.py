@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 from pans.runtime.bundle.optics import incident_field, incident_intensity
+from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
+from pans.trainer.model.imaging import DrawnOptics
 from pans.trainer.options import Options
 from pans.trainer.tasks.distort import with_copies
 from pans.trainer.tasks.registry import Objects, Task
@@ -50,6 +52,17 @@ class TrainingData:
         self.shown, self.labels, self.target = here(self.shown), here(self.labels), here(self.target)
         self.picture_shape = self.image_shape if self.is_image else None  # of what is to be given back
         self.n_fit = len(self.labels) - n_validation
+        tolerance = None if options.optics is None else tolerance_of(options.optics)
+        self.optics = None if tolerance is None else DrawnOptics(tolerance, task.image_shape, options.seed)
+
+    def drawn(self, number: int, floor: float) -> tuple[Tensor, float]:
+        """Return the objects for an epoch, and the black that is still to be lifted: drawn optics show that of the modulator too.
+
+        `number` counts the draws of optics. Without any the objects are `shown`.
+        """
+        if self.optics is None:
+            return self.shown, floor
+        return self.optics.through((1.0 - floor) * self.shown + floor, number), 0.0
 
 
 def encoder_input(task: Task, objects: Objects, profile: Profile, options: Options) -> Tensor:

@@ -45,6 +45,8 @@ VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
+FINAL_DRAWS = 1 << 40  # of optics: those of validation and of the head's fit come after those of all epochs
+HEAD_DRAWS = 4  # optics through which the head sees every object when it is fitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +162,11 @@ class Run:
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
         sums = torch.zeros(4, dtype=torch.float64)
+        shown, lifted = data.drawn(self.restart * options.epochs + self.epoch, self._black(self.epoch))
         self.head.train()
         for i, batch in enumerate(batches):
             now = self.epoch + i / len(batches)
-            light = self.encoder(data.shown[batch], schedule.black(options, now, data.floor))
+            light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
             slope, clamp = schedule.slope_and_clamp(options, now)
             p = click_probability(light.clamp(max=clamp), law, slope)
@@ -185,6 +188,9 @@ class Run:
         stage = schedule.stage(options, self.epoch)
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
+
+    def _black(self, now: float) -> float:
+        return schedule.black(self.options, now, self.data.floor)
 
     def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
         """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
@@ -222,13 +228,17 @@ class Run:
 
     # ---- after the last epoch ----
 
-    def probabilities(self, start: int, stop: int) -> Tensor:
-        """Click probabilities, float64 (n, d_f), of the training objects start..stop through the whole instrument."""
+    def probabilities(self, start: int, stop: int, draw: int = 0) -> Tensor:
+        """Click probabilities, float64 (n, d_f), of the training objects start..stop through the whole instrument.
+
+        `draw` counts draws of optics that no epoch has seen.
+        """
         law, parts = self.law(), []
+        shown, floor = self.data.drawn(FINAL_DRAWS + draw, self.data.floor)
         with torch.no_grad():
             for first in range(start, stop, CHUNK):
                 which = torch.arange(first, min(first + CHUNK, stop))
-                parts.append(click_probability(self.encoder(self.data.shown[which], self.data.floor).double(), law))
+                parts.append(click_probability(self.encoder(shown[which], floor).double(), law))
         return torch.cat(parts)
 
     def validation_loss(self) -> float:
@@ -272,11 +282,13 @@ class Run:
                 floats = (self.encoder.weight**2).cpu().numpy().copy()
             with as_usage_error():
                 quantised = quantise_patterns(floats, self.profile.projector.levels, float(self.encoder.top().detach()))
-        p, shape = self.probabilities(0, len(self.data.labels)), self.data.picture_shape
+        n, shape = len(self.data.labels), self.data.picture_shape
+        draws = 1 if self.data.optics is None else HEAD_DRAWS
+        p = torch.cat([self.probabilities(0, n, draw) for draw in range(draws)])
         fit_head(
             self.head,
             p,
-            self.data.target,
+            torch.cat([self.data.target] * draws),
             cross_entropy if shape is None else similarity_loss(self.options.similarity, shape),
             self.random,
             shots=self.options.shots,

@@ -20,7 +20,7 @@ import serial
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.ports import shell
-from pans.firmware_sim.ports.serve import ChildLink, SimOptions, open_sim, parse_sim_url
+from pans.firmware_sim.ports.serve import ChildLink, SimOptions, build_instrument, open_sim, parse_sim_url
 from pans.firmware_sim.ports.shell import Port, TcpPort, open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import load_scene
@@ -61,6 +61,9 @@ def test_a_url_names_the_instrument() -> None:
         ("sim:ideal?offset=-1", "offset=-1"),
         ("sim:ideal?drift_ppm=nan", "drift_ppm=nan"),
         ("sim:ideal?drift_ppm=5000", "drift_ppm=5000"),
+        ("sim:ideal?optics=shift=1", "allowed: shift=RIGHT,DOWN"),
+        ("sim:ideal?optics=psf=-1", "psf_px is -1.0"),
+        ("sim:ideal?optics=psf=1:tilt=2", "'tilt=2' is not KEY=VALUE"),
         ("sim:ideal?" + "&".join(["seed=1"] * 50), "no list of key=value"),
     ],
 )
@@ -68,6 +71,23 @@ def test_what_cannot_be_meant_is_refused(url: str, text: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse_sim_url(url)
     assert text in str(caught.value)
+
+
+def test_hidden_optics_change_the_light_and_are_announced() -> None:
+    options = parse_sim_url("sim:ideal?scene=fashion200&pace=fast&optics=shift=1,-2:black=0.01:gain=5%")
+    instrument, _ = build_instrument(options, START_NS)
+    assert isinstance(instrument, Instrument)
+    imaging = instrument.view.scene.what.imaging  # type: ignore[union-attr]
+    assert (imaging.right_px, imaging.down_px, imaging.black, imaging.gain) == (1.0, -2.0, 0.01, 1.05)
+    assert instrument._facts()["simulated_optics"] == "right_px 1, down_px -2, black 0.01, gain 1.05"
+    perfect, _ = build_instrument(parse_sim_url("sim:ideal?scene=fashion200&pace=fast"), START_NS)
+    assert "simulated_optics" not in perfect._facts()  # type: ignore[attr-defined]
+
+
+def test_optics_are_for_objects_that_stand_still() -> None:
+    options = parse_sim_url("sim:flow-snspd?scene=cells-in-flow&pace=fast&optics=psf=0.5")
+    with pytest.raises(ConfigError, match="'cells-in-flow' moves: optics other than perfect"):
+        build_instrument(options, START_NS)
 
 
 @pytest.mark.parametrize("pace", ["fast", "real"])

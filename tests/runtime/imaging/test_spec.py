@@ -82,3 +82,10 @@ def test_a_spec_is_told_from_the_name_of_a_bundle():
     assert is_spec("shift=1,2")
     assert not is_spec("folder/shift=1.pans")
     assert not is_spec("psf")
+
+
+def test_a_tolerance_is_spelled_as_it_is_read():
+    found = tolerance_of("shift=1,0.1:rotate=2:scale=3%:psf=0.5..0.8:black=0.002:gain=0.9..1.05")
+    assert tolerance_of(found.spelled()) == found
+    assert found.words().startswith("right_px -1 to 1, down_px -0.1 to 0.1, rotation_deg -2 to 2, scale 0.97 to 1.03")
+    assert Tolerance().words() == "perfect optics"

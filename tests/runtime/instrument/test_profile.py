@@ -4,9 +4,12 @@ import contextlib
 import dataclasses
 import hashlib
 import math
+import re
 import time
 import tomllib
+from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -408,3 +411,74 @@ def test_reading_takes_time_in_proportion_to_the_size(unit: str) -> None:
     with contextlib.suppress(ConfigError):
         read_toml(text, "long.toml")
     assert time.process_time() - started < 2.0  # about 0.2; where each key counted the lines before it, 24
+
+
+OPTICS = """
+[optics]
+psf_px = 0.6
+psf_tolerance_px = 0.1
+right_px = 0.25
+shift_tolerance_px = 1
+rotation_tolerance_deg = 2.0
+dark_pixel = 0.002
+gain_tolerance = 0.05
+"""
+
+
+def test_a_profile_states_its_optics_and_how_far_they_may_be_off() -> None:
+    text = load_profile("dmd-spad").text
+    profile = parse_profile(text.replace("\n[detector]", OPTICS + "\n[detector]", 1), "lab.toml")
+    assert profile.optics is not None
+    spans = profile.optics.tolerance().as_dict()
+    assert spans == {
+        "right_px": [-0.75, 1.25],
+        "down_px": [-1.0, 1.0],
+        "rotation_deg": [-2.0, 2.0],
+        "scale": [1.0, 1.0],
+        "psf_px": [pytest.approx(0.5), pytest.approx(0.7)],
+        "black": [0.002, 0.002],
+        "gain": [0.95, 1.05],
+    }
+    stated = profile.imaging()
+    assert (stated.right_px, stated.psf_px, stated.black, stated.gain) == (0.25, pytest.approx(0.6), 0.002, 1.0)
+
+
+def test_profiles_without_optics_are_perfect_and_read_as_before() -> None:
+    for name in shipped_profiles():
+        profile = load_profile(name)
+        assert profile.optics is None
+        assert profile.imaging().is_identity
+        assert profile == parse_profile(profile.text, f"{name}.toml")
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ("psf_px = -1", "optics.psf_px must be a number from 0 to 1000"),
+        ("psf_px = 0.2\npsf_tolerance_px = 0.3", "psf_tolerance_px must be at most optics.psf_px - 0 = 0.2, found 0.3"),
+        ("scale_tolerance = 0.9", "scale_tolerance must be at most"),
+        ("black = 0.1", "optics.black is not a key"),
+        ("source_fluctuation = 0.5", "from 0 to 0.3"),
+        ("dark_pixel = 1", "from 0 to 0.99"),
+    ],
+)
+def test_optics_that_cannot_be_are_refused(lines: str, words: str) -> None:
+    text = load_profile("dmd-spad").text.replace("\n[detector]", f"\n[optics]\n{lines}\n\n[detector]", 1)
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        parse_profile(text, "lab.toml")
+
+
+def test_a_flat_field_stands_in_a_file_beside_the_profile(tmp_path: Path) -> None:
+    text = load_profile("dmd-spad").text
+    path = tmp_path / "lab.toml"
+    path.write_text(text.replace("\n[detector]", '\n[optics]\nflat_field_file = "flat.npz"\n\n[detector]', 1))
+    with pytest.raises(ConfigError, match="not a readable flat field"):
+        load_profile(path).imaging()
+    flat = np.array([[0.5, 1.5], [0.75, 1.25]])
+    np.savez(tmp_path / "flat.npz", flat=flat)
+    found = load_profile(path).imaging().flat
+    assert found is not None
+    np.testing.assert_array_equal(found, flat)
+    np.savez(tmp_path / "flat.npz", flat=2 * flat)
+    with pytest.raises(ConfigError, match="flat has the mean 2"):
+        load_profile(path).imaging()

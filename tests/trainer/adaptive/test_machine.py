@@ -180,3 +180,39 @@ def test_bits_made_from_grey_patterns_keep_their_light_within_the_top(top):
     darkest_lit = torch.where(mask > 0, grey, torch.inf).amin(dim=1)
     brightest_dark = torch.where(mask > 0, 0.0, grey).amax(dim=1)
     assert bool((darkest_lit >= brightest_dark).all())
+
+
+@pytest.mark.parametrize("bits", [False, True])
+def test_the_gradient_through_optics_holds_the_light_of_dark_pixels(bits):
+    """One more column of grey values: what a pattern's full pixel brings through its dark ones."""
+    machine = random_machine(7, bits)
+    sight = Sight(ClickLaw(0.01), 1 / 255, 0.0, torch.float64, dark_pixels=True)
+    grey = torch.cat([GREY, torch.tensor([[40.0], [90.0], [10.0]], dtype=torch.float64)], dim=1)
+
+    def loss():
+        passed = forward(machine, sight, grey)
+        total = 0.07 * float(passed.photons().mean())
+        for counts, leaves in zip(machine.counts, passed.leaves):
+            total -= float(((leaves @ ONE_HOT.T) * torch.log(counts / counts.sum(dim=1, keepdim=True))).sum()) / len(
+                grey
+            )
+        return total
+
+    light = machine.levels[1].light
+    mask, scale = light.shown()
+    scale = torch.ones(len(mask), 1) if scale is None else scale
+    wanted = scale * (mask @ GREY.T + light.full(mask) * torch.tensor([40.0, 90.0, 10.0])) / 255
+    torch.testing.assert_close(brought(light, sight, grey), wanted)
+    backward(machine, sight, grey, ONE_HOT, forward(machine, sight, grey), Aim(0.07))
+    step = 1e-6
+    for level in machine.levels:
+        tensor = level.light.log_light if bits else level.light.root
+        gradient = tensor.grad.clone()
+        for index in np.ndindex(*tensor.shape):
+            there = tensor[index].item()
+            tensor[index] = there + step
+            above = loss()
+            tensor[index] = there - step
+            below = loss()
+            tensor[index] = there
+            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)

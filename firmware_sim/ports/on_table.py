@@ -1,0 +1,44 @@
+"""The scene as it stands on the optical table: what the profile states of the optics, and a hidden truth in its place.
+
+Owns the choice between the two; the light that follows is computed by scene/optics.py. A scene that moves has perfect optics or none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from pans.firmware_sim.scene.moving import ALL_CHANNELS, Change, SceneFile
+from pans.firmware_sim.scene.scene_file import open_scene
+from pans.firmware_sim.scene.still import Scene
+from pans.runtime.errors import ConfigError
+from pans.runtime.imaging import imaging_of, is_spec
+from pans.runtime.instrument.profile import Profile
+
+
+def scene_on_table(name: str, changes: str, optics: str, profile: Profile) -> SceneFile:
+    """Open the scene `name` with `changes` where `profile` says, or where `optics` does; ConfigError for one that moves.
+
+    `optics` is as of `--optics`; keys that it does not name are as the profile states them.
+    """
+    scene = open_scene(name, changes)
+    imaging = profile.imaging()
+    if is_spec(optics):
+        imaging = imaging_of(optics, imaging)
+    scene = _drifting(scene, profile)
+    if imaging.is_identity:
+        return scene
+    if not isinstance(scene.what, Scene):
+        raise ConfigError(
+            f"scene {scene.name!r} moves: optics other than perfect ones are simulated for still objects",
+            remedy="leave the optics out, or choose a scene of still objects",
+        )
+    return replace(scene, what=replace(scene.what, imaging=imaging))
+
+
+def _drifting(scene: SceneFile, profile: Profile) -> SceneFile:
+    """Let the source drift as the profile states, for as long as a run may last."""
+    drift = 0.0 if profile.optics is None else profile.optics.source_drift_percent_per_hour
+    if not drift:
+        return scene
+    return replace(scene, changes=(*scene.changes, Change("drift", 0.0, math.inf, ALL_CHANNELS, drift / 3600)))

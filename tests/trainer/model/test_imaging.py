@@ -1,0 +1,58 @@
+"""Objects through drawn optics, as training sees them: held against the light that pans.runtime.imaging states."""
+
+# ruff: noqa: E402  (what follows needs torch)
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from pans.runtime.imaging import Imaging, met, tolerance_of
+from pans.trainer.model.encoders import ActiveIllumination
+from pans.trainer.model.imaging import DrawnOptics, through
+
+SHAPE = (6, 7)
+FLAT = np.linspace(0.5, 1.5, 42).reshape(SHAPE)
+TABLE = Imaging(0.4, -0.3, 5.0, 1.02, 0.6, black=0.02, gain=1.1, flat=FLAT)
+
+
+def test_the_light_of_patterns_is_that_of_the_runtimes_model():
+    rng = np.random.default_rng(0)
+    objects, patterns = torch.from_numpy(rng.random((5, 42))), torch.from_numpy(rng.random((3, 42)))
+    full = patterns.amax(dim=1, keepdim=True)
+    light = through(TABLE, objects, SHAPE) @ torch.cat([patterns, full], dim=1).T
+    wanted = met(TABLE, patterns.numpy(), SHAPE, full.numpy()) @ objects.numpy().T
+    np.testing.assert_allclose(light.numpy(), wanted.T, rtol=1e-12)
+
+
+def test_an_encoder_lights_dark_pixels_by_its_brightest_level():
+    random = torch.Generator().manual_seed(0)
+    encoder = ActiveIllumination(3, 42, (0.01, 2.0), random)
+    objects = torch.rand((4, 42), generator=random, dtype=torch.float64)
+    for levels in (None, 16):
+        if levels:
+            encoder.start_quantising(levels)
+        patterns = encoder.patterns().detach().double()
+        full = float(patterns.max() if levels is None else encoder.top().detach())
+        wanted = objects.numpy() @ met(TABLE, patterns.numpy(), SHAPE, full).T
+        found = encoder(through(TABLE, objects, SHAPE).float()).detach().numpy()
+        np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+def test_the_same_number_draws_the_same_optics_and_another_one_others():
+    drawn = DrawnOptics(tolerance_of("shift=1:rotate=2:psf=0.5..0.8:black=0.002"), SHAPE, 3)
+    objects = torch.rand((90, 42), generator=torch.Generator().manual_seed(1))
+    first, again, other = drawn.through(objects, 5), drawn.through(objects, 5), drawn.through(objects, 6)
+    torch.testing.assert_close(first, again, rtol=0, atol=0)
+    assert first.shape == (90, 43)
+    assert (first - other).abs().max() > 0.05
+    # every object is seen by one of some forty tables: those of one group alone share theirs
+    one = torch.ones(90, 42)
+    columns = drawn.through(one, 5)[:, 0]
+    assert len(columns.unique()) > 20
+
+
+def test_an_exact_tolerance_is_one_table():
+    drawn = DrawnOptics(tolerance_of("shift=0.5..0.5,-0.25..-0.25:psf=0.5"), SHAPE, 0)
+    objects = torch.rand((50, 42), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    wanted = through(Imaging(0.5, -0.25, psf_px=0.5), objects, SHAPE)
+    torch.testing.assert_close(drawn.through(objects, 9), wanted)

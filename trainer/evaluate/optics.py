@@ -1,0 +1,131 @@
+"""Accuracy under given optics: over draws within a tolerance, at its edge, and against each misalignment by itself.
+
+Owns the grids and the sums; the figures of one table are those of held_out.py. Exact expectations wherever a bundle has them. SIMULATED.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.imaging import Imaging, Tolerance
+
+from .accuracy import Measured
+from .held_out import Conditions, HeldOut, measure, trials_needed
+from .walks import MeasuredWalks
+
+CURVES: Mapping[str, tuple[float, ...]] = {
+    "shift_px": (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0),  # to the right and down alike
+    "rotation_deg": (0.0, 1.0, 2.0, 3.0, 5.0),
+    "psf_px": (0.0, 0.3, 0.5, 0.7, 0.9, 1.2),
+    "black": (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02),
+}
+AS_IT_IS = Conditions()
+DRAW_STREAM = 0xD7A  # beside the seed
+Figures = Measured | MeasuredWalks
+Told = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class OverOptics:
+    """Means over several tables. `accuracy_std_optics` is the spread from table to table, `accuracy_se_objects` the error of one table's
+    figure that comes from having few objects (the tables share them)."""
+
+    accuracy_mean: float
+    accuracy_std_optics: float
+    accuracy_se_optics: float
+    accuracy_se_objects: float
+    accuracy_worst: float
+    clicks_mean: float
+    photons_mean: float
+    illumination: float
+    objects: int
+    tables: int
+
+
+def figures_under(bundle: Bundle, held_out: HeldOut, imaging: Imaging, conditions: Conditions) -> Figures:
+    """Return what `bundle` decides when objects stand as `imaging` says; ValueError for bundles that return pictures."""
+    if bundle.picture_shape is not None:
+        raise ValueError(f"{bundle.name} returns pictures, allowed: bundles that decide among classes")
+    told = replace(conditions, imaging=imaging)
+    found = measure(bundle, held_out, trials=trials_needed(bundle), conditions=told)
+    assert isinstance(found, (Measured, MeasuredWalks))
+    return found
+
+
+def over_optics(
+    bundle: Bundle,
+    held_out: HeldOut,
+    tables: Iterable[Imaging],
+    conditions: Conditions = AS_IT_IS,
+    told: Told = lambda done, of: None,
+) -> OverOptics:
+    """Return the means over `tables`, at least one; `told` hears how many are done."""
+    which = list(tables)
+    found = []
+    for number, imaging in enumerate(which):
+        found.append(figures_under(bundle, held_out, imaging, conditions))
+        told(number + 1, len(which))
+    right = np.array([one.accuracy_mean or 0.0 for one in found])
+    spread = float(right.std(ddof=1)) if len(right) > 1 else 0.0
+    return OverOptics(
+        accuracy_mean=float(right.mean()),
+        accuracy_std_optics=spread,
+        accuracy_se_optics=spread / math.sqrt(len(right)),
+        accuracy_se_objects=float(np.mean([one.accuracy_se_objects or 0.0 for one in found])),
+        accuracy_worst=float(right.min()),
+        clicks_mean=float(np.mean([one.clicks_mean for one in found])),
+        photons_mean=float(np.mean([one.photons_mean for one in found])),
+        illumination=float(np.mean([one.illumination for one in found])),
+        objects=found[0].objects,
+        tables=len(which),
+    )
+
+
+def drawn_tables(tolerance: Tolerance, count: int, seed: int) -> list[Imaging]:
+    """Return `count` optics drawn within `tolerance`; ValueError below one."""
+    if count < 1:
+        raise ValueError(f"draws is {count}, allowed: 1 or more")
+    random = np.random.default_rng([DRAW_STREAM, seed])
+    return [tolerance.draw(random) for _ in range(count)]
+
+
+def misalignment_curves(
+    bundle: Bundle,
+    held_out: HeldOut,
+    about: Imaging,
+    conditions: Conditions = AS_IT_IS,
+    told: Told = lambda done, of: None,
+) -> dict[str, list[dict[str, Any]]]:
+    """Return for every curve of `CURVES` its points, one misalignment at a time about the optics `about`.
+
+    A point holds `value`, and of the figures what `pans evaluate` reports of light and accuracy.
+    """
+    total, done = sum(len(values) for values in CURVES.values()), 0
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, values in CURVES.items():
+        points = []
+        for value in values:
+            measured = asdict(figures_under(bundle, held_out, _off(about, name, value), conditions))
+            points.append({"value": value, **{key: measured[key] for key in _SHOWN}})
+            done += 1
+            told(done, total)
+        found[name] = points
+    return found
+
+
+_SHOWN = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
+
+
+def _off(about: Imaging, name: str, value: float) -> Imaging:
+    if name == "shift_px":
+        return replace(about, right_px=about.right_px + value, down_px=about.down_px + value)
+    if name == "rotation_deg":
+        return replace(about, rotation_deg=about.rotation_deg + value)
+    fact: dict[str, Any] = {name: value}
+    return replace(about, **fact)

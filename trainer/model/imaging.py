@@ -1,0 +1,54 @@
+"""Objects through drawn optics: what the pattern grid meets of every training object on tables that differ within a tolerance.
+
+Owns the draws and the form in which training sees them. Objects are parted at random into groups, each seen through optics of its own.
+Light from dark pattern pixels is linear in the object and in the light of a full pixel: it stands in one more column beside the pixels,
+which meets the brightest level of a pattern as a pixel meets its own. Never trains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pans.runtime.imaging import Imaging, Tolerance, operator
+
+OPTICS_STREAM = 0x0971C5  # beside the seed, so that no other draw is repeated
+GROUP = 500  # objects seen through the same optics
+GROUPS_MIN = 40  # of few objects, so that they meet more than a handful of draws
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnOptics:
+    """A tolerance and the shape of the grid; `number` in the methods counts the draws: the same number gives the same optics."""
+
+    tolerance: Tolerance
+    shape: tuple[int, int]
+    seed: int
+
+    def through(self, transmission: Tensor, number: int) -> Tensor:
+        """Return objects (n, pixels) as drawn optics show them, (n, pixels + 1): the last column is the light of dark pixels.
+
+        Both for a gain of all light and of (1 - black) of a pattern, as `pans.runtime.imaging.levelled` has it.
+        """
+        random = np.random.default_rng([OPTICS_STREAM, self.seed, number % (1 << 63)])
+        n = len(transmission)
+        size = max(1, min(GROUP, n // GROUPS_MIN))
+        order = torch.from_numpy(random.permutation(n))
+        result = torch.empty(n, transmission.shape[1] + 1, dtype=transmission.dtype)
+        for group in order.split(size):
+            result[group] = through(self.tolerance.draw(random), transmission[group], self.shape)
+        return result
+
+
+def through(imaging: Imaging, transmission: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return objects (n, pixels) as `imaging` shows them, (n, pixels + 1); see `DrawnOptics.through`."""
+    seen = transmission
+    if not imaging.in_place:
+        seen = transmission @ torch.from_numpy(operator(imaging, shape)).to(transmission.dtype).T
+    if imaging.flat is not None:
+        seen = seen * torch.from_numpy(imaging.flat.copy()).flatten().to(seen.dtype)
+    seen = imaging.gain * seen
+    return torch.cat([(1.0 - imaging.black) * seen, imaging.black * seen.sum(dim=1, keepdim=True)], dim=1)
