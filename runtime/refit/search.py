@@ -4,9 +4,10 @@ Owns the order of the candidates, the test, the budget and the journal of trials
 measuring, up to its end: that is how a search is resumed. Patterns and devices are behind `measure`.
 
 For each parameter in turn a step up and a step down are tried. A step is accepted if the mean of the paired differences of log loss over
-the objects is above `CLEARLY` standard errors; it is tried again in the same direction next. Steps that are better by `PERHAPS` standard
-errors, too little for that, are tried together at the end of the round: a table is seldom off in one way alone. A round without a step
-halves all steps.
+the objects is above `CLEARLY` standard errors; it is tried again in the same direction next. Steps that look better, too little for that,
+are tried together at the end of the round: a table is seldom off in one way alone. They are better by `PERHAPS` standard errors, or at
+all and clearly better than the opposite step. A round without a step halves all steps. Each round but the first begins with what has been
+reached, once more, so that a lucky trial does not stand for it.
 """
 
 from __future__ import annotations
@@ -104,8 +105,9 @@ class Search:
         self.journal: list[Step] = []
         self.held_out = held_out_of(n_objects)
         self._measure, self._keep = measure, keep
-        self._n, self._followed = n_objects, 0
+        self._n, self._followed, self._times = n_objects, 0, 0
         self._here: F64 = np.full(n_objects, np.nan)
+        self._errors: list[float] = []  # of the differences between trials
 
     @property
     def spent(self) -> Cost:
@@ -115,48 +117,73 @@ class Search:
             total = total.plus(step.cost)
         return total
 
+    @property
+    def resolution(self) -> float:
+        """The least gain in log loss that these objects can tell from chance in one trial; nan before two trials."""
+        return CLEARLY * float(np.median(self._errors)) if self._errors else math.nan
+
     def run(self) -> None:
         """Search until the steps are too small to tell, or the budget is spent (`ended` says which)."""
         try:
-            self._here = self._try(STILL)
-            while True:
-                if not self._round():
-                    if all(self.steps[name] / 2 < LAST_STEP[name] - 1e-12 for name in self.names):
-                        break
-                    self.steps = {name: max(step / 2, LAST_STEP[name]) for name, step in self.steps.items()}
+            self._reach(STILL, self._try(STILL))
+            while self._round() or self._halve():
+                self._times += 1
+                self._here = self._here + (self._try(self.best) - self._here) / self._times
             self.ended = "the smallest steps change nothing more"
         except OutOfBudget:
             self.ended = "the budget is spent"
+
+    def _reach(self, move: Move, loss: F64) -> None:
+        self.best, self._here, self._times = move, loss, 1
+
+    def _halve(self) -> bool:
+        """Halve all steps; False where they are the last ones already."""
+        if all(self.steps[name] / 2 < LAST_STEP[name] - 1e-12 for name in self.names):
+            return False
+        self.steps = {name: max(step / 2, LAST_STEP[name]) for name, step in self.steps.items()}
+        return True
 
     def _round(self) -> bool:
         """Try each parameter once, up and down, then what was promising together; return whether a step was accepted."""
         accepted, promising = self.accepted, dict[str, float]()
         for name in self.names:
-            for step in (self.steps[name], -self.steps[name]):
-                clear = self._accepts({name: step})
-                if clear > PERHAPS:
-                    promising[name] = step
-                if clear > CLEARLY:
-                    del promising[name]
-                    while self._accepts({name: step}) > CLEARLY:
-                        pass
-                    break
-        if len(promising) > 1:
+            moved, step = self._both_ways(name)
+            if not moved and step:
+                promising[name] = step
+        if promising:
             self._accepts(promising)
         return self.accepted > accepted
 
-    def _accepts(self, steps: Mapping[str, float]) -> float:
-        """Try `steps` from the best move, and go there if that is clearly better; return by how many standard errors it is better."""
+    def _both_ways(self, name: str) -> tuple[bool, float]:
+        """Try a step up and a step down; return whether one was accepted, else the one that is promising, 0 for none."""
+        gains, losses = [], []
+        for step in (self.steps[name], -self.steps[name]):
+            gain, loss = self._accepts({name: step})
+            if gain > CLEARLY:
+                while self._accepts({name: step})[0] > CLEARLY:
+                    pass
+                return True, 0.0
+            gains.append(gain)
+            losses.append(loss)
+        better = int(gains[1] > gains[0])
+        step = (self.steps[name], -self.steps[name])[better]
+        against = _in_errors(*paired(losses[1 - better], losses[better], ~self.held_out))
+        return False, step if gains[better] > PERHAPS or (gains[better] > 0 and against > CLEARLY) else 0.0
+
+    def _accepts(self, steps: Mapping[str, float]) -> tuple[float, F64]:
+        """Try `steps` from the best move, and go there if that is clearly better; return by how many standard errors, and the losses."""
         candidate = self.best
         for name, step in steps.items():
             candidate = candidate.by(name, step)
         loss = self._try(candidate)
         gain, error = paired(self._here, loss, ~self.held_out)
-        clear = gain / error if error > 0 else math.copysign(math.inf, gain) if gain else 0.0
+        if math.isfinite(error):
+            self._errors.append(error)
+        clear = _in_errors(gain, error)
         if clear > CLEARLY:
-            self.best, self._here = candidate, loss
+            self._reach(candidate, loss)
             self.accepted += 1
-        return clear
+        return clear, loss
 
     def _try(self, move: Move) -> F64:
         """Return each object's loss under `move`: from the journal as far as it goes, then measured."""
@@ -196,6 +223,11 @@ def paired(old: F64, new: F64, chosen: NDArray[np.bool_]) -> tuple[float, float]
     if len(difference) < 2:
         return 0.0, math.inf
     return float(difference.mean()), float(difference.std(ddof=1) / math.sqrt(len(difference)))
+
+
+def _in_errors(gain: float, error: float) -> float:
+    """Return a gain in standard errors; infinite where there is no error at all."""
+    return gain / error if error > 0 else math.copysign(math.inf, gain) if gain else 0.0
 
 
 def _losses(step: Step, n: int) -> F64:

@@ -128,6 +128,7 @@ class Tuning:
             "steps": search.steps,
             "accepted": search.accepted,
             "test": f"paired difference of log loss above {CLEARLY} standard errors",
+            "resolution": search.resolution if math.isfinite(search.resolution) else None,
             "trials": len(search.journal),
             "ended": "interrupted" if interrupted else search.ended,
             "interrupted": interrupted,
@@ -180,6 +181,8 @@ def words_of(report: Mapping[str, Any]) -> str:
         f"ended: {report['ended']}; {spent['photons_or_clicks']:.4g} photons and "
         f"{spent['instrument_minutes']:.3g} minutes of the instrument",
     ]
+    if report["resolution"] is not None:
+        lines.append(f"with these objects a step is seen from a gain of {report['resolution']:.2g} in log loss on")
     compared = report["comparison"]
     if compared is None:
         lines.append("not compared: the old patterns stay" if not report["changed"] else "not compared: interrupted")

@@ -58,6 +58,7 @@ def test_steps_that_are_not_clear_alone_are_taken_together() -> None:
     search.run()
     assert search.journal[7].move == search.best == Move(right_px=1.0, down_px=-1.0, rotation_deg=2.0)
     assert search.accepted == 1
+    assert search.resolution == pytest.approx(2.33 * 0.5 / math.sqrt(800), rel=0.01)  # differences of +-0.5
 
 
 def test_a_table_that_is_right_is_left_alone() -> None:
