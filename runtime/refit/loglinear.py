@@ -23,6 +23,7 @@ PRECISION_RANGE = (1e-2, 1e6)  # of a prior: a score moves by 10 at the one end 
 _FIRST_PRECISION = 10.0
 _ROUNDS, _STEPS, _LAST_STEPS = 12, 4, 30  # of the prior's width; Newton steps in a round, and at the end
 _SETTLED = 0.05  # change of the logarithm of a precision that ends the search
+_ROWS_AT_ONCE = 4096  # of the Hessian: 50 MB at most
 _FLAT = 1e-9  # variance of a feature that says nothing
 
 
@@ -145,10 +146,14 @@ def _maximised(standard: _Standard, scores: F64, counts: F64, prior: Prior, step
 def _hessian(features: F64, total: F64, chance: F64, precision: F64) -> F64:
     """Second derivatives by all weights, (size, size): the sum over rows of n (diag(p) - p p^T), taken with the features."""
     n_features, n_classes = features.shape[1], chance.shape[1]
-    both = (features[:, :, None] * chance[:, None, :]).reshape(len(features), -1)
-    flat: NDArray[np.float64] = -(both * total[:, None]).T @ both
+    flat: NDArray[np.float64] = np.zeros((n_features * n_classes, n_features * n_classes))
     found = flat.reshape(n_features, n_classes, n_features, n_classes)
-    for label in range(n_classes):
-        found[:, label, :, label] += (features * (total * chance[:, label])[:, None]).T @ features
+    for start in range(0, len(features), _ROWS_AT_ONCE):
+        part = slice(start, start + _ROWS_AT_ONCE)
+        x, p, n = features[part], chance[part], total[part]
+        both = (x[:, :, None] * p[:, None, :]).reshape(len(x), -1)
+        flat -= (both * n[:, None]).T @ both
+        for label in range(n_classes):
+            found[:, label, :, label] += (x * (n * p[:, label])[:, None]).T @ x
     flat[np.diag_indices(len(flat))] += np.repeat(precision, n_classes)
     return flat
