@@ -1,0 +1,112 @@
+"""Accuracy where the table is not perfect: held against images that were moved by hand, and over several tables."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bundles import automaton_bundle, made_bundle, six_states
+
+from pans.runtime.bundle.model import Bundle, load_bundle
+from pans.runtime.errors import UsageError
+from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
+from pans.runtime.instrument.profile import Optics, load_profile
+from pans.trainer.commands.evaluate_optics import curve_words, several_tables
+from pans.trainer.evaluate.accuracy import light_of
+from pans.trainer.evaluate.held_out import Conditions, HeldOut, held_out_of, imaging_on
+from pans.trainer.evaluate.optics import CURVES, drawn_tables, figures_under, misalignment_curves, over_optics
+from pans.trainer.evaluate.walks import measured_walks, walks_of
+from pans.trainer.tasks.registry import Objects, Task
+
+IDEAL = load_profile("ideal")
+RNG = np.random.default_rng(2)
+IMAGES = RNG.integers(0, 256, (30, 2, 3), dtype=np.uint8)
+LABELS = RNG.integers(0, 3, 30)
+MOVED = np.zeros_like(IMAGES)
+MOVED[:, 1:, :-1] = IMAGES[:, :-1, 1:]  # one to the left, one down
+TABLE = Imaging(right_px=-1.0, down_px=1.0)
+TASK = Task("toy", ("a", "b", "c"), Objects(IMAGES, LABELS), Objects(IMAGES, LABELS), "0" * 64, "none")
+HELD_OUT = HeldOut(TASK, TASK.test, IDEAL)
+
+
+def fixed() -> Bundle:
+    levels = RNG.integers(0, 16, (2, 6))
+    table = RNG.random((4, 3))
+    return made_bundle(2, 3, image_shape=(2, 3), levels=16, pattern_levels=levels, photons_per_level=0.1, table=table)
+
+
+def test_a_moved_object_brings_the_light_of_moved_pixels() -> None:
+    bundle = fixed()
+    found = light_of(bundle, IDEAL, IMAGES, imaging=TABLE)
+    np.testing.assert_allclose(found.photoelectrons, light_of(bundle, IDEAL, MOVED).photoelectrons, rtol=1e-13)
+    lit = light_of(bundle, IDEAL, IMAGES, imaging=Imaging(black=0.1, gain=2.0)).photoelectrons
+    sums = IMAGES.reshape(30, -1).sum(axis=1) / 255
+    plain = light_of(bundle, IDEAL, IMAGES).photoelectrons
+    np.testing.assert_allclose(lit, 2 * (0.9 * plain + 0.1 * 1.5 * sums[:, None]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("trials", [None, 40])
+def test_an_automaton_walks_as_before_moved_objects(trials: int | None) -> None:
+    bundle = automaton_bundle(six_states(), photons=1.5)
+    moved = measured_walks(walks_of(bundle, IDEAL, IMAGES, LABELS, imaging=TABLE, trials=trials))
+    by_hand = measured_walks(walks_of(bundle, IDEAL, MOVED, LABELS, trials=trials))
+    assert moved.photons_mean == pytest.approx(by_hand.photons_mean, rel=1e-12)
+    assert moved.accuracy_mean == pytest.approx(by_hand.accuracy_mean, rel=1e-12)
+    assert moved.accuracy_mean != measured_walks(walks_of(bundle, IDEAL, IMAGES, LABELS, trials=trials)).accuracy_mean
+
+
+def test_several_tables_give_their_mean_and_spread() -> None:
+    bundle = fixed()
+    tables = [IDENTITY, TABLE, imaging_of("psf=0.8")]
+    one_by_one = [figures_under(bundle, HELD_OUT, table, Conditions()).accuracy_mean for table in tables]
+    found = over_optics(bundle, HELD_OUT, tables)
+    assert found.accuracy_mean == pytest.approx(np.mean(one_by_one))
+    assert found.accuracy_std_optics == pytest.approx(np.std(one_by_one, ddof=1))
+    assert (found.accuracy_worst, found.tables, found.objects) == (min(one_by_one), 3, 30)
+    tolerance = tolerance_of("shift=1:psf=0.5..0.8")
+    first, again = drawn_tables(tolerance, 4, 7), drawn_tables(tolerance, 4, 7)
+    assert [one.numbers() for one in first] == [one.numbers() for one in again]
+    with pytest.raises(ValueError, match="draws is 0"):
+        drawn_tables(tolerance, 0, 7)
+
+
+def test_curves_start_from_the_table_that_they_are_about() -> None:
+    bundle = fixed()
+    curves = misalignment_curves(bundle, HELD_OUT, TABLE)
+    there = figures_under(bundle, HELD_OUT, TABLE, Conditions()).accuracy_mean
+    assert {name: [point["value"] for point in points] for name, points in curves.items()} == {
+        name: list(values) for name, values in CURVES.items()
+    }
+    for points in curves.values():
+        assert points[0]["accuracy_mean"] == there
+    shifted = figures_under(bundle, HELD_OUT, Imaging(0.0, 2.0), Conditions()).accuracy_mean
+    assert curves["shift_px"][4]["accuracy_mean"] == shifted
+    assert "shift_px" in curve_words("toy", 30, TABLE, curves)
+
+
+def test_without_optics_a_table_is_as_the_profile_states() -> None:
+    stated = replace(IDEAL, optics=Optics(right_px=-1.0, down_px=1.0))
+    held_out = HeldOut(TASK, TASK.test, stated)
+    assert imaging_on(held_out, Conditions()).numbers() == TABLE.numbers()
+    assert imaging_on(held_out, Conditions(imaging=IDENTITY)).is_identity
+
+
+def test_options_that_contradict_each_other_are_refused() -> None:
+    plain = {"optics": None, "draws": None, "trials": None, "shots": 1}
+    assert not several_tables(argparse.Namespace(**plain))
+    assert several_tables(argparse.Namespace(**plain | {"draws": 2}))
+    for wrong in ({"draws": 0}, {"draws": 2, "optics": "tolerance"}, {"optics": "tolerance", "shots": 2}):
+        with pytest.raises(UsageError):
+            several_tables(argparse.Namespace(**plain | wrong))
+
+
+@pytest.mark.data
+def test_the_shipped_patterns_lose_what_a_misaligned_image_costs() -> None:
+    bundle = load_bundle("fashion10")[0]
+    held_out = held_out_of(bundle, None, 500, None, Conditions())
+    perfect, moved = (figures_under(bundle, held_out, table, Conditions()) for table in (IDENTITY, Imaging(1.0, 1.0)))
+    assert perfect.accuracy_mean is not None
+    assert moved.accuracy_mean is not None
+    assert 0.11 < perfect.accuracy_mean - moved.accuracy_mean < 0.21  # about 16 points, of few objects
