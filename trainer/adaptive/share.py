@@ -21,6 +21,8 @@ from .reroute import Sweep
 ROUNDS = 12  # of k-means
 NEAREST = 48  # patterns of the pool that a state tries, the most alike
 BRIGHTER = (0.6, 0.8, 1.0, 1.25, 1.6)  # times the brightness that keeps the light as it was
+ROWS_AT_ONCE = 1024  # patterns that are compared with all others
+NUMBERS_MAX = 1 << 27  # objects times patterns, of which the light is kept: 512 MiB
 HARDLY = 1e-3  # chance to reach a state, below which an object is left out of that state's choice
 GLARE = 1e-3  # of the price of a detected photoelectron, what one sent out costs: else a bright spot where hardly anything is would do
 SURE = 1e-4  # of a state's cost, by which another pattern must be better
@@ -117,14 +119,17 @@ class _Pool:
 def choose_patterns(
     machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0
 ) -> int:
-    """Let every state show the pattern of the pool, and have the brightness, that cost the objects in `blocks` least; return how many
-    states changed. `price` is that of a photoelectron. From the last level to the first, so that the expected cost falls with every
-    change. Patterns that nothing shows afterwards become copies of those that are shown most, and take half of their states.
+    """Let every state show the pattern of the pool, and have the brightness, that cost the objects in `blocks` least.
+
+    Returns how many states changed. `price` is that of a photoelectron. From the last level to the first, so that the expected cost
+    falls with every change. Only the first of the blocks are taken where all are too many for memory. Patterns that nothing shows
+    afterwards become copies of those that are shown most, and take half of their states.
     """
     lights = [level.light for level in machine.levels]
     pooled = [light for light in lights if isinstance(light, Bits) and light.rows is not None]
     if len(pooled) < len(lights) or len(machine.levels[0].successors) > 2:  # no click, click
         return 0
+    blocks = blocks[: max(1, NUMBERS_MAX // (len(blocks[0]) * len(pooled[0].lean)))]
     with torch.no_grad():
         sweep = Sweep(machine, sight, blocks)
         pool = _pool_of(pooled, sight, blocks)
@@ -140,11 +145,22 @@ def choose_patterns(
 
 def _pool_of(pooled: list[Bits], sight: Sight, blocks: list[Block]) -> _Pool:
     mask = torch.gt(pooled[0].lean, 0).to(sight.sums)
-    alike = directions(mask)
-    near = (alike @ alike.T).fill_diagonal_(2.0).topk(min(NEAREST, len(mask)), dim=1).indices
+    near = nearest(directions(mask), min(NEAREST, len(mask)))
     light = torch.cat([sight.light(mask, block.grey) for block in blocks], dim=1)
     factors = (1.0,) if one_brightness(pooled) else BRIGHTER
     return _Pool(light, mask.sum(dim=1), near, torch.tensor(factors, dtype=light.dtype))
+
+
+def nearest(vectors: Tensor, count: int) -> Tensor:
+    """Return the numbers of the `count` vectors (n, dimensions) that are most like each, (n, count), itself first."""
+    found = []
+    for first in range(0, len(vectors), ROWS_AT_ONCE):
+        rows = vectors[first : first + ROWS_AT_ONCE]
+        alike = rows @ vectors.T
+        own = torch.arange(len(rows))
+        alike[own, first + own] = torch.inf
+        found.append(alike.topk(count, dim=1).indices)
+    return torch.cat(found)
 
 
 def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool, price: float) -> int:

@@ -142,6 +142,24 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
         assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE * float(alpha.sum())
 
 
+def test_the_nearest_are_those_of_the_largest_cosine_and_itself_is_first(monkeypatch):
+    monkeypatch.setattr(module, "ROWS_AT_ONCE", 3)
+    masks = (torch.rand(8, 30, generator=torch.Generator().manual_seed(2)) < 0.4).float()
+    masks[5] = 0  # a dark pattern is like none, and still its own nearest
+    found = module.nearest(module.directions(masks), 4)
+    for row, near in enumerate(found.tolist()):
+        assert near[0] == row
+        cosine = {
+            other: float(masks[row] @ masks[other]) / float(masks[row].norm() * masks[other].norm() + 1e-9)
+            for other in range(8)
+            if other != row
+        }
+        assert (
+            sorted((round(cosine[other], 5) for other in near[1:]), reverse=True)
+            == sorted((round(value, 5) for value in cosine.values()), reverse=True)[:3]
+        )
+
+
 def test_patterns_that_nothing_shows_take_half_of_the_states_of_others(shared):
     machine, sight, blocks = shared
     for level in machine.levels:
