@@ -4,7 +4,8 @@ Owns the facts, the checks that need nothing else (ranges, order, depth, reach) 
 decides. All checks are linear in the size, whatever the arrays hold; they raise ValueError with what, found and allowed.
 
 A *node* is a state or a leaf: state s is node s, leaf l is node `n_states` + l. A *walk* begins in state 0; one exposure per state, until a
-leaf is reached. With c channels an exposure has 2**c outcomes: bit k of the outcome is the click of channel k.
+leaf is reached. With c channels an exposure has 2**c outcomes: bit k of the outcome is the click of channel k. Of a detector that
+counts, outcome j is j photons, the last one that many or more.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ STATES_MAX = 65_533  # a state number is stamped into a u16 beside 0xFFFE (adapt
 LEAVES_MAX = 1 << 20
 SLOTS_MAX = 1024
 CHANNELS_MAX = 8
+COUNT_OUTCOMES = (3, 16)  # of a detector that counts; two are clicks
 POSTERIOR_SUM_TOLERANCE = 1e-5
 DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
 CONFIDENCE_RANGE = Range(1e-6, 1.0)
@@ -50,6 +52,7 @@ class Automaton:
         np.uint32
     ]  # (states, outcomes): outcome 0 no click, 1 click; 2**c outcomes of c channels at once
     posteriors: NDArray[np.float32]  # (states + leaves, classes) class probabilities in each node; rows sum to 1
+    counts: bool = False  # outcomes are photon numbers of one detector, the last one "this many or more"
     depth: NDArray[np.uint16] = field(init=False)  # (states,) exposures before the state
     n_slots: int = field(init=False)  # T: exposures of the longest walk
 
@@ -82,22 +85,27 @@ class Automaton:
 
     @property
     def n_outcomes(self) -> int:
-        """Number of outcomes of one exposure, 2**c."""
+        """Number of outcomes of one exposure: 2**c, or the photon numbers told apart."""
         return int(self.successors.shape[1])
 
     @property
     def channels(self) -> int:
-        """Number of channels that are read at once, c."""
-        return self.n_outcomes.bit_length() - 1
+        """Number of channels that are read at once, c; one where photons are counted."""
+        return 1 if self.counts else self.n_outcomes.bit_length() - 1
 
     @property
     def n_bits(self) -> int:
-        """Bits of a click word: `channels` per slot; bit t * channels + k is channel k in slot t."""
+        """Numbers of a click word, `channels` per slot: t * channels + k is the click of channel k in slot t, or t its photon number."""
         return self.n_slots * self.channels
 
 
 def reachable_automaton(
-    pattern: ArrayLike, dwell: ArrayLike, dwell_steps: int, successors: ArrayLike, posteriors: ArrayLike
+    pattern: ArrayLike,
+    dwell: ArrayLike,
+    dwell_steps: int,
+    successors: ArrayLike,
+    posteriors: ArrayLike,
+    counts: bool = False,
 ) -> Automaton:
     """Return the automaton of these arrays without the states and leaves that no walk reaches; ValueError as `Automaton`."""
     states, nodes = np.asarray(successors), np.asarray(posteriors)
@@ -110,7 +118,7 @@ def reachable_automaton(
     number[kept] = np.arange(len(kept))
     shown = kept[kept < n_states]
     return Automaton(
-        np.asarray(pattern)[shown], np.asarray(dwell)[shown], dwell_steps, number[states[shown]], nodes[kept]
+        np.asarray(pattern)[shown], np.asarray(dwell)[shown], dwell_steps, number[states[shown]], nodes[kept], counts
     )
 
 
@@ -130,6 +138,7 @@ def stopped(automaton: Automaton, confidence: float) -> Automaton:
         automaton.dwell_steps,
         leads_to[automaton.successors],
         np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]]),
+        automaton.counts,
     )
 
 
@@ -156,8 +165,12 @@ def _whole_numbers(values: Any, dtype: np.dtype[Any], axes: int, name: str) -> N
 def _check_sizes(automaton: Automaton) -> None:
     states, outcomes = automaton.successors.shape
     demand(1 <= states <= STATES_MAX, f"{states} states, allowed: 1 to {STATES_MAX}")
-    fits = outcomes == 1 << automaton.channels and 1 <= automaton.channels <= CHANNELS_MAX
-    demand(fits, f"{outcomes} outcomes per exposure, allowed: 2**c of c channels, c from 1 to {CHANNELS_MAX}")
+    if automaton.counts:
+        low, high = COUNT_OUTCOMES
+        demand(low <= outcomes <= high, f"{outcomes} photon numbers per exposure, allowed: {low} to {high}")
+    else:
+        fits = outcomes == 1 << automaton.channels and 1 <= automaton.channels <= CHANNELS_MAX
+        demand(fits, f"{outcomes} outcomes per exposure, allowed: 2**c of c channels, c from 1 to {CHANNELS_MAX}")
     for name in ("pattern", "dwell"):
         shape = getattr(automaton, name).shape
         demand(shape == (states,), f"{name} has shape {shape} for {states} states")

@@ -1,4 +1,4 @@
-"""The parts of a bundle that holds an automaton, format version 3: docs/reference/formats.md in code.
+"""The parts of a bundle that holds an automaton, format versions 3 and 4 (of photon numbers): docs/reference/formats.md in code.
 
 Owns how patterns are packed and how states, posteriors and golden walks lie in the file; the container around them is format.py's. A part
 that unpacks to more than memory should hold is refused before it is unpacked.
@@ -55,7 +55,7 @@ def parts_of(bundle: Bundle, automaton: Automaton) -> list[tuple[str, NDArray[An
         ("state_dwell", automaton.dwell),
         ("successors", automaton.successors),
         ("posteriors", automaton.posteriors),
-        ("golden_words", _packed(bundle.golden_means)),
+        ("golden_words", bundle.golden_means.astype(np.uint8) if automaton.counts else _packed(bundle.golden_means)),
         ("golden_walks", walks),
         ("golden_posteriors", automaton.posteriors[walks[:, -1]]),
     ]
@@ -63,7 +63,8 @@ def parts_of(bundle: Bundle, automaton: Automaton) -> list[tuple[str, NDArray[An
 
 def facts_of(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
     """Return the header's keys that only such a bundle has."""
-    facts: dict[str, Any] = {"automaton": {"dwell_steps": automaton.dwell_steps}}
+    outcomes = {"outcomes": automaton.n_outcomes} if automaton.counts else {}
+    facts: dict[str, Any] = {"automaton": {"dwell_steps": automaton.dwell_steps, **outcomes}}
     return facts if bundle.expected is None else facts | {"expected": dict(bundle.expected)}
 
 
@@ -76,13 +77,25 @@ def demand_parts(parts: Mapping[str, NDArray[Any]], levels: int) -> None:
         demand(array.ndim == axes, f"the part {name} has {array.ndim} axes, allowed: {axes}")
 
 
+def counts_photons(facts: Mapping[str, Any]) -> bool:
+    """Return whether the automaton in a header or in `facts_of` tells photon numbers apart, which takes format version 4."""
+    return isinstance(facts["automaton"], dict) and "outcomes" in facts["automaton"]
+
+
 def automaton_of(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Automaton:
     """Return the automaton of a file; ValueError for what is impossible."""
-    facts = header["automaton"]
-    known = isinstance(facts, dict) and set(facts) == {"dwell_steps"}
-    demand(known, f"automaton is {ascii(facts)[:80]}, allowed: an object with the key dwell_steps")
+    facts, counts = header["automaton"], counts_photons(header)
+    keys = {"dwell_steps", "outcomes"} if counts else {"dwell_steps"}
+    known = isinstance(facts, dict) and set(facts) == keys
+    demand(
+        known, f"automaton is {ascii(facts)[:80]}, allowed: an object with the keys dwell_steps and perhaps outcomes"
+    )
+    if counts:
+        said, columns = facts["outcomes"], parts["successors"].shape[1]
+        same = isinstance(said, int) and said == columns
+        demand(same, f"automaton.outcomes is {ascii(said)[:80]}, successors has {columns} columns")
     states = (parts["state_pattern"], parts["state_dwell"], facts["dwell_steps"])
-    return Automaton(*states, parts["successors"], parts["posteriors"])
+    return Automaton(*states, parts["successors"], parts["posteriors"], counts)
 
 
 def expected_of(header: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -113,10 +126,12 @@ def golden_of(parts: Mapping[str, NDArray[Any]], automaton: Automaton) -> Golden
     """Return the golden walks; ValueError unless each leaf's posterior is, bit for bit, the automaton's."""
     stored, walks, posteriors = (parts[name] for name in GOLDEN_PARTS)
     n_bits, rows = automaton.n_bits, len(stored)
-    width = -(-n_bits // 8)
+    width = n_bits if automaton.counts else -(-n_bits // 8)
     demand(1 <= rows <= GOLDEN_MAX, f"{rows} golden walks, allowed: 1 to {GOLDEN_MAX}")
     demand(rows * n_bits <= GOLDEN_MEANS_MAX, f"{rows} golden words of {n_bits}, allowed: {GOLDEN_MEANS_MAX} in all")
-    demand(stored.shape[1] == width, f"golden_words has rows of {stored.shape[1]} bytes, {n_bits} clicks need {width}")
+    demand(
+        stored.shape[1] == width, f"golden_words has rows of {stored.shape[1]} bytes, {n_bits} outcomes need {width}"
+    )
     wanted = (rows, automaton.n_slots + 1)
     demand(walks.shape == wanted, f"golden_walks has shape {walks.shape}, allowed: {wanted}")
     leaves = walks[:, -1]
@@ -125,7 +140,9 @@ def golden_of(parts: Mapping[str, NDArray[Any]], automaton: Automaton) -> Golden
     demand(ends, f"a golden walk ends at a node outside {low} to {high - 1}, where the leaves are")
     same = posteriors.shape == (rows, automaton.n_classes) and np.array_equal(posteriors, automaton.posteriors[leaves])
     demand(same, "the golden posteriors are not those of the leaves")
-    words = _unpacked(stored, n_bits, "golden_words", np.dtype(np.float32))
+    words = stored.astype(np.float32)
+    if not automaton.counts:
+        words = _unpacked(stored, n_bits, "golden_words", np.dtype(np.float32))
     return Golden(frozen(words), frozen(log_scores(posteriors)), walks)
 
 

@@ -27,7 +27,7 @@ from .layers import Int8Head
 from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
-VERSIONS = (1, 2, 3)  # a bundle is written in the lowest that can say it
+VERSIONS = (1, 2, 3, 4)  # a bundle is written in the lowest that can say it
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
@@ -38,6 +38,7 @@ _KEYS_OF_VERSION: dict[int, set[str]] = {
     1: set(),
     2: {"sensor", "picture_shape"},
     3: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
+    4: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
 }
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
@@ -86,7 +87,7 @@ def bundle_bytes(bundle: Bundle) -> bytes:
         raise UsageError(
             f"this bundle would have a header of {len(header)} and {total} bytes in all, allowed: {allowed}"
         )
-    version = _version_of(set(_new_facts(bundle)))
+    version = _version_of(_new_facts(bundle))
     body = b"".join([_PROLOGUE.pack(MAGIC, version, len(header)), header, *blobs])
     return body + hashlib.sha256(body).digest()
 
@@ -125,8 +126,11 @@ def _new_facts(bundle: Bundle) -> dict[str, Any]:
     return facts
 
 
-def _version_of(new_keys: set[str]) -> int:
-    return 3 if "automaton" in new_keys else 2 if new_keys else 1
+def _version_of(facts: Mapping[str, Any]) -> int:
+    """The lowest version that can say `facts`, those that version 1 has not."""
+    if "automaton" in facts:
+        return 4 if automaton_file.counts_photons(facts) else 3
+    return 2 if facts else 1
 
 
 def parse_bundle(data: bytes, where: str) -> Bundle:
@@ -226,12 +230,13 @@ def _what_changed(source: _Source, header: bytes, header_end: int) -> str:
 def _read_parts(header: Mapping[str, Any], version: int, source: _Source, header_end: int) -> dict[str, Any]:
     """Return the parts by name, after checking that they fill the file without gap, overlap or rest; models are bytes."""
     new_keys = set(header) & _KEYS_OF_VERSION[version]
-    if version == 3:
+    if version >= 3:
         new_keys |= automaton_file.HEADER_KEYS
     keys = _HEADER_KEYS | new_keys
     demand(set(header) == keys, f"the header has the keys {_quoted(header)}, allowed: {_quoted(keys)}")
-    demand(version == _version_of(new_keys), f"a bundle of format version {version} that says no more than 1")
-    known = automaton_file.PARTS if version == 3 else _PARTS
+    least = _version_of({key: header[key] for key in new_keys})
+    demand(version == least, f"a bundle of format version {version} that says no more than {least}")
+    known = automaton_file.PARTS if version >= 3 else _PARTS
     rows = header["parts"]
     demand(isinstance(rows, list) and len(rows) <= len(known), "the header's parts are not a short list")
     parts: dict[str, Any] = {}

@@ -217,6 +217,9 @@ def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
     parts = (beside.head_onnx, beside.table, beside.int8_head, beside.int8_onnx)
     demand(all(part is None for part in parts), "an automaton beside a head or a table, allowed: either")
     words = np.concatenate([_golden_words(automaton.n_bits), words_to(automaton, golden_nodes(automaton))])
+    if automaton.counts:
+        drawn = np.random.default_rng(20250103).integers(0, automaton.n_outcomes, (64, automaton.n_bits))
+        words = np.concatenate([words, drawn.astype(np.float32)])
     numbers = max(automaton.n_bits / GOLDEN_MEANS_MAX, automaton.n_classes / GOLDEN_SCORES_MAX)
     words = words[:: math.ceil(len(words) * numbers)]  # fewer of very long ones
     walks = walk_nodes(automaton, words)

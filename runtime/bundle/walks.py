@@ -34,7 +34,8 @@ EXPECTED_KEYS = (*_TEXTS, *EXPECTED_RANGES)
 def walk_nodes(automaton: Automaton, words: NDArray[Any]) -> NDArray[np.uint32]:
     """Return the node in each slot, uint32 (n, n_slots + 1), of click words of zeros and ones (n, n_bits); the leaf is repeated to the end.
 
-    Bit t * channels + k is the click of channel k in slot t. Bits after the leaf do not count.
+    Bit t * channels + k is the click of channel k in slot t; where photons are counted, number t is theirs. What follows the leaf does
+    not matter.
     """
     n_states, channels = automaton.n_states, automaton.channels
     bits = words.astype(np.uint32).reshape(len(words), automaton.n_slots, channels)
@@ -49,7 +50,7 @@ def walk_nodes(automaton: Automaton, words: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def words_to(automaton: Automaton, nodes: NDArray[Any]) -> NDArray[np.float32]:
-    """Return one click word per node of `nodes` that leads to it, float32 (n, n_bits) of zeros and ones; zeros beyond."""
+    """Return one click word per node of `nodes` that leads to it, float32 (n, n_bits), zeros beyond."""
     n_nodes, outcomes = len(automaton.posteriors), automaton.n_outcomes
     edge = np.full(n_nodes, -1, np.int64)
     edge[automaton.successors.reshape(-1)] = np.arange(automaton.successors.size)
@@ -59,7 +60,9 @@ def words_to(automaton: Automaton, nodes: NDArray[Any]) -> NDArray[np.float32]:
         row, here = row[moving], here[moving]
         state, outcome = np.divmod(edge[here], outcomes)
         slot = automaton.depth[state].astype(np.int64)
-        bits[row, slot] = outcome[:, None] >> np.arange(automaton.channels) & 1
+        bits[row, slot] = (
+            outcome[:, None] if automaton.counts else outcome[:, None] >> np.arange(automaton.channels) & 1
+        )
         here = state
     return bits.reshape(len(nodes), automaton.n_bits)
 
@@ -68,6 +71,14 @@ def golden_nodes(automaton: Automaton) -> NDArray[np.int64]:
     """Return nodes that golden walks lead to: at most `GOLDEN_NODES`, evenly spread, the last leaf among them."""
     last = len(automaton.posteriors) - 1
     return np.unique(np.linspace(1, last, min(last, GOLDEN_NODES)).round().astype(np.int64))
+
+
+def check_words(automaton: Automaton, words: NDArray[Any], what: str) -> None:
+    """Raise ValueError for click words with a number that no outcome of `automaton` has; `what` names them."""
+    most = automaton.n_outcomes - 1 if automaton.counts else 1
+    fits = bool(((words >= 0) & (words <= most) & (words == np.floor(words))).all())
+    allowed = f"whole ones from 0 to {most}" if automaton.counts else "0 and 1"
+    demand(fits, f"{what} hold other numbers than {allowed}")
 
 
 def log_scores(posteriors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -124,5 +135,5 @@ def check_expected(expected: Mapping[str, Any], automaton: Automaton) -> None:
     demand(
         exposures <= automaton.n_slots * slack, f"expected.exposures is {exposures:g} of {automaton.n_slots} at most"
     )
-    most = exposures * automaton.channels
+    most = exposures * (automaton.n_outcomes - 1 if automaton.counts else automaton.channels)
     demand(clicks <= most * slack, f"expected.clicks is {clicks:g} of {exposures:g} exposures")

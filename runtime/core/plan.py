@@ -248,6 +248,12 @@ def _walks(
 
 def _checked_drive(profile: Profile, automaton: Automaton, drive: str) -> str:
     """Return "device" or "host", whichever is asked for and possible; PlanError says what is not, in numbers."""
+    if automaton.counts:
+        raise PlanError(
+            f"the automaton tells {automaton.n_outcomes} photon numbers apart, the protocol's CLICKS say click or none: a run "
+            "cannot take it",
+            remedy="pans evaluate gives its exact expectation; for a run, train with --outcomes 2",
+        )
     if profile.mode != "sequential" or automaton.channels != 1:
         raise PlanError(
             f"the automaton reads {automaton.channels} detectors at once, {profile.name} measures in {profile.mode} mode; "

@@ -50,6 +50,25 @@ def walk_words(
     return -1
 
 
+@njit(cache=True, nogil=True)
+def walk_counts(
+    successors: NDArray[np.uint32], words: NDArray[Any], leaves: NDArray[np.uint32], exposures: NDArray[np.uint16]
+) -> int:
+    """Walk words of photon numbers (n, slots) from state 0, as `walk_words` does; -1, or the first word with an impossible number."""
+    n_states, n_outcomes = successors.shape
+    for i in range(words.shape[0]):
+        node, slot = np.int64(0), 0
+        while node < n_states:
+            outcome = np.int64(words[i, slot])
+            if outcome < 0 or outcome >= n_outcomes:
+                return i
+            node = np.int64(successors[node, outcome])
+            slot += 1
+        leaves[i] = node - n_states
+        exposures[i] = slot
+    return -1
+
+
 class AutomatonDecider:
     """Decides by the leaf that a click word reaches; `automaton` is the one that runs, stopped early where that was asked for."""
 
@@ -76,8 +95,9 @@ class AutomatonDecider:
         demand_one_shot(shots)
         self._one[0] = counts
         automaton = self.automaton
-        if walk_words(automaton.successors, self._one, automaton.channels, self._leaf, self._exposures) >= 0:
-            raise UsageError(f"an automaton answers clicks of 0 or 1, not {counts.tolist()}")
+        if _walk(automaton, self._one, self._leaf, self._exposures) >= 0:
+            what = f"photon numbers of {_allowed(automaton)}" if automaton.counts else "clicks of 0 or 1"
+            raise UsageError(f"an automaton answers {what}, not {counts.tolist()}")
         return self.decide_leaf(int(self._leaf[0]))
 
     def decide_leaf(self, leaf: int) -> Verdict:
@@ -85,9 +105,10 @@ class AutomatonDecider:
         return Verdict(int(self.labels[leaf]), float(self.probabilities[leaf]))
 
     def leaves(self, counts: ArrayLike, shots: int = 1) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
-        """Return the leaf and the exposures of each walk, (n,), of clicks, integers (n, d_f); ValueError beyond 0 and 1."""
+        """Return the leaf and the exposures of each walk, (n,), of outcomes, integers (n, d_f); ValueError for impossible ones."""
         demand_one_shot(shots)
-        return _walked(self.automaton, checked_counts(counts, shots, self.n_features))
+        most = self.automaton.n_outcomes - 1 if self.automaton.counts else shots
+        return _walked(self.automaton, checked_counts(counts, most, self.n_features))
 
     def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
         """Return log posteriors, float32 (n, classes), at least log(1e-30), of clicks (n, d_f)."""
@@ -124,10 +145,20 @@ def leaf_verdicts(automaton: Automaton, confidence: float) -> Verdicts:
 
 def _walked(automaton: Automaton, words: NDArray[np.int64]) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
     leaves, exposures = np.empty(len(words), np.uint32), np.empty(len(words), np.uint16)
-    bad = walk_words(automaton.successors, words, automaton.channels, leaves, exposures)
+    bad = _walk(automaton, words, leaves, exposures)
     if bad >= 0:
-        raise ValueError(f"click word {bad} holds other numbers than 0 and 1")
+        raise ValueError(f"click word {bad} holds other numbers than {_allowed(automaton)}")
     return leaves, exposures
+
+
+def _walk(automaton: Automaton, words: NDArray[Any], leaves: NDArray[np.uint32], exposures: NDArray[np.uint16]) -> int:
+    if automaton.counts:
+        return int(walk_counts(automaton.successors, words, leaves, exposures))
+    return int(walk_words(automaton.successors, words, automaton.channels, leaves, exposures))
+
+
+def _allowed(automaton: Automaton) -> str:
+    return f"0 to {automaton.n_outcomes - 1}" if automaton.counts else "0 and 1"
 
 
 def demand_one_shot(shots: int) -> None:

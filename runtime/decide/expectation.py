@@ -1,8 +1,9 @@
 """What an automaton does on given objects, exactly: no trials, no sampling error.
 
 Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
-edges into s', in float64: every state is at one depth, so that alpha is whole when its slot comes. Where the detector has afterpulses,
-a click depends on the click before: alpha is then carried for both outcomes of the last exposure. Never draws anything.
+edges into s', in float64, whether the outcomes are clicks or photon numbers: every state is at one depth, so that alpha is whole when its
+slot comes. Where the detector has afterpulses, a click depends on the click before: alpha is then carried for both outcomes of the last
+exposure. Never draws anything.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.instrument.click_law import ClickLaw, both_chances
+from pans.runtime.instrument.count_law import CountLaw, count_chances, outcomes_of
 
 LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB
 _NUMBERS_AT_ONCE = 1 << 22
@@ -28,6 +30,7 @@ F64 = NDArray[np.float64]
 class ExpectedWalk:
     """Expected sums per decision of each object, float64 (n,), and the chance of each leaf, float64 (n, leaves).
 
+    `clicks` are the photons counted, where a reading says how many.
     `photons` are photoelectrons of the light, dark counts not among them; `illumination` the intensities of the patterns that are shown.
     """
 
@@ -42,7 +45,7 @@ def expected_walk(
     automaton: Automaton,
     patterns: NDArray[Any],
     transmission: NDArray[np.floating[Any]],
-    law: ClickLaw,
+    law: ClickLaw | CountLaw,
     photons_per_level: float = 1.0,
     *,
     afterpulse: float = 0.0,
@@ -52,12 +55,18 @@ def expected_walk(
     `patterns` (n_patterns, pixels) times `photons_per_level` are photoelectrons per exposure and unit transmission, lit all the
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
     `afterpulse` is the chance that a click makes the next exposure click as well; the exposure before a walk is taken to have none (that
-    of the last object's end is forgotten, at most `afterpulse` clicks per walk). ValueError for shapes that do not fit and for more than
-    one channel.
+    of the last object's end is forgotten, at most `afterpulse` clicks per walk). ValueError for shapes that do not fit, more than one
+    channel, a law of other outcomes than the automaton's, and afterpulses of a detector that counts.
     """
     _check_arguments(automaton, patterns, transmission)
     if not 0 <= afterpulse < 1:
         raise ValueError(f"afterpulse is {afterpulse:g}, allowed: from 0 to below 1")
+    outcomes = outcomes_of(law)
+    if outcomes != automaton.n_outcomes or (automaton.counts and afterpulse):
+        raise ValueError(
+            f"an automaton of {automaton.n_outcomes} outcomes under a law of {outcomes}, afterpulse {afterpulse:g}, allowed: "
+            "the same outcomes, and no afterpulses where photons are counted"
+        )
     n, n_leaves = len(transmission), automaton.n_leaves
     found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)))
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
@@ -106,7 +115,7 @@ def _walk_block(
     slots: list[NDArray[np.int64]],
     light: F64,
     shown: F64,
-    detector: tuple[ClickLaw, float],
+    detector: tuple[ClickLaw | CountLaw, float],
     found: ExpectedWalk,
     here: slice,
 ) -> None:
@@ -118,17 +127,34 @@ def _walk_block(
         pattern = automaton.pattern[states]
         share = automaton.dwell[states] / automaton.dwell_steps
         photoelectrons = light[:, pattern] * share
-        click, miss = both_chances(law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
-        clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
         reached = alpha[:, :, states].sum(axis=0)
+        if isinstance(law, CountLaw):
+            chances = count_chances(law, photoelectrons)
+            click, clicked = np.tensordot(np.arange(outcomes_of(law)), chances, 1), 0.0
+        else:
+            click, miss = both_chances(law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
+            clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
         sums[0] += (reached * click + clicked).sum(axis=1)
         sums[1] += (reached * photoelectrons).sum(axis=1)
         sums[2] += reached @ (shown[pattern] * share)
         sums[3] += reached.sum(axis=1)
-        pass_on(alpha, states, automaton.successors, (click, miss), afterpulse)
+        if isinstance(law, CountLaw):
+            pass_counts_on(alpha[0], states, automaton.successors, chances)
+        else:
+            pass_on(alpha, states, automaton.successors, (click, miss), afterpulse)
     for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
         total[here] = row
     found.leaves[here] = alpha[:, :, automaton.n_states :].sum(axis=0)
+
+
+@njit(cache=True, nogil=True)
+def pass_counts_on(alpha: F64, states: NDArray[np.int64], successors: NDArray[np.uint32], chances: F64) -> None:
+    """Add what leaves each of `states` (m,) to its successors: alpha (n, nodes), chances (outcomes, n, m)."""
+    for i in range(alpha.shape[0]):
+        for k in range(states.size):
+            reached = alpha[i, states[k]]
+            for outcome in range(chances.shape[0]):
+                alpha[i, successors[states[k], outcome]] += reached * chances[outcome, i, k]
 
 
 @njit(cache=True, nogil=True)

@@ -104,7 +104,7 @@ def _about(value: float, off: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Detector:
-    """What clicks; effects left at 0 are absent."""
+    """What clicks; effects left at 0 are absent. `photon_number_max`: the largest number that a reading can state, 1 of clicks alone."""
 
     kind: str
     channels: int
@@ -117,6 +117,7 @@ class Detector:
     between_exposures: str = GATED
     afterpulse_probability: float = 0.0
     crosstalk_probability: float = 0.0
+    photon_number_max: int = 1
 
 
 @dataclass(frozen=True, slots=True)

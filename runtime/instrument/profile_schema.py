@@ -76,6 +76,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "between_exposures": Key("text", required=False, choices=(GATED, FREE_RUNNING)),
         "afterpulse_probability": _PROBABILITY,
         "crosstalk_probability": _PROBABILITY,
+        "photon_number_max": Key("whole", 1, 15, required=False),
     },
     "exposure": {
         "min_us": Key("number", 0, 1e9, above=True),

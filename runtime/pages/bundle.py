@@ -90,7 +90,10 @@ def _add_automaton(page: Page, bundle: Bundle, automaton: Automaton) -> None:
 
 def outcomes(automaton: Automaton, state: int, classes: tuple[str, ...]) -> list[str]:
     """Return the most probable class after each outcome of an exposure in `state`."""
-    named = ("no click", "click") if automaton.successors.shape[1] == 2 else ()
+    named: tuple[str, ...] = ("no click", "click") if automaton.n_outcomes == 2 else ()
+    if automaton.counts:
+        last = automaton.n_outcomes - 1
+        named = (*(f"{number} photons" for number in range(last)), f"{last} or more")
     lines = []
     for outcome, words in reversed(list(enumerate(named))):
         after = automaton.posteriors[int(automaton.successors[state, outcome])]

@@ -168,7 +168,7 @@ def _automaton(old: Automaton, rows: Rows, found: Refitted, clicks: Labelled) ->
             corrected += 1
     posteriors = np.maximum(posteriors, _LEAST)
     posteriors /= posteriors.sum(axis=1, keepdims=True)
-    return Automaton(old.pattern, old.dwell, old.dwell_steps, old.successors, posteriors.astype(np.float32)), corrected
+    return replace(old, posteriors=posteriors.astype(np.float32)), corrected
 
 
 def _of_slot(

@@ -16,14 +16,15 @@ class Walk(NamedTuple):
     leaf: int
 
 
-def walk(automaton: Automaton, word: Sequence[int]) -> Walk:
-    """Walk a click word; bit t * channels + k is channel k in slot t."""
+def walk(automaton: Automaton, word: Sequence[int], counts: bool = False) -> Walk:
+    """Walk a click word; bit t * channels + k is channel k in slot t. With `counts` number t is the photons of slot t."""
     states: list[int] = []
     node = 0
     while node < automaton.n_states:
         bits = word[len(states) * automaton.channels : (len(states) + 1) * automaton.channels]
         states.append(node)
-        node = int(automaton.successors[node][sum(2**k for k, bit in enumerate(bits) if bit)])
+        outcome = bits[0] if counts else sum(2**k for k, bit in enumerate(bits) if bit)
+        node = int(automaton.successors[node][outcome])
     return Walk(states, node - automaton.n_states)
 
 

@@ -1,8 +1,8 @@
-"""Growing an automaton level by level: new patterns for every state, trained on what their click tells, then merged.
+"""Growing an automaton level by level: new patterns for every state, trained on what their outcome tells, then merged.
 
 Owns one level at a time: candidates from the class means that each state sees, the best of them trained by Adam on the expected
-cross-entropy of its two children and the price of its light, and the merging of the children to as many states as are wanted. Growing
-looks one exposure ahead; what lies further ahead is tuned (tune.py).
+cross-entropy of its children, one per outcome, and the price of its light, and the merging of the children to as many states as are
+wanted. Growing looks one exposure ahead; what lies further ahead is tuned (tune.py).
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pans.runtime.instrument.count_law import outcomes_of
+
 from .light import Grey
 from .machine import COUNT_FLOOR, Level, Machine, Sight, children
 from .merge import merged
 from .objects import Block
-from .outcomes import no_click
+from .outcomes import mean_reading, readings
 
 TRIED_BLOCKS = 6  # objects on which candidates are compared, in blocks
 LIGHT_TRIED = (0.4, 1.6)  # mean photoelectrons of a candidate
@@ -118,59 +120,67 @@ class Growth:
 
     def _cost_of(self, patterns: Tensor, tried: int, price: float) -> Tensor:
         """What every state's pattern leaves unknown of the class, and the price of its light, (states,)."""
-        silent, spent = torch.zeros(len(patterns), self.counts.shape[1]), torch.zeros(len(patterns))
-        whole = torch.zeros_like(silent)
+        spent, whole = torch.zeros(len(patterns)), torch.zeros(len(patterns), self.counts.shape[1])
+        parts = [torch.zeros_like(whole) for _ in range(outcomes_of(self.sight.law) - 1)]
         for alpha, block in zip(self.alphas[:tried], self.blocks[:tried]):
             light = self.sight.light(patterns, block.grey)
-            dark, _ = no_click(light, self.sight.law)
-            silent += (alpha * dark) @ block.one_hot.T
+            for part, chance in zip(parts, readings(light, self.sight.law)[0]):
+                part += (alpha * chance) @ block.one_hot.T
             whole += alpha @ block.one_hot.T
             spent += (alpha * light).sum(dim=1)
-        return mass_entropy(silent) + mass_entropy((whole - silent).clamp(min=0)) + price * spent
+        unknown = sum_of(mass_entropy(part) for part in [*parts, remainder(whole, parts).clamp(min=0)])
+        return unknown + price * spent
 
     def _train(self, light: Grey, price: float) -> None:
-        """Adam on the two children's expected cross-entropy under running class counts."""
+        """Adam on the children's expected cross-entropy under running class counts."""
         options = self.options
         optimiser = torch.optim.Adam([light.root], lr=options.rate, fused=True)
         n = sum(len(block) for block in self.blocks)
-        whole = self.counts.double() + 2 * COUNT_FLOOR  # in float32 a child's count could vanish beside the other's
-        silent = torch.minimum(self._silent_counts(light).double() + COUNT_FLOOR, whole - COUNT_FLOOR)
+        outcomes = outcomes_of(self.sight.law)
+        whole = (
+            self.counts.double() + outcomes * COUNT_FLOOR
+        )  # in float32 a child's count could vanish beside another's
+        parts = [torch.minimum(p.double() + COUNT_FLOOR, whole - COUNT_FLOOR) for p in self._outcome_counts(light)]
         steps, done = options.epochs * len(self.blocks), 0
         for epoch in range(options.epochs):
             share = 0.05 if epoch == 0 else 0.03
             for index in torch.randperm(len(self.blocks), generator=self.random).tolist():
                 alpha, block = self.alphas[index], self.blocks[index]
                 mask, _ = light.shown()
-                dark, fall = no_click(self.sight.light(mask, block.grey), self.sight.law)
-                here_silent = (alpha * dark) @ block.one_hot.T
-                gain = (log_posterior(whole - silent) - log_posterior(silent)).float() @ block.one_hot
-                slope = torch.mul(fall, gain).neg_().add_(price).mul_(alpha).mul_(1.0 / len(block))
+                chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
+                arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
+                slope = _told(falls, parts, whole, block)
+                slope.neg_().add_(price).mul_(alpha).mul_(1.0 / len(block))
                 light.take(self.sight.mask_slope(slope, block.grey, light), None)
                 optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
                 optimiser.step()
                 light.settle()
                 done += 1
-                silent = torch.minimum((1 - share) * silent + share * n / len(block) * here_silent, whole - COUNT_FLOOR)
-                silent.clamp_(min=COUNT_FLOOR)
+                for outcome, here in enumerate(arrived):
+                    part = (1 - share) * parts[outcome] + share * n / len(block) * here
+                    parts[outcome] = torch.minimum(part, whole - COUNT_FLOOR).clamp_(min=COUNT_FLOOR)
 
-    def _silent_counts(self, light: Grey) -> Tensor:
+    def _outcome_counts(self, light: Grey) -> list[Tensor]:
+        """Class counts of all outcomes but the last, each (states, classes)."""
         mask, _ = light.shown()
-        return sum_of(
-            (alpha * no_click(self.sight.light(mask, block.grey), self.sight.law)[0]) @ block.one_hot.T
-            for alpha, block in zip(self.alphas, self.blocks)
-        )
+        totals: list[Tensor] = []
+        for alpha, block in zip(self.alphas, self.blocks):
+            chances, _ = readings(self.sight.light(mask, block.grey), self.sight.law)
+            counted = [(alpha * chance) @ block.one_hot.T for chance in chances]
+            totals = counted if not totals else [total + part for total, part in zip(totals, counted)]
+        return totals
 
     def _branch(self, light: Grey) -> None:
         """Carry the probabilities to the children and merge these."""
         states = len(light.root)
-        silent = self._silent_counts(light)
-        both = torch.cat([silent, (self.counts - silent).clamp(min=0)])
-        groups = merged(both.double().cpu().numpy(), min(self.options.states, len(both)))
-        successors = torch.from_numpy(np.ascontiguousarray(groups)).to(both.device).reshape(2, states)
+        parts = self._outcome_counts(light)
+        edges = torch.cat([*parts, remainder(self.counts, parts).clamp(min=0)])
+        groups = merged(edges.double().cpu().numpy(), min(self.options.states, len(edges)))
+        successors = torch.from_numpy(np.ascontiguousarray(groups)).to(edges.device).reshape(-1, states)
         n_nodes = int(groups.max()) + 1
         self._carry(light, successors, n_nodes)
         self.levels.append(Level(light, successors))
-        self.counts = torch.zeros(n_nodes, both.shape[1]).index_add_(0, successors.flatten(), both)
+        self.counts = torch.zeros(n_nodes, edges.shape[1]).index_add_(0, successors.flatten(), edges)
 
     def _carry(self, light: Grey, successors: Tensor, n_nodes: int) -> None:
         """Carry the probabilities of all objects over one level, and add up its light and clicks."""
@@ -178,12 +188,32 @@ class Growth:
         photons = clicks = 0.0
         for index, block in enumerate(self.blocks):
             alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)
-            dark, _ = no_click(brought, self.sight.law)
+            chances, _ = readings(brought, self.sight.law)
             photons += float((alpha * brought).sum())
-            clicks += float((alpha * (1 - dark)).sum())
-            self.alphas[index] = children(alpha, dark, successors, n_nodes)
+            clicks += float((alpha * mean_reading(chances)).sum())
+            self.alphas[index] = children(alpha, chances, successors, n_nodes)
         n = sum(len(block) for block in self.blocks)
         self.spent = self.spent[0] + photons / n, self.spent[1] + clicks / n
+
+
+def remainder(whole: Tensor, parts: list[Tensor]) -> Tensor:
+    """Return what `parts` leave of `whole`, all (states, classes)."""
+    rest = whole - parts[0]
+    for part in parts[1:]:
+        rest = rest - part
+    return rest
+
+
+def _told(falls: tuple[Tensor, ...], parts: list[Tensor], whole: Tensor, block: Block) -> Tensor:
+    """How fast light lowers the expected cross-entropy of the outcomes, (states, objects), by their class counts `parts`."""
+    rest = remainder(whole, parts)
+    if len(parts) > 1:
+        rest.clamp_(min=COUNT_FLOOR)  # each part alone leaves it, all together may not
+    last = log_posterior(rest)
+    slope = torch.mul(falls[0], (last - log_posterior(parts[0])).float() @ block.one_hot)
+    for fall, part in zip(falls[1:], parts[1:]):
+        slope.addcmul_(fall, (last - log_posterior(part)).float() @ block.one_hot)
+    return slope
 
 
 def sum_of(parts: object) -> Tensor:

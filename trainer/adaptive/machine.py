@@ -1,8 +1,8 @@
 """The automaton while it is trained: levels of states, their successors, and the class counts of its leaves.
 
 Owns the exact forward pass (the probability of every node, given an object), the exact gradient of the expected loss, and the matrix
-products in reduced precision that make both quick. A level has states; an outcome (no click, click) of a state leads to a node of the
-next level; nodes are that level's states first, then its leaves. Nodes of the last level are all leaves.
+products in reduced precision that make both quick. A level has states; an outcome (no click, click; or 0, 1, 2+ photons) of a
+state leads to a node of the next level; nodes are that level's states first, then its leaves. Nodes of the last level are all leaves.
 
 Tensors stand as (states, objects): rows are moved whole along the edges. For a state s of a level, with alpha its probability, q that
 of no click and beta the expected loss from there on:
@@ -23,12 +23,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pans.runtime.instrument.click_law import ClickLaw
-
 from .light import Light
-from .outcomes import no_click
+from .outcomes import Law, mean_reading, readings
 
-OUTCOMES = 2  # no click, click
 WRONG = 2.2  # nats, of a wrong decision: about the odds of ten classes, so that both parts of the loss are of one size
 COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
 
@@ -73,7 +70,7 @@ class Sight:
     With `dark_pixels` grey values have one more column, the light that dark pixels bring where a full one has 1 (model/imaging.py).
     """
 
-    law: ClickLaw
+    law: Law
     gain: float
     floor: float = 0.0
     products: torch.dtype = torch.float32
@@ -113,12 +110,21 @@ class Sight:
 
 @dataclass(slots=True)
 class Step:
-    """One level of a pass: probability of the states, light, probability of no click and how fast it falls with light."""
+    """One level of a pass: probability of the states, light, chances of all outcomes but the last, and how fast each falls with light."""
 
     alpha: Tensor
     light: Tensor
-    dark: Tensor
-    fall: Tensor
+    chances: tuple[Tensor, ...]
+    falls: tuple[Tensor, ...]
+
+    @property
+    def dark(self) -> Tensor:
+        """Probability of no click: of the outcome 0."""
+        return self.chances[0]
+
+    def clicks(self) -> Tensor:
+        """Return the expected clicks of every object: photons counted, where they are."""
+        return (self.alpha * mean_reading(self.chances)).sum(dim=0)
 
 
 @dataclass(slots=True)
@@ -133,8 +139,8 @@ class Pass:
         return torch.stack([(step.alpha * step.light).sum(dim=0) for step in self.steps]).sum(dim=0)
 
     def clicks(self) -> Tensor:
-        """Return the expected clicks of every object."""
-        return torch.stack([(step.alpha * (1 - step.dark)).sum(dim=0) for step in self.steps]).sum(dim=0)
+        """Return the expected clicks of every object: photons counted, where they are."""
+        return torch.stack([step.clicks() for step in self.steps]).sum(dim=0)
 
 
 def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
@@ -144,12 +150,20 @@ def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
     return result if scale is None else result.mul_(scale)
 
 
-def children(alpha: Tensor, dark: Tensor, successors: Tensor, n_nodes: int) -> Tensor:
-    """Return the probability of the nodes behind states of probability `alpha` that stay dark with `dark`, (nodes, objects)."""
-    silent = alpha * dark
+def children(alpha: Tensor, chances: tuple[Tensor, ...], successors: Tensor, n_nodes: int) -> Tensor:
+    """Return the probability of the nodes behind states of probability `alpha`, (nodes, objects).
+
+    `chances` are those of all outcomes but the last, which takes what remains.
+    """
     nodes = torch.zeros(n_nodes, alpha.shape[1], dtype=alpha.dtype)
-    nodes.index_add_(0, successors[0], silent)
-    return nodes.index_add_(0, successors[1], torch.sub(alpha, silent, out=silent))
+    rest = alpha
+    for chance, after in zip(chances, successors):
+        part = alpha * chance
+        nodes.index_add_(0, after, part)
+        rest = torch.sub(rest, part, out=part)
+    if len(chances) > 1:
+        rest.clamp_(min=0)  # a difference of several numbers rounds to either side of 0
+    return nodes.index_add_(0, successors[-1], rest)
 
 
 def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
@@ -161,9 +175,9 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         if number:
             result.leaves.append(nodes[level.n_states :])
         light = brought(level.light, sight, grey)
-        dark, fall = no_click(light, sight.law)
-        result.steps.append(Step(alpha, light, dark, fall))
-        nodes = children(alpha, dark, level.successors, machine.n_nodes(number))
+        chances, falls = readings(light, sight.law)
+        result.steps.append(Step(alpha, light, chances, falls))
+        nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result
 
@@ -203,14 +217,20 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
     beta = aim.at_leaves(machine.counts[-1], one_hot)
     for number in range(len(machine.levels) - 1, -1, -1):
         level, step = machine.levels[number], passed.steps[number]
-        after_click = beta[level.successors[1]]
-        gain = beta[level.successors[0]].sub_(after_click)  # what no click costs more than a click
-        slope = torch.mul(step.fall, gain).neg_().add_(aim.price).mul_(step.alpha).mul_(share)
+        after_last = beta[level.successors[-1]]
+        gains = [beta[after].sub_(after_last) for after in level.successors[:-1]]  # what they cost more than the last
+        slope = torch.mul(step.falls[0], gains[0])
+        for fall, gain in zip(step.falls[1:], gains[1:]):
+            slope.addcmul_(fall, gain)
+        slope.neg_().add_(aim.price).mul_(step.alpha).mul_(share)
         mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
         level.light.take(mask_slope if scale is None else mask_slope.mul_(scale), light_slope)
-        beta = gain.mul_(step.dark).add_(after_click).add_(step.light, alpha=aim.price)
+        beta = gains[0].mul_(step.chances[0])
+        for chance, gain in zip(step.chances[1:], gains[1:]):
+            beta.addcmul_(chance, gain)
+        beta.add_(after_last).add_(step.light, alpha=aim.price)
         if aim.exposure_price:
             beta += aim.exposure_price
         if number and len(machine.counts[number - 1]):

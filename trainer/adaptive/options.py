@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
 from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import check_optics
 from pans.trainer.tasks.registry import Task
@@ -61,6 +62,7 @@ class AutomatonOptions:
     teacher_epochs: int = 6  # of that network
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
+    outcomes: int = 2  # of one exposure: no click and a click, or 0, 1, ... photons and the last "this many or more"
 
 
 LIMITS = {
@@ -79,6 +81,7 @@ LIMITS = {
     "decide": (0, 1),
     "exposure_price": (0, 10),
     "teacher_epochs": (1, 1000),
+    "outcomes": (2, OUTCOMES_MAX),
     "patterns": (0, 65_535),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
@@ -92,9 +95,9 @@ def photons_wanted(options: AutomatonOptions) -> float:
     return DEFAULT_PHOTONS if options.clicks is None else PHOTONS_PER_CLICK * options.clicks
 
 
-def states_at_most(exposures: int, states: int) -> int:
-    """Return how many states an automaton can have: twice as many from exposure to exposure, and `states` at most."""
-    return sum(min(1 << min(level, 32), states) for level in range(exposures))
+def states_at_most(exposures: int, states: int, outcomes: int = 2) -> int:
+    """Return how many states an automaton can have: `outcomes` times as many from exposure to exposure, and `states` at most."""
+    return sum(min(outcomes ** min(level, 32), states) for level in range(exposures))
 
 
 def patterns_at_most(options: AutomatonOptions, profile: Profile) -> int:
@@ -120,7 +123,7 @@ def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int
     if options.states:
         return exposures, options.states
     most = min(profile.projector.pattern_memory, profile.projector.automaton_states or STATES_MAX)
-    while states > 1 and states_at_most(exposures, states) > most:
+    while states > 1 and states_at_most(exposures, states, options.outcomes) > most:
         states -= 1
     return exposures, states
 
@@ -181,7 +184,10 @@ def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
             f"an automaton shows one pattern after another, {profile.name} is a {profile.mode} profile",
             remedy="choose a sequential profile, such as ideal or dmd-spad",
         )
-    most = states_at_most(exposures, states)
+    why = cannot_count(profile, options.outcomes)
+    if why:
+        raise PlanError(why, remedy="--outcomes 2, or a profile whose detector.photon_number_max is at least one less")
+    most = states_at_most(exposures, states, options.outcomes)
     if most > STATES_MAX:
         raise PlanError(
             f"{exposures} exposures of {states} states are up to {most} states, allowed at most {STATES_MAX}",

@@ -17,7 +17,7 @@ from torch import Tensor
 from .light import Grey, Light
 from .machine import COUNT_FLOOR, Machine, Sight, forward, leaf_losses
 from .objects import Block
-from .outcomes import no_click
+from .outcomes import readings
 
 SURE = 0.5  # standard errors by which a node must be better; the difference of an object's losses varies by about LOSS_SPREAD
 LOSS_SPREAD = 0.5  # nats
@@ -48,16 +48,14 @@ class Sweep:
         self.betas = [leaf_losses(machine.counts[-1], block.one_hot) for block in blocks]
 
     def costs(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Expected loss of every edge at every node, (2, states, nodes), class counts of the edges, (2, states, classes), and the
-        standard error of a difference of losses, (2, states)."""
+        """Expected loss of every edge at every node, (outcomes, states, nodes), class counts of the edges, (outcomes, states, classes),
+        and the standard error of a difference of losses, (outcomes, states)."""
         costs: Tensor | None = None
         arrived: Tensor | None = None
         squares: Tensor | None = None
         for kept, beta, block in zip(self.kept, self.betas, self.blocks):
-            alpha, dark = self._alpha_dark(kept[number])
-            silent = alpha * dark
-            both = torch.cat([silent, alpha - silent])
-            part, counted, square = both @ beta.T, both @ block.one_hot.T, both.square().sum(dim=1)
+            edges = self._edges(kept[number])
+            part, counted, square = edges @ beta.T, edges @ block.one_hot.T, edges.square().sum(dim=1)
             costs = part if costs is None else costs + part
             arrived = counted if arrived is None else arrived + counted
             squares = square if squares is None else squares + square
@@ -65,7 +63,8 @@ class Sweep:
         assert arrived is not None
         assert squares is not None
         error = LOSS_SPREAD * squares.sqrt()
-        return costs.unflatten(0, (2, -1)), arrived.unflatten(0, (2, -1)), error.unflatten(0, (2, -1))
+        by_outcome = len(self.machine.levels[number].successors), -1
+        return costs.unflatten(0, by_outcome), arrived.unflatten(0, by_outcome), error.unflatten(0, by_outcome)
 
     def copy_node(self, source: int, target: int) -> None:
         """Let the expected loss of `target` behind the present level be that of `source`."""
@@ -81,18 +80,25 @@ class Sweep:
         """Replace the expected losses behind level `number` by those before it, under its present successors."""
         level = self.machine.levels[number]
         for index, (kept, block) in enumerate(zip(self.kept, self.blocks)):
-            _, dark = self._alpha_dark(kept[number])
+            light = kept[number][1].float()
             beta = self.betas[index]
-            after = beta[level.successors[1]]
-            before = after + dark * (beta[level.successors[0]] - after) + price * kept[number][1].float()
+            before = after = beta[level.successors[-1]]
+            for chance, outcome in zip(readings(light, self.sight.law)[0], level.successors):
+                before = before + chance * (beta[outcome] - after)
+            before = before + price * light
             before += exposure_price
             if number and len(self.machine.counts[number - 1]):
                 before = torch.cat([before, leaf_losses(self.machine.counts[number - 1], block.one_hot)])
             self.betas[index] = before
 
-    def _alpha_dark(self, kept: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        alpha, light = kept
-        return alpha.float(), no_click(light.float(), self.sight.law)[0]
+    def _edges(self, kept: tuple[Tensor, Tensor]) -> Tensor:
+        """Probability of every edge, (outcomes * states, objects)."""
+        alpha, light = kept[0].float(), kept[1].float()
+        parts = [alpha * chance for chance in readings(light, self.sight.law)[0]]
+        rest = alpha - parts[0]
+        for part in parts[1:]:
+            rest = (rest - part).clamp_(min=0)
+        return torch.cat([*parts, rest])
 
 
 def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, exposure_price: float = 0.0) -> Rerouted:
@@ -126,7 +132,7 @@ def reroute(machine: Machine, sight: Sight, blocks: list[Block], price: float, e
 def _stop(
     machine: Machine, number: int, sweep: Sweep, cost: Tensor, arrived: Tensor, error: Tensor
 ) -> tuple[int, float]:
-    """Give edges leaves of their own where that costs less than `cost`; all (2, states). Returns how many, and what is saved.
+    """Give edges leaves of their own where that costs less than `cost`; all (outcomes, states). Returns how many, and what is saved.
 
     A leaf states the posterior of the objects that arrive, with one more object spread over the classes, so that few of them
     promise little.
@@ -168,7 +174,7 @@ def _revive(machine: Machine, number: int, arrived: Tensor) -> list[tuple[int, i
         in_edges[empty] = int(half.sum())
         _copy_node(machine, number, full, empty, edges[own[half]].sum(dim=0))
         revived.append((full, empty))
-    level.successors = targets.unflatten(0, (2, -1))
+    level.successors = targets.unflatten(0, (len(level.successors), -1))
     return revived
 
 

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from pans.runtime.imaging import tolerance_of
-from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.count_law import count_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.exposure import exposure_us_of, top_limits
@@ -176,7 +176,8 @@ class _Run:
         """How the instrument sees objects at the exposure that the present brightest pixel needs."""
         low, high = top_limits(self.profile)
         top = self.machine.levels[0].light.top if self.stage == "shown" else low
-        law = click_law(self.profile, exposure_us_of(self.profile, min(high, max(low, top))))
+        exposure_us = exposure_us_of(self.profile, min(high, max(low, top)))
+        law = count_law(self.profile, exposure_us, self.options.outcomes)
         if self.options.dark is not None:
             law = replace(law, dark_per_exposure=self.options.dark)
         through = self.options.optics is not None

@@ -78,7 +78,9 @@ NUMBERS = (
     ("clamp", "L", "clamp photoelectrons early in training"),
     ("dark", "R", "dark photoelectrons per exposure in training, instead of the profile's"),
 )
-OF_AUTOMATA = ("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher")
+OF_AUTOMATA = (
+    *("exposures", "states", "patterns", "grey", "strength", "decide", "outcomes", "exposure_price", "soft", "teacher"),
+)
 AS_GIVEN = (
     *("features", "photons", "budget", "complex_field", "conserving", "optics"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
@@ -141,6 +143,12 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="P",
         help="of an automaton: most different patterns, which states share (default: the projector's memory)",
+    )
+    parser.add_argument(
+        "--outcomes",
+        type=int,
+        metavar="K",
+        help="of an automaton: outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
     )
     parser.add_argument(
         "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"

@@ -43,6 +43,7 @@ TAKEN = (
     "copies",
     "strength",
     "decide",
+    "outcomes",
     "exposure_price",
     "soft",
     "dark",

@@ -21,6 +21,7 @@ from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
+from pans.runtime.instrument.count_law import CountLaw, cannot_count, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 
@@ -106,6 +107,22 @@ def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | Non
         exposure_us = bundle.analyser.exposure_us
     law = click_law(profile, exposure_us)
     return law if dark is None else replace(law, dark_per_exposure=dark)
+
+
+def outcome_law_of(
+    bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None
+) -> ClickLaw | CountLaw:
+    """Return the law of what the automaton of `bundle` is told of an exposure: of clicks as `law_of`, or of photon numbers.
+
+    ValueError for what `law_of` refuses, and for a profile that cannot tell so many photon numbers apart.
+    """
+    law, automaton = law_of(bundle, profile, eta, dark), bundle.automaton
+    if automaton is None or not automaton.counts:
+        return law
+    why = cannot_count(profile, automaton.n_outcomes)
+    if why:
+        raise ValueError(f"{bundle.name} needs {why}")
+    return counting(law, automaton.n_outcomes)
 
 
 def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:

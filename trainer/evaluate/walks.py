@@ -22,9 +22,10 @@ from pans.runtime.decide.expectation import expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.imaging import IDENTITY, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, object_transmission
+from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
-from .accuracy import law_of
+from .accuracy import outcome_law_of
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
@@ -111,7 +112,7 @@ def walks_of(
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if trials is not None and trials < 1:
         raise ValueError(f"trials is {trials}, allowed: 1 or more")
-    law = law_of(bundle, profile, eta, dark)
+    law = outcome_law_of(bundle, profile, eta, dark)
     automaton = stopped(bundle.automaton, confidence) if confidence else bundle.automaton
     leaf_labels = leaf_verdicts(automaton, confidence).labels
     parts: list[Walks] = []
@@ -160,7 +161,7 @@ def _sampled(
     automaton: Automaton,
     patterns: NDArray[Any],
     seen: NDArray[Any],
-    detector: tuple[ClickLaw, float],
+    detector: tuple[ClickLaw | CountLaw, float],
     scale: float,
     trials: int,
     rng: np.random.Generator,
@@ -177,16 +178,25 @@ def _sampled(
             state = node[going]
             pattern, share = automaton.pattern[state], automaton.dwell[state] / automaton.dwell_steps
             photoelectrons = light[going, pattern] * share
-            probability = click_probability(law, photoelectrons)
-            probability += (1 - probability) * afterpulse * before[going]
-            before[going] = click = rng.random(going.size) < probability
-            for total, values in zip(sums, (click, photoelectrons, whole[pattern] * share, 1.0)):
+            outcome = _drawn(law, photoelectrons, afterpulse * before[going], rng)
+            before[going] = outcome > 0
+            for total, values in zip(sums, (outcome, photoelectrons, whole[pattern] * share, 1.0)):
                 total[going] += values
-            node[going] = automaton.successors[state, click.astype(np.int64)]
+            node[going] = automaton.successors[state, outcome]
             going = going[node[going] < automaton.n_states]
         leaves[rows, node - automaton.n_states] += 1.0
     sums /= trials
     return sums[0], sums[1], sums[2], sums[3], leaves / trials
+
+
+def _drawn(law: ClickLaw | CountLaw, light: F64, again: F64, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Draw the outcome of each exposure (n,); `again` is the chance of a click that only the one before it causes."""
+    if isinstance(law, CountLaw):
+        passed = rng.random(light.size) >= np.cumsum(count_chances(law, light)[:-1], axis=0)
+        return np.asarray(passed.sum(axis=0), np.int64)
+    probability = click_probability(law, light)
+    probability += (1 - probability) * again
+    return np.asarray(rng.random(light.size) < probability, np.int64)
 
 
 def measured_walks(walks: Walks) -> MeasuredWalks:

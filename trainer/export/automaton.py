@@ -24,7 +24,7 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import law_of
+from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -94,7 +94,12 @@ def bundle_of(
     """Return the bundle of a trained automaton: states and leaves that no walk reaches are left out, and patterns that none shows."""
     arrays = trained.arrays
     automaton = reachable_automaton(
-        arrays.pattern, arrays.dwell, arrays.dwell_steps, arrays.successors, arrays.posteriors
+        arrays.pattern,
+        arrays.dwell,
+        arrays.dwell_steps,
+        arrays.successors,
+        arrays.posteriors,
+        trained.options.outcomes > 2,
     )
     shown, pattern = np.unique(automaton.pattern, return_inverse=True)
     automaton = replace(automaton, pattern=pattern.astype(np.uint16))
@@ -135,7 +140,7 @@ def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile
     """
     objects = task.test.first(COMPARED_OBJECTS)
     assert bundle.automaton is not None
-    law = law_of(bundle, profile, dark=trained.options.dark)
+    law = outcome_law_of(bundle, profile, dark=trained.options.dark)
     seen = object_transmission(profile, objects.images.reshape(len(objects), -1))
     found = expected_walk(bundle.automaton, bundle.pattern_levels, seen, law, bundle.photons_per_level)
     of_class = found.leaves @ bundle.automaton.posteriors[bundle.automaton.n_states :].astype(np.float64)
@@ -155,7 +160,8 @@ def compare_decider(bundle: Bundle, seed: int) -> None:
     """Hold the back end that will decide against plain walks of random click words; PansError where a decision differs."""
     automaton = bundle.automaton
     assert automaton is not None
-    words = np.random.default_rng(seed).integers(0, 2, (SAMPLED_WALKS, automaton.n_bits))
+    outcomes = automaton.n_outcomes if automaton.counts else 2
+    words = np.random.default_rng(seed).integers(0, outcomes, (SAMPLED_WALKS, automaton.n_bits))
     wanted = automaton.posteriors[walk_nodes(automaton, words)[:, -1]]
     found = make_decider(bundle, backend="automaton").scores_batch(words.astype(np.int64), 1)
     if not np.array_equal(found.argmax(axis=1), wanted.argmax(axis=1)):

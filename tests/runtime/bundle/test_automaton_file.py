@@ -106,6 +106,53 @@ def test_without_expected_figures_none_stand_in_the_file() -> None:
     assert header["automaton"] == {"dwell_steps": 2}
 
 
+Change = Callable[[dict[str, Any], dict[str, np.ndarray]], Any]
+
+
+def counting() -> Automaton:
+    """An automaton of four photon numbers."""
+    few = random_automaton(4, channels=2)
+    return Automaton(few.pattern, few.dwell, few.dwell_steps, few.successors, few.posteriors, counts=True)
+
+
+def test_photon_numbers_come_back_in_version_4() -> None:
+    automaton = counting()
+    made = automaton_bundle(automaton)
+    data = bundle_bytes(made)
+    assert struct.unpack_from("<I", data, 8)[0] == 4
+    header, arrays = taken_apart(data)
+    assert header["automaton"] == {"dwell_steps": 8, "outcomes": 4}
+    assert arrays["golden_words"].shape[1] == automaton.n_slots == made.n_features
+    assert arrays["golden_words"].max() == 3
+    read = parse_bundle(data, "here")
+    assert read.automaton is not None
+    assert read.automaton.counts
+    assert (read.automaton.channels, read.automaton.n_outcomes) == (1, 4)
+    same(made, read)
+    assert bundle_bytes(read) == data
+
+
+COUNT_LIES: list[tuple[Change, str]] = [
+    (lambda h, a: h["automaton"].update(outcomes=3), "outcomes is 3, successors has 4 columns"),
+    (lambda h, a: h["automaton"].update(outcomes=4.0), r"outcomes is 4\.0, successors"),
+    (lambda h, a: h["automaton"].update(more=1), "allowed: an object with the keys dwell_steps"),
+    (lambda h, a: h["automaton"].pop("outcomes"), "version 4 that says no more than 3"),
+    (lambda h, a: a["golden_words"].__setitem__((0, 0), 4), "other numbers than whole ones from 0 to 3|index 4"),
+    (
+        lambda h, a: h["automaton"].update(outcomes=2) or a.update(successors=a["successors"][:, :2].copy()),
+        "2 photon numbers",
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), COUNT_LIES, ids=[words[:30] for _, words in COUNT_LIES])
+def test_a_lie_about_photon_numbers_is_named(change: Change, words: str) -> None:
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle(counting())))
+    change(header, arrays)
+    with pytest.raises(DamagedFileError, match=words):
+        parse_bundle(put_together(header, arrays, 4), "here")
+
+
 def test_bits_lie_as_the_document_says() -> None:
     levels = np.zeros((3, 20), np.int64)
     levels[0, [0, 9, 19]] = 1
@@ -120,9 +167,6 @@ def test_bits_lie_as_the_document_says() -> None:
 def test_older_versions_are_written_as_before() -> None:
     data = bundle_bytes(made_bundle(table=np.arange(8).reshape(4, 2)))
     assert struct.unpack_from("<I", data, 8)[0] == 1
-
-
-Change = Callable[[dict[str, Any], dict[str, np.ndarray]], Any]
 
 
 def put(part: str, place: Any, value: Any) -> Change:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
 from pans.runtime.instrument.click_law import click_probability, object_transmission
+from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import Conditions, evaluate
 from pans.trainer.evaluate.accuracy import law_of
@@ -226,3 +228,45 @@ def test_dark_counts_do_not_follow_the_dwell() -> None:
     for one in (automaton, short):
         found = measured_walks(walks_of(automaton_bundle(one), ideal, IMAGES, LABELS, dark=0.3, eta=0.0))
         assert found.clicks_mean == pytest.approx((1 - math.exp(-0.3)) * found.exposures_mean, rel=1e-12)
+
+
+def counting_bundle() -> Bundle:
+    """An automaton of photon numbers: the edges of a random one, and more of them."""
+    few = random_automaton(3, slots=4, channels=2)
+    automaton = Automaton(few.pattern, few.dwell, few.dwell_steps, few.successors, few.posteriors, counts=True)
+    assert automaton.n_outcomes == 4
+    return automaton_bundle(automaton, photons_per_level=0.4)
+
+
+def test_photon_numbers_are_summed_over_all_words() -> None:
+    """Every word of readings, chances by the law of one exposure, the decider's own answers."""
+    model = counting_bundle()
+    automaton = model.automaton
+    assert automaton is not None
+    decider: Any = make_decider(model)
+    law = CountLaw(0.02, 0.2, (0.84, 1.5, 2.5))
+    images, labels = IMAGES[:6], LABELS[:6]
+    sums = np.zeros(4)  # right, clicks, photons, exposures
+    for row, label in zip(object_transmission(PROFILE, images.reshape(6, -1)), labels):
+        light = (model.pattern_levels[automaton.pattern] * model.photons_per_level) @ row
+        light = light * automaton.dwell / automaton.dwell_steps
+        chances = count_chances(law, light)
+        for word in product(range(4), repeat=automaton.n_slots):
+            chance, states = 1.0, naive.walk(automaton, word, counts=True)
+            for state, reading in zip(states.states, word):
+                chance *= chances[reading, state]
+            chance /= 4 ** (automaton.n_slots - len(states.states))  # words that differ behind the leaf are one walk
+            right = decider.decide_leaf(states.leaf).label == label
+            seen = sum(word[: len(states.states)])
+            sums += chance * np.array([right, seen, light[states.states].sum(), len(states.states)])
+    found = measured_walks(walks_of(model, PROFILE, images, labels, dark=0.02))
+    wanted = (found.accuracy_mean, found.clicks_mean, found.photons_mean, found.exposures_mean)
+    np.testing.assert_allclose(sums / 6, wanted, rtol=1e-9)
+    drawn = measured_walks(walks_of(model, PROFILE, images, labels, dark=0.02, trials=3000, seed=1))
+    assert abs(drawn.clicks_mean - found.clicks_mean) < 5 * 3 * 4 / math.sqrt(6 * 3000)
+    assert abs(drawn.accuracy_mean - found.accuracy_mean) < 5 * found.accuracy_std / math.sqrt(3000)
+
+
+def test_photon_numbers_need_a_detector_that_tells_them_apart() -> None:
+    with pytest.raises(ValueError, match=r"tells 2 apart \(detector\.photon_number_max\)"):
+        walks_of(counting_bundle(), load_profile("dmd-spad"), IMAGES, LABELS)

@@ -1,0 +1,222 @@
+"""Three outcomes of an exposure: the exact pass against all words, its gradient, growing, edges; and two, bit for bit as before."""
+
+# ruff: noqa: E402  (what follows needs torch)
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from trainings import bars_task, random_machine
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.core.plan import build_plan
+from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.count_law import CountLaw, count_chances, count_slopes
+from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive import reroute as module
+from pans.trainer.adaptive.figures import figures
+from pans.trainer.adaptive.grow import GrowOptions, Growth
+from pans.trainer.adaptive.machine import Aim, Sight, backward, brought, forward
+from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
+from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options
+from pans.trainer.adaptive.outcomes import readings
+from pans.trainer.adaptive.reroute import reroute
+from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.export.automaton import export_automaton
+
+LAWS = [CountLaw(0.0, 0.0, (0.5, 1.5)), CountLaw(0.02, 0.3, (0.5, 1.5)), CountLaw(0.01, 0.0, (0.5, 1.5, 2.5))]
+GREY = torch.tensor([[0, 10, 255, 30, 7], [200, 0, 90, 255, 255], [0, 0, 0, 0, 0]], dtype=torch.float64)
+ONE_HOT = torch.tensor([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]], dtype=torch.float64)
+
+
+def counting_machine(outcomes, seed=0):
+    """The machine of `random_machine`, with more outcomes, each of which leads somewhere."""
+    machine = random_machine(seed)
+    for number, level in enumerate(machine.levels):
+        more = [(level.successors[1] + 1 + k) % machine.n_nodes(number) for k in range(outcomes - 2)]
+        level.successors = torch.stack([*level.successors, *more])
+    return machine
+
+
+def wide(law, floor=0.01):
+    return Sight(law, 1 / 255, floor, torch.float64)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+def test_chances_and_falls_are_the_runtimes(law):
+    light = np.array([0.0, 1e-7, 0.01, 0.5, 1.0, 3.0, 10.0, 40.0])
+    chances, falls = readings(torch.from_numpy(light), law)
+    assert len(chances) == len(falls) == law.outcomes - 1
+    np.testing.assert_allclose(torch.stack(chances).numpy(), count_chances(law, light)[:-1], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(torch.stack(falls).numpy(), -count_slopes(law, light)[:-1], rtol=1e-6, atol=2e-8)
+
+
+def walked(machine, sight, law, i):
+    """The chance of every leaf, photons and counted photons of object i, word by word."""
+    light = [brought(level.light, sight, GREY)[:, i].numpy() for level in machine.levels]
+    chances = [count_chances(law, of_level) for of_level in light]
+    leaves, photons, clicks = {}, 0.0, 0.0
+    for word in product(range(law.outcomes), repeat=len(machine.levels)):
+        chance, state, spent, seen = 1.0, 0, 0.0, 0
+        for number, (level, outcome) in enumerate(zip(machine.levels, word)):
+            chance *= chances[number][outcome, state]
+            spent, seen = spent + light[number][state], seen + outcome
+            node = int(level.successors[outcome, state])
+            n_states = machine.levels[number + 1].n_states if number + 1 < len(machine.levels) else 0
+            if node >= n_states:
+                chance /= law.outcomes ** (
+                    len(machine.levels) - number - 1
+                )  # words that differ behind the leaf are one walk
+                break
+            state = node
+        place = number, node - n_states
+        leaves[place] = leaves.get(place, 0.0) + chance
+        photons, clicks = photons + chance * spent, clicks + chance * seen
+    return leaves, photons, clicks
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+def test_forward_is_the_sum_over_all_words(law):
+    machine, sight = counting_machine(law.outcomes, 1), wide(law)
+    passed = forward(machine, sight, GREY)
+    for i in range(len(GREY)):
+        leaves, photons, clicks = walked(machine, sight, law, i)
+        for (number, leaf), chance in leaves.items():
+            assert float(passed.leaves[number][leaf, i]) == pytest.approx(chance, rel=1e-7)
+        assert float(torch.cat(passed.leaves)[:, i].sum()) == pytest.approx(1.0, abs=1e-14)
+        assert float(passed.photons()[i]) == pytest.approx(photons, rel=1e-7)
+        assert float(passed.clicks()[i]) == pytest.approx(clicks, rel=1e-7)
+
+
+def loss_of(machine, sight, aim):
+    passed = forward(machine, sight, GREY)
+    total = aim.price * float(passed.photons().mean())
+    for counts, leaves in zip(machine.counts, passed.leaves):
+        log = torch.log(counts / counts.sum(dim=1, keepdim=True))
+        total -= float(((leaves @ ONE_HOT.T) * log).sum()) / len(GREY)
+    return total
+
+
+@pytest.mark.parametrize("law", LAWS, ids=str)
+def test_gradient_is_that_of_the_loss(law):
+    machine, sight, aim, step = counting_machine(law.outcomes, 3), wide(law), Aim(0.07), 1e-6
+    backward(machine, sight, GREY, ONE_HOT, forward(machine, sight, GREY), aim)
+    for level in machine.levels:
+        gradient, root = level.light.root.grad.clone(), level.light.root
+        for index in np.ndindex(*root.shape):
+            there = root[index].item()
+            root[index] = there + step
+            above = loss_of(machine, sight, aim)
+            root[index] = there - step
+            below = loss_of(machine, sight, aim)
+            root[index] = there
+            assert float(gradient[index]) == pytest.approx((above - below) / (2 * step), rel=1e-5, abs=1e-8)
+
+
+def test_two_outcomes_are_bit_for_bit_what_they_were():
+    """Forward and backward as they were written for a click alone, in float32."""
+    machine, sight = random_machine(5), Sight(ClickLaw(0.01), 1 / 255, 0.01)
+    for level in machine.levels:
+        level.light.root = level.light.root.float()
+    machine.counts = [counts.float() for counts in machine.counts]
+    grey, one_hot, price = GREY.float(), ONE_HOT.float(), 0.07
+    alphas, lights, leaves, alpha = [], [], [], torch.ones(1, 3)
+    for number, level in enumerate(machine.levels):
+        n_next = machine.levels[number + 1].n_states if number < 2 else 0
+        light = brought(level.light, sight, grey)
+        silent = alpha * torch.exp(-(light + 0.01))
+        nodes = torch.zeros(machine.n_nodes(number), 3).index_add_(0, level.successors[0], silent)
+        nodes.index_add_(0, level.successors[1], alpha - silent)
+        alphas, lights, leaves, alpha = [*alphas, alpha], [*lights, light], [*leaves, nodes[n_next:]], nodes[:n_next]
+    passed = forward(machine, sight, grey)
+    assert all(torch.equal(found, wanted) for found, wanted in zip(passed.leaves, leaves, strict=True))
+    backward(machine, sight, grey, one_hot, passed, Aim(price))
+    beta = -torch.log(machine.counts[-1] / machine.counts[-1].sum(dim=1, keepdim=True)) @ one_hot
+    for number in (2, 1, 0):
+        level, dark = machine.levels[number], torch.exp(-(lights[number] + 0.01))
+        click = beta[level.successors[1]]
+        gain = beta[level.successors[0]] - click
+        slope = (-(dark * gain) + price) * alphas[number] * (1.0 / 3)
+        assert torch.equal(level.light.root.grad, sight.mask_slope(slope, grey) * level.light.root * 2.0)
+        beta = (gain * dark + click).add(lights[number], alpha=price)
+        if number:
+            counts = machine.counts[number - 1]
+            beta = torch.cat([beta, -torch.log(counts / counts.sum(dim=1, keepdim=True)) @ one_hot])
+
+
+@pytest.fixture(scope="module")
+def grown():
+    objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
+    blocks = objects.epoch(0, 200, torch.float32)
+    sight = Sight(LAWS[0], objects.gain)
+    with torch.no_grad():
+        growth = Growth(blocks, sight, GrowOptions(states=8), torch.Generator().manual_seed(0))
+        for _ in range(4):
+            growth.grow(0.02)
+    return growth.machine(), sight, blocks, growth
+
+
+def test_growing_branches_by_outcome(grown):
+    machine, sight, blocks, growth = grown
+    assert [level.n_states for level in machine.levels] == [1, 3, 8, 8]
+    assert all(len(level.successors) == 3 for level in machine.levels)
+    found = figures(machine, sight, blocks)
+    assert (found.photons, found.clicks) == pytest.approx(growth.spent, rel=1e-4)
+    assert found.accuracy > 0.5  # four classes: 0.25 by chance
+    leaves = sum(forward(machine, sight, block.grey).leaves[-1] @ block.one_hot.T for block in blocks)
+    torch.testing.assert_close(leaves, growth.counts, rtol=1e-4, atol=1e-3)
+
+
+def test_edges_of_three_outcomes_are_put_right(grown, monkeypatch):
+    machine, sight, blocks, _ = grown
+    machine = replace(
+        machine, levels=[replace(level) for level in machine.levels], counts=[c.clone() for c in machine.counts]
+    )
+    monkeypatch.setattr(module, "SURE", 0.0)
+
+    def cost():
+        found = figures(machine, sight, blocks)
+        return found.loss + 0.02 * found.photons
+
+    good = cost()
+    machine.levels[2].successors = machine.levels[2].successors.roll(1, 0)
+    spoiled = cost()
+    assert spoiled > good + 0.02
+    assert reroute(machine, sight, blocks, 0.02).moved > 0
+    assert cost() < good + 0.3 * (spoiled - good)
+
+
+SMALL = AutomatonOptions(
+    photons=4.0, exposures=4, states=8, batch=64, tune_epochs=1, epochs=3, first_price=0.1, outcomes=3, reroutes=1
+)
+
+
+def test_a_training_ends_in_a_bundle_that_is_evaluated(tmp_path):
+    task, profile = bars_task(), load_profile("oled-qcmos")
+    trained = train_automaton(task, profile, SMALL)
+    made = export_automaton(tmp_path / "bars.pans", trained, task, profile, name="bars", provenance={})
+    automaton = load_bundle(tmp_path / "bars.pans")[0].automaton
+    assert automaton.counts
+    assert (automaton.n_outcomes, automaton.n_slots) == (3, 4)
+    assert made.difference < 1e-5  # of class chances, between the float64 sums of the file and the machine's
+    assert made.measured.accuracy_mean > 0.5  # four classes: 0.25 by chance
+    assert made.measured.photons_mean == pytest.approx(4.0, rel=0.1)
+    with pytest.raises(PlanError, match=r"tells 3 photon numbers apart.*a run cannot take it"):
+        build_plan(profile, made.bundle)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "name", "error", "words"),
+    [
+        (1, "ideal", UsageError, "--outcomes is 1, allowed: 2 to 16"),
+        (17, "ideal", UsageError, "--outcomes is 17"),
+        (3, "dmd-spad", PlanError, r"dmd-spad tells 2 apart \(detector.photon_number_max\)"),
+    ],
+)
+def test_what_cannot_be_counted_is_refused(outcomes, name, error, words):
+    with pytest.raises(error, match=words):
+        check_automaton_options(replace(SMALL, outcomes=outcomes), bars_task(20), load_profile(name))
