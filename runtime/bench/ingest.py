@@ -22,7 +22,7 @@ from pans.runtime.core.plan import NO_SHOT, Plan
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
-from pans.runtime.instrument.dark_rate import DarkMonitor
+from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.record import Recorder
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.watch import resources_used

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import Decider
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, Finding
+from pans.runtime.instrument.channel_health import LEVELS, ChannelHealth, DarkMonitor, DarkReport, Finding
 from pans.runtime.instrument.cusum import FLOOR_RATE, Alarm, ChannelWatch, WatchSettings
-from pans.runtime.instrument.dark_rate import DarkMonitor, DarkReport
 from pans.runtime.instrument.dead_channels import DeadChannelTest, Silence
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, ClickBlock, FrameBlock

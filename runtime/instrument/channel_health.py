@@ -1,8 +1,8 @@
 """What is wrong with the detector, in plain words: hot and silent channels, light leaks, drift, told apart from the watch's alarms.
 
-Owns the naming of causes, their levels, and which state lasts; never counts clicks (cusum.py) and never acts
-(dark_guard.py). `ChannelHealth.take` turns alarms into `Finding`s: one when a state begins and one when it ends, however often
-a test passes its threshold meanwhile.
+Owns the naming of causes, their levels, which state lasts, and the dark rate of a whole run beside the profile's (`DarkMonitor`); never
+counts clicks (cusum.py) and never acts (dark_guard.py). `ChannelHealth.take` turns alarms into `Finding`s: one when a state begins
+and one when it ends, however often a test passes its threshold meanwhile.
 
 Told apart by who is concerned and how strongly: one channel with most of the excess is *hot*; all of them at once, five times
 or more, is a *burst* (a light leak); all of them by less is a *drift*; fewer clicks than expected is *quiet* (none at all:
@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.intervals import wilson_interval
+from pans.runtime.intervals import binomial_tail, wilson_interval
 
 from .cusum import ALL_CHANNELS, Alarm, ChannelWatch
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
+ALARM_PROBABILITY = 1e-6  # of seeing this many dark clicks or more, if the profile's dark rate were right
 BURST_RATIO = 5.0  # of the present to the expected rate, from which an excess is an alarm, and of all channels a burst
 WARNING_RATIO = 1.5  # the least ratio that a test looks for (WatchSettings.drift_ratio)
 MOST = 0.5  # of the excess: a channel with more of it is the cause
@@ -227,3 +228,43 @@ def _words(
         f"{_who(channels, n_channels)} {ratio:.3g} times as often as expected in the dark ({rate:.3g} per exposure, "
         f"expected {expected:.3g}) for about {length} dark exposures: {causes[kind]}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class DarkReport:
+    """Clicks in dark exposures: the estimate per exposure with its 95 % Wilson interval, beside what the profile says."""
+
+    exposures: int
+    clicks: int
+    per_exposure: float
+    low: float
+    high: float
+    expected: float
+    alarm: str
+    policy: str = "warn"
+    findings: tuple[
+        dict[str, Any], ...
+    ] = ()  # states of the detector that began or ended (channel_health.py), in order
+    present: tuple[str, ...] = ()  # those that last, in words
+    channels: tuple[
+        dict[str, float], ...
+    ] = ()  # exposures, clicks, rate and its interval by channel, where a guard watched
+
+
+class DarkMonitor:
+    """Compares tallied dark clicks with the click probability `expected` of a dark exposure."""
+
+    def __init__(self, expected: float) -> None:
+        self.expected = expected
+
+    def report(self, exposures: int, clicks: int) -> DarkReport:
+        """Return the estimate, its interval and, where the counts contradict the profile, the alarm's sentence ("" if none)."""
+        low, high = wilson_interval(clicks, exposures)
+        rate = clicks / exposures if exposures else 0.0
+        alarm = ""
+        if exposures and binomial_tail(clicks, exposures, self.expected) < ALARM_PROBABILITY:
+            alarm = (
+                f"{clicks} clicks in {exposures} dark exposures, expected are {self.expected * exposures:.3g}: "
+                "look for stray light, a warm detector or a wrong threshold"
+            )
+        return DarkReport(exposures, clicks, rate, low, high, self.expected, alarm)

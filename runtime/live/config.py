@@ -16,7 +16,7 @@ from pans.runtime.instrument.calibration import MAX_AGE_H
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pans.runtime.instrument.dark_rate import DarkReport
+    from pans.runtime.instrument.channel_health import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
 
     from .tally import RunTally

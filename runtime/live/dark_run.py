@@ -23,8 +23,8 @@ from pans.runtime.instrument.calibration import (
     load_calibration,
     now_utc,
 )
+from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.instrument.click_law import click_law, click_probability
-from pans.runtime.instrument.dark_rate import DarkReport
 from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import binomial_tail

@@ -24,8 +24,8 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, LATE_SLOTS, WRONG_PATTERNS
 from pans.runtime.errors import DeviceError, LinkError, RecordingError, UsageError
+from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.instrument.click_law import click_law, click_probability
-from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link, link_facts
 from pans.runtime.link.connection import Connection, check_device

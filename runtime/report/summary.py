@@ -11,7 +11,7 @@ from typing import Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
-from pans.runtime.instrument.dark_rate import DarkReport
+from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.live import RunResult
 from pans.runtime.live.continuous import DISK_NEARLY_FULL
 from pans.runtime.live.dark_run import DarkFigures

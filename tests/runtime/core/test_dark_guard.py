@@ -31,9 +31,8 @@ from pans.runtime.core.dark_tables import (
     word_prior,
 )
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.channel_health import ChannelHealth, Finding
+from pans.runtime.instrument.channel_health import ChannelHealth, DarkMonitor, Finding
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
-from pans.runtime.instrument.dark_rate import DarkMonitor
 from pans.runtime.wire.messages import ClickBlock
 
 N = 8

@@ -8,7 +8,7 @@ from math import comb
 import mpmath
 import pytest
 
-from pans.runtime.instrument.dark_rate import DarkMonitor
+from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.intervals import binomial_tail, wilson_interval
 
 

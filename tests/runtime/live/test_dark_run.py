@@ -9,7 +9,7 @@ import pytest
 from pans.firmware_sim.resealed.uses import small_calibration
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.instrument.calibration import load_calibration
-from pans.runtime.instrument.dark_rate import DarkReport
+from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.live.dark_run import DarkRun
 
 
