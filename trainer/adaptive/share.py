@@ -15,7 +15,7 @@ from torch import Tensor
 from .light import BRIGHTNESS_MIN, Bits
 from .machine import Machine, Sight
 from .objects import Block
-from .outcomes import no_click
+from .outcomes import readings
 from .reroute import Sweep
 
 ROUNDS = 12  # of k-means
@@ -178,7 +178,7 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
         bright = _brightness(seen @ alpha, before[state], pool.factors).clamp(light.bottom, light.top)
         lights = seen.unsqueeze(1) * bright.unsqueeze(2)  # (candidates, factors, objects)
         sent = GLARE * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
-        dark, _ = no_click(lights, sweep.sight.law)
+        dark = readings(lights, sweep.sight.law)[0][0]
         costs = dark @ (alpha * gains[state, some]) + price * (lights @ alpha + sent)
         best = int(costs.argmin())
         if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE * alpha.sum():

@@ -189,7 +189,9 @@ def _sampled(
     return sums[0], sums[1], sums[2], sums[3], leaves / trials
 
 
-def _drawn(law: ClickLaw | CountLaw, light: F64, again: F64, rng: np.random.Generator) -> NDArray[np.int64]:
+def _drawn(
+    law: ClickLaw | CountLaw, light: F64, again: NDArray[np.floating[Any]], rng: np.random.Generator
+) -> NDArray[np.int64]:
     """Draw the outcome of each exposure (n,); `again` is the chance of a click that only the one before it causes."""
     if isinstance(law, CountLaw):
         passed = rng.random(light.size) >= np.cumsum(count_chances(law, light)[:-1], axis=0)
