@@ -139,6 +139,7 @@ class _RoundTrip:
         connection.decoder.use_kernels()
         self._core = _NotingCore(plan, make_decider(bundle), 1, 0)
         self._core.warm_up()
+        self._core.warm_up_steps()
         self._run = LiveRun(connection, plan, self._core, len(bundle.classes), RunConfig(deadline_us=1e9), None, 0)
         session = connection.session
         start = clock.to_tick(link.now_ns() + 50_000_000)

@@ -180,6 +180,7 @@ def _step_row(plan: Plan, decider: Decider, frames: list[bytes], wanted: NDArray
     """A whole object's block at a time through `Core.step_messages`, as the live loop calls it; wall time of each call."""
     core, decoder = Core(plan, decider, 1, 0), BulkDecoder()
     core.warm_up()
+    core.warm_up_steps()
     core.begin(0, 0)
     times: list[int] = []
     found: list[Any] = []

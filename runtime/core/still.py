@@ -55,9 +55,17 @@ class Core(Follower):
         if self.guard is None or self.guard.policy == "warn":
             rows = rows_needed(self.windows.n_windows)
             steps = self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, rows)
-            steps.warm_up()
             ordinary = steps.decides and not self.windows.parallel  # others decide one by one, as `step` does
             self._steps = steps if ordinary else None
+
+    def warm_up_steps(self) -> None:
+        """Compile or load what `step_messages` needs to take a block in one call, where that can be; else it is asked for none."""
+        if self._steps is not None:
+            self._steps.warm_up()
+
+    def leave_steps(self) -> None:
+        """Ordinary messages are taken elsewhere, by `bulk_steps`: `step_messages` takes what is left one by one."""
+        self._steps = None
 
     @property
     def compiles(self) -> bool:

@@ -115,7 +115,7 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     marks.objects[slot] = number
     marks.truths[slot] = np.int16(stream.mark_truth(buffer, payload))
     stream.mark_photons(buffer, payload, marks.photons, slot)
-    stream.go_on(state, 0)
+    stream.go_on(state, np.int64(0))
     return True
 
 
@@ -244,7 +244,7 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
     n_rows, done = state[N_ROWS], block.frames
     at = block.at + _U(state[FRAME]) * block.word_bytes
     for i in range(state[FRAME], block.frames):
-        here, clicks, index, crc = np.int64(window_at[block.relative + i]), 0, 0, crc_zero
+        here, clicks, index, crc = np.int64(window_at[block.relative + i]), np.int64(0), np.int64(0), crc_zero
         for p in range(n_lanes):
             byte = np.int64(buffer[at + _U(p)]) & (block.top_mask if p == n_lanes - 1 else 0xFF)
             clicks += ONES[byte]
@@ -275,7 +275,7 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
     n_features, n_lanes, crc_zero, shots = counts.shape[1], lanes.size, tables.crc_zero[0], state[SHOTS]
     n_rows, done = state[N_ROWS], block.frames
     at = block.at + _U(state[FRAME]) * block.word_bytes
-    window, held = np.int64(-1), 0  # `held` frames of `window` are in the lanes
+    window, held = np.int64(-1), np.int64(0)  # `held` frames of `window` are in the lanes
     for i in range(state[FRAME], block.frames):
         here = np.int64(window_at[block.relative + i])
         if here < 0:
@@ -294,10 +294,10 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
         if block.relative + i != last[here]:
             if held == 255:
                 spill(lanes, counts, seen, here, held)
-                held = 0
+                held = np.int64(0)
             continue
         complete(lanes, counts, seen, here, held, whole)
-        held = 0
+        held = np.int64(0)
         clicks, index, crc = sum_up(whole, radix, crc_table, crc_zero)
         label, probability, flags = np.int64(_NO_LABEL), np.float32(0.0), 0
         if seen[here, 0] != shots * n_features:
@@ -305,7 +305,7 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
         elif labels.size:
             label, probability, flags = _look_up(labels, probabilities, index)
         else:
-            counts_out[n_rows] = whole
+            _keep_counts(counts_out, np.int64(n_rows), whole)
         _put_row(rows[n_rows], state, block, i, here * shots, (clicks, label, flags, probability, crc))
         n_rows += 1
         state[NEXT_WINDOW] = here + 1
@@ -315,6 +315,13 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
     if held:
         spill(lanes, counts, seen, window, held)
     state[N_ROWS], state[FRAME] = n_rows, done
+
+
+@njit(cache=True, nogil=True)
+def _keep_counts(counts_out, row, counts):  # type: ignore[no-untyped-def]
+    """Keep the clicks of a window for the back end."""
+    for feature in range(counts.size):
+        counts_out[row, feature] = counts[feature]
 
 
 @njit(cache=True, nogil=True)
@@ -336,7 +343,7 @@ def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no
             row = windows.walks.nodes[index] - n_states if n_states else row
             label, probability, flags = _look_up(tables.labels, tables.probabilities, row)
         elif flags == 0:
-            counts_out[state[N_ROWS]] = counts[index]
+            _keep_counts(counts_out, state[N_ROWS], counts[index])
         decided = (clicks, label, flags, probability, crc)
         here = rows[state[N_ROWS]]
         _put_row(here, state, block, last[index] - block.relative, index * state[SHOTS], decided)

@@ -159,10 +159,11 @@ class ChannelWatch:
         self.exposures += dark_exposures
         return self._alarms(int(n))
 
-    def warm_up(self) -> None:
-        """Compile or load the kernels, without counting anything."""
+    def warm_up(self, *, counts: bool = False) -> None:
+        """Compile or load the kernels, with `counts` that of `update` too; nothing is counted."""
         self.update_words(np.zeros((0, 1), np.uint8))
-        self.update(0, np.zeros(self.n_channels, np.int64))
+        if counts:
+            self.update(0, np.zeros(self.n_channels, np.int64))
 
     def restart(self) -> None:
         """Begin every test from 0: what their sums hold belongs to a state that is over."""

@@ -99,7 +99,10 @@ def run_live(
             block_us = plan.cycle_us * min(plan.block_exposures / plan.slots_per_cycle, 1.0)
             spare = not link.virtual and block_us >= SETTLED_WITHIN_US
             run.compiled = CompiledTurns(run, core, prompt=spare or (observers.acts and observers.watch is not None))
+            core.leave_steps()
             run.compiled.attach()  # before the heap is touched: loading kernels takes memory
+        elif isinstance(core, Core):
+            core.warm_up_steps()
         reader = connection.reader.thread_id
         wanted = config.realtime and not link.virtual
         with (

@@ -54,8 +54,8 @@ def compile_core() -> None:
 
 
 def compile_still() -> None:
-    """The back ends of fixed patterns."""
-    _compile_steps(STILL, STILL_PROFILE)
+    """The back ends of fixed patterns, and the steps of Python's turn."""
+    _compile_steps(STILL, STILL_PROFILE).warm_up_steps()
 
 
 def _compile_steps(name: str, profile: str) -> Core:
@@ -102,8 +102,10 @@ def compile_flow() -> None:
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
     from pans.runtime.flow.settings import read_flow
+    from pans.runtime.instrument.cusum import ChannelWatch
     from pans.runtime.instrument.profile import load_profile
 
+    ChannelWatch(1, np.full(1, 0.01)).warm_up(counts=True)
     profile = load_profile("flow-snspd")
     levels = np.zeros((4, 64), np.uint16)
     levels[:, 0] = profile.projector.levels - 1

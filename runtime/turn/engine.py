@@ -56,13 +56,13 @@ class Turn:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
 
     def __init__(self, steps: BulkSteps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
-        from .kernels import feed, turn  # numba is loaded only by who decides in bulk
+        from .kernels import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
         self.rings: Rings = make_rings()
         self.counts = _NOTHING
-        self._kernel, self._feed = turn, feed
-        self._fed: tuple[U8, I64] = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
+        self._kernel = turn
+        self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
         self.control[ring.FD] = -1
@@ -75,7 +75,6 @@ class Turn:
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming; nothing is read and nothing changes."""
         self.run()
-        self.feed(*self._fed)
 
     def drives(self, drive: Drive) -> None:
         """Name the states of walks by `drive` from here on."""
@@ -83,8 +82,12 @@ class Turn:
 
     def run(self, fd: int = -1, limits: Limits = NO_LIMITS) -> int:
         """Take what is decoded, then read from `fd` (-1: nothing) until `limits`; return why it ended (rings.WHY)."""
+        return self._call(self._nothing, fd, limits)
+
+    def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits) -> int:
         self._prepare(fd, limits)
-        return self._done(self._kernel(self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch))
+        ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
+        return self._done(ended)
 
     def _prepare(self, fd: int, limits: Limits) -> None:
         control, steps = self.control, self.steps
@@ -112,10 +115,7 @@ class Turn:
 
     def feed_on(self) -> int:
         """Go on with what `feed` was given."""
-        self._prepare(-1, NO_LIMITS)
-        return self._done(
-            self._feed(*self._fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        )
+        return self._call(self._fed, -1, NO_LIMITS)
 
     def decoded(self, n_bodies: int, arrival_ns: int) -> int:
         """Take the bodies that the decoder has found in what it was given last."""

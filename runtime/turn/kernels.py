@@ -28,19 +28,47 @@ _U = np.uint64
 
 
 @njit(cache=True, nogil=True)
-def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
+def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
 
     decoder Decoder, walk WalkArrays, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). The rings are filled from
-    their beginning.
+    their beginning. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64 (n, 2) are their bytes and the
+    times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins; ALL_TAKEN behind the
+    last one.
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
-    control, scratch = bare(control), bare(scratch)
+    fed, reads, control, scratch = bare(fed), bare(reads), bare(control), bare(scratch)
     _begin(walk, control)
-    ended = take_bodies(decoder, walk, drive, rings, control, scratch)
-    if ended != ring.ALL_TAKEN or not control[ring.READS]:
-        return ended
-    began_ns = now_ns(scratch)
+    began_ns, shows = (
+        np.int64(-1),
+        np.int64(-1),
+    )  # before the first read: neither the clock nor what was shown is looked at
+    while True:
+        ended = take_bodies(decoder, walk, drive, rings, control, scratch)
+        if ended == ring.ALL_TAKEN and reads.shape[0]:
+            if control[ring.NEXT_READ] == reads.shape[0]:
+                return ended
+            if control[ring.N_ARRIVALS] == rings.arrivals.size:
+                return ring.FULL
+            _next_read(fed, reads, decoder, control)
+        elif ended != ring.ALL_TAKEN or not control[ring.READS]:
+            return ended
+        else:
+            if began_ns < 0:
+                began_ns = now_ns(scratch)
+            elif control[ring.N_SHOWS] > shows and now_ns(scratch) >= control[ring.DUE_NS]:
+                return ring.DUE
+            shows = control[ring.N_SHOWS]
+            ended = _await_bytes(decoder, rings, control, began_ns, scratch)
+            if ended != ring.ALL_TAKEN:
+                return ended
+        rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
+        control[ring.N_ARRIVALS] += 1
+
+
+@njit(cache=True, nogil=True)
+def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no-untyped-def]
+    """Read as soon as something is there; ALL_TAKEN when it is decoded, or why the call ends."""
     quiet_ns = QUIET_NS if control[ring.DRIVES] else 0  # the caller's work fits into the exposure behind a SHOW
     while True:
         now = now_ns(scratch)
@@ -55,7 +83,7 @@ def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-unty
             return ring.FULL
         awake = now < began_ns + control[ring.EAGER_NS]
         if not awake:
-            ready = wait_for(control[ring.FD], due - now, False, scratch)
+            ready = wait_for(control[ring.FD], due - now, np.bool_(False), scratch)
             _note_wait(rings.notes, control, now, due, now_ns(scratch))
             if ready < 0:
                 return _failed(control, ready)
@@ -64,48 +92,25 @@ def turn(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-unty
             if ready == 0:
                 continue
         found = _read(decoder, control, scratch)
-        if found < 0 or (found == 0 and not awake):
+        if found > 0:
+            return ring.ALL_TAKEN
+        if found < 0 or not awake:
             if found == -AGAIN:
                 continue
             return _failed(control, found)
-        if found == 0:
-            continue  # a terminal says so when nothing is there
-        rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
-        control[ring.N_ARRIVALS] += 1
-        shows = control[ring.N_SHOWS]
-        ended = take_bodies(decoder, walk, drive, rings, control, scratch)
-        if ended != ring.ALL_TAKEN:
-            return ended
-        if control[ring.N_SHOWS] > shows and now_ns(scratch) >= control[ring.DUE_NS]:
-            return ring.DUE
+        # a terminal says so when nothing is there
 
 
 @njit(cache=True, nogil=True)
-def feed(data, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
-    """Take what was read elsewhere, `data` uint8, read by read: `reads` int64 (n, 2) are their bytes and the times of their arrival.
-
-    control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins. Returns why it ended, as `turn`; ALL_TAKEN
-    behind the last one. The rings are filled from their beginning.
-    """
-    decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
-    data, reads, control, scratch = bare(data), bare(reads), bare(control), bare(scratch)
-    _begin(walk, control)
-    while True:
-        ended = take_bodies(decoder, walk, drive, rings, control, scratch)
-        if ended != ring.ALL_TAKEN or control[ring.NEXT_READ] == reads.shape[0]:
-            return ended
-        if control[ring.N_ARRIVALS] == rings.arrivals.size:
-            return ring.FULL
-        size = reads[control[ring.NEXT_READ], 0]
-        control[ring.ARRIVAL_NS] = reads[control[ring.NEXT_READ], 1]
-        control[ring.NEXT_READ] += 1
-        held = _make_room(decoder)
-        at = control[ring.READ_AT]
-        wire.copy_span(data, _U(at), _U(at + size), decoder.buffer, _U(held))
-        control[ring.READ_AT] += size
-        _decode(decoder, control, held, size)
-        rings.arrivals[control[ring.N_ARRIVALS]] = control[ring.ARRIVAL_NS]
-        control[ring.N_ARRIVALS] += 1
+def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
+    """Decode the next of the reads that were made elsewhere."""
+    size, at = reads[control[ring.NEXT_READ], 0], control[ring.READ_AT]
+    control[ring.ARRIVAL_NS] = reads[control[ring.NEXT_READ], 1]
+    control[ring.NEXT_READ] += 1
+    held = _make_room(decoder)
+    wire.copy_span(fed, _U(at), _U(at + size), decoder.buffer, _U(held))
+    control[ring.READ_AT] += size
+    _decode(decoder, control, held, size)
 
 
 @njit(cache=True, nogil=True)

@@ -59,7 +59,7 @@ def put_show(drive, number, exposure, state, out, at):  # type: ignore[no-untype
     for i in range(tail):
         plain[TAIL_AT + i] = drive.tails[state, i]
     size = TAIL_AT + tail
-    crc = np.int64(crc32_span(plain, 0, size, SCHEMA))
+    crc = np.int64(crc32_span(plain, _U(0), _U(size), np.int64(SCHEMA)))
     for i in range(4):
         plain[size + i] = np.uint8(crc >> 8 * i & 0xFF)
     code_at, code = at, 1
@@ -112,7 +112,9 @@ def _send(control, data, begin, end, scratch):  # type: ignore[no-untyped-def]
             continue
         if taken == -INTERRUPTED:
             continue
-        if (taken == 0 or taken == -AGAIN) and wait_for(control[ring.FD], WRITE_WAIT_NS, True, scratch) > 0:
+        if (taken == 0 or taken == -AGAIN) and wait_for(
+            control[ring.FD], np.int64(WRITE_WAIT_NS), np.bool_(True), scratch
+        ) > 0:
             continue
         control[ring.UNSENT], control[ring.ERRNO] = end - begin, -taken
         return False

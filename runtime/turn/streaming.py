@@ -56,7 +56,6 @@ class StreamCore:
         """Compile or load every kernel of the path, before arming."""
         self.decoder.warm_up()
         self.core.windows.warm_up()
-        self._steps.warm_up()
         self.turn.warm_up()
         self._steps.begin(self._session)
 

@@ -1,6 +1,6 @@
-"""Arrays and tuples of arrays inside a kernel without a count of references.
+"""What kernels need and numba has not: arrays without a count of references, a float32 from its bits.
 
-Owns one intrinsic. A kernel that takes an array out of a tuple counts a reference, and again when it lets go: two locked additions each
+Owns two intrinsics. A kernel that takes an array out of a tuple counts a reference, and again when it lets go: two locked additions each
 time, which for a block of one exposure added up to most of its time. A bare array owns nothing and counts nothing; its memory must
 outlive the call, as the arguments of a call do.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -19,6 +20,10 @@ if numba.config.DISABLE_JIT:
     def bare(value: Any) -> Any:
         """Return `value`."""
         return value
+
+    def as_float32(bits: Any) -> Any:
+        """Return the float32 whose bits are the low 32 of `bits`."""
+        return np.uint32(bits).view(np.float32)
 
 else:
 
@@ -30,6 +35,16 @@ else:
             return _stripped(context, builder, signature.args[0], arguments[0])
 
         return value(value), code
+
+    @intrinsic
+    def as_float32(typing_context, bits):  # type: ignore[no-untyped-def]
+        """The float32 whose bits are the low 32 of `bits`, uint64; a view of an array takes numba seconds to compile."""
+
+        def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            low = builder.trunc(arguments[0], context.get_value_type(types.uint32))
+            return builder.bitcast(low, context.get_value_type(types.float32))
+
+        return types.float32(types.uint64), code
 
 
 def _stripped(context: Any, builder: Any, kind: Any, value: Any) -> Any:

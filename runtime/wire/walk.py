@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from .bare import as_float32
 from .kernels import load4, load8
 from .schema import BLOCK_HEADER_BYTES, HEADER, STRUCTS, MessageType
 from .tracker import MAX_GAP_EXPOSURES
@@ -117,7 +118,7 @@ def block_times(buffer, payload):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def mark_photons(buffer, payload, photons, place):  # type: ignore[no-untyped-def]
     """Put a MARK's photons into `photons` float32 at `place`, bit for bit."""
-    photons[place : place + 1].view(np.uint32)[0] = np.uint32(load4(buffer, payload + _U(28)))
+    photons[place] = as_float32(load4(buffer, payload + _U(28)))
 
 
 @njit(cache=True, nogil=True)
