@@ -55,7 +55,7 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
             return ended
         else:
             if began_ns < 0:
-                began_ns = now_ns(scratch)
+                began_ns = np.int64(now_ns(scratch))
             elif control[ring.N_SHOWS] > shows and now_ns(scratch) >= control[ring.DUE_NS]:
                 return ring.DUE
             shows = control[ring.N_SHOWS]
