@@ -74,6 +74,10 @@ def _run(args: argparse.Namespace) -> int:
     if args.resume and not checkpoint.is_file():
         raise UsageError(f"{checkpoint}: there is no checkpoint", remedy="leave --resume out")
     replaces = args.force or args.resume
+    if checkpoint.exists() and not replaces:
+        raise UsageError(
+            f"{checkpoint}: a tuning was begun here", remedy="go on with --resume, or begin anew with --force"
+        )
     check_outputs([args.out, checkpoint], inputs=[path, args.labels], force=replaces)
     from pans.runtime.instrument.profile import load_profile
     from pans.runtime.live.continuous import stop_signals

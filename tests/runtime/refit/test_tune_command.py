@@ -43,6 +43,7 @@ def test_a_budget_ends_it_whole_and_it_can_be_resumed(
     assert told["from_bundle_sha256"] == load_bundle(BUNDLE)[1]
     kept = json.loads((tmp_path / "tuned.pans.tune.json").read_text())
     assert len(kept["trials"]) == 3
+    assert "a tuning was begun here" in tune(capsys, device, out, code=2)["error"]["message"]
     again = tune(capsys, device, out, "--objects", 100, "--photons", 26_000, "--resume")
     assert again["trials"] == 4
     assert json.loads((tmp_path / "tuned.pans.tune.json").read_text())["trials"][:3] == kept["trials"]
