@@ -89,7 +89,8 @@ class ActiveIllumination(nn.Module):
         """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""
         patterns = self.patterns()
         if transmission.shape[1] > patterns.shape[1]:
-            full = patterns.max() if self.levels is None else self.top()
+            # a full pixel of the shortest exposure may be brighter than any that the patterns need; dark ones leak a part of it
+            full = patterns.max().clamp(min=self.top_limits[0]) if self.levels is None else self.top()
             patterns = torch.cat([patterns, full.expand(len(patterns), 1)], dim=1)
         photoelectrons: Tensor = (1 - floor) * (transmission @ patterns.T) + floor * patterns.sum(dim=1)
         return photoelectrons

@@ -24,15 +24,16 @@ def test_the_light_of_patterns_is_that_of_the_runtimes_model():
     np.testing.assert_allclose(light.numpy(), wanted.T, rtol=1e-12)
 
 
-def test_an_encoder_lights_dark_pixels_by_its_brightest_level():
+@pytest.mark.parametrize("low", [0.01, 1.5])
+def test_an_encoder_lights_dark_pixels_by_its_brightest_level(low):
     random = torch.Generator().manual_seed(0)
-    encoder = ActiveIllumination(3, 42, (0.01, 2.0), random)
+    encoder = ActiveIllumination(3, 42, (low, 2.0), random)
     objects = torch.rand((4, 42), generator=random, dtype=torch.float64)
     for levels in (None, 16):
         if levels:
             encoder.start_quantising(levels)
         patterns = encoder.patterns().detach().double()
-        full = float(patterns.max() if levels is None else encoder.top().detach())
+        full = float(max(patterns.max(), low) if levels is None else encoder.top().detach())
         wanted = objects.numpy() @ met(TABLE, patterns.numpy(), SHAPE, full).T
         found = encoder(through(TABLE, objects, SHAPE).float()).detach().numpy()
         np.testing.assert_allclose(found, wanted, rtol=1e-5)
