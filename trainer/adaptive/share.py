@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .grow import sum_of
 from .light import BRIGHTNESS_MIN, Bits
 from .machine import Machine, Sight
 from .objects import Block
@@ -25,6 +26,7 @@ ROWS_AT_ONCE = 1024  # patterns that are compared with all others
 NUMBERS_MAX = 1 << 27  # objects times patterns, of which the light is kept: 512 MiB
 HARDLY = 1e-3  # chance to reach a state, below which an object is left out of that state's choice
 GLARE = 1e-3  # of the price of a detected photoelectron, what one sent out costs: else a bright spot where hardly anything is would do
+GLARE_MIN = 1e-5  # nats, where detected light is cheap: with 2e-7 a budget of 40 photons took four times the illumination of free patterns
 SURE = 1e-4  # of a state's cost, by which another pattern must be better
 
 
@@ -127,7 +129,7 @@ def choose_patterns(
     """
     lights = [level.light for level in machine.levels]
     pooled = [light for light in lights if isinstance(light, Bits) and light.rows is not None]
-    if len(pooled) < len(lights) or len(machine.levels[0].successors) > 2:  # no click, click
+    if len(pooled) < len(lights):
         return 0
     blocks = blocks[: max(1, NUMBERS_MAX // (len(blocks[0]) * len(pooled[0].lean)))]
     with torch.no_grad():
@@ -167,7 +169,9 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
     """Choose for all states of one level, reached with `alphas` (states, objects); returns how many changed."""
     assert light.rows is not None
     to = sweep.machine.levels[number].successors
-    gains = torch.cat([beta[to[0]] - beta[to[1]] for beta in sweep.betas], dim=1)  # what no click costs more
+    rest = [beta[to[-1]] for beta in sweep.betas]  # below: what each other outcome costs more than the last
+    gains = [torch.cat([beta[one] - last for beta, last in zip(sweep.betas, rest)], dim=1) for one in to[:-1]]
+    glare = max(GLARE * price, GLARE_MIN)
     changed, before = 0, light.scale().flatten().clone()
     for state in range(len(light.rows)):
         some = (alphas[state] > HARDLY).nonzero().flatten()
@@ -177,9 +181,10 @@ def _choose(light: Bits, number: int, sweep: Sweep, alphas: Tensor, pool: _Pool,
         seen, alpha = pool.light[candidates][:, some], alphas[state, some]
         bright = _brightness(seen @ alpha, before[state], pool.factors).clamp(light.bottom, light.top)
         lights = seen.unsqueeze(1) * bright.unsqueeze(2)  # (candidates, factors, objects)
-        sent = GLARE * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
-        dark = readings(lights, sweep.sight.law)[0][0]
-        costs = dark @ (alpha * gains[state, some]) + price * (lights @ alpha + sent)
+        sent = glare * pool.lit[candidates].unsqueeze(1) * bright * alpha.sum()
+        chances, _ = readings(lights, sweep.sight.law)
+        told = sum_of(chance @ (alpha * gain[state, some]) for chance, gain in zip(chances, gains))
+        costs = told + price * (lights @ alpha) + sent
         best = int(costs.argmin())
         if costs.flatten()[best] < costs[0, len(pool.factors) // 2] - SURE * alpha.sum():
             light.rows[state] = candidates[best // len(pool.factors)]

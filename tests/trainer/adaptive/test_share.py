@@ -142,6 +142,22 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
         assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE * float(alpha.sum())
 
 
+def test_light_sent_out_costs_even_where_light_detected_does_not(shared, monkeypatch):
+    machine, sight, blocks = shared
+    start = [(level.light.rows.clone(), level.light.log_light.clone()) for level in machine.levels]
+    lean = machine.levels[0].light.lean.clone()
+    sent = []
+    for glare in (0.0, 1e-5, 1e-2):
+        monkeypatch.setattr(module, "GLARE_MIN", glare)
+        for level, (rows, log_light) in zip(machine.levels, start):
+            level.light.rows.copy_(rows)
+            level.light.log_light.copy_(log_light)
+        machine.levels[0].light.lean.copy_(lean)
+        choose_patterns(machine, sight, blocks, 0.0)
+        sent.append(figures(machine, sight, blocks).illumination)
+    assert sent[0] >= sent[1] > 1.2 * sent[2] > 0
+
+
 def test_the_nearest_are_those_of_the_largest_cosine_and_itself_is_first(monkeypatch):
     monkeypatch.setattr(module, "ROWS_AT_ONCE", 3)
     masks = (torch.rand(8, 30, generator=torch.Generator().manual_seed(2)) < 0.4).float()
