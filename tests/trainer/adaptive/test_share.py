@@ -1,6 +1,8 @@
 """States that share patterns: the grouping, the light it keeps, and the gradient of the pool."""
 
 # ruff: noqa: E402  (what follows needs torch)
+from dataclasses import replace
+
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
@@ -8,6 +10,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from trainings import bars_task, random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.count_law import CountLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import share as module
 from pans.trainer.adaptive.figures import figures, masses, mean_objects
@@ -92,8 +95,12 @@ def test_a_group_of_patterns_that_differ_keeps_many_pixels_lit():
 @pytest.fixture
 def shared():
     objects = TrainingObjects(bars_task(), load_profile("ideal"), 0, Augmentation())
-    blocks = objects.epoch(0, 200, torch.float32)
-    sight = Sight(ClickLaw(), objects.gain)
+    blocks, sight = objects.epoch(0, 200, torch.float32), Sight(ClickLaw(), objects.gain)
+    return *grown_and_shared(blocks, sight), blocks
+
+
+def grown_and_shared(blocks, sight):
+    """A machine whose states share six patterns, before they have chosen."""
     with torch.no_grad():
         growth = Growth(blocks, sight, GrowOptions(states=8), torch.Generator().manual_seed(0))
         for _ in range(5):
@@ -103,7 +110,7 @@ def shared():
         for level, mean in zip(machine.levels, means):
             level.light = as_bits(level.light.shown()[0], mean)
         share_patterns(machine, 6, masses(machine, sight, blocks), means, torch.Generator().manual_seed(0))
-    return machine, sight, blocks
+    return machine, sight
 
 
 def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
@@ -140,6 +147,21 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
         now = of(seen[level.light.rows[state]] * level.light.scale()[state])
         dearest = float((alpha * torch.maximum(quiet, click)).sum())
         assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE * float(alpha.sum())
+
+
+def test_states_of_three_outcomes_choose_too(shared):
+    _, click_sight, blocks = shared
+    sight = replace(click_sight, law=CountLaw(0.0, 0.0, (0.5, 1.5)))
+    machine, _ = grown_and_shared(blocks, sight)
+    for level in machine.levels:
+        assert len(level.successors) == 3
+        level.light.rows.zero_()
+    costs = []
+    for _ in range(3):
+        found = figures(machine, sight, blocks)
+        costs.append(found.loss + PRICE * found.photons)
+        assert choose_patterns(machine, sight, blocks, PRICE) > 0
+    assert costs[0] - 0.05 > costs[1] > costs[2] - 2e-3
 
 
 def test_light_sent_out_costs_even_where_light_detected_does_not(shared, monkeypatch):
