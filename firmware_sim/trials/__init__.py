@@ -60,6 +60,7 @@ TRIALS: Mapping[str, TrialEntry] = {
     "pace": TrialEntry(
         ".pace", "real pace: objects at 1000/s, the demo beside a busy core, automata to 100 kHz", "15 min"
     ),
+    "registration": TrialEntry(".registration", "many simulated optical tables against their truths", "5 min"),
     "soak": TrialEntry(".soak", "half an hour of real time with faults on, watched from outside", "30 min"),
 }
 

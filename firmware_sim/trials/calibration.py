@@ -78,11 +78,17 @@ def calibrate_one(profile: Profile, seconds: float, seed: int) -> Outcome:
     return Outcome(level, found, dark, dark_interval)
 
 
-def simulate(truth: Profile, design: Design, seed: int) -> CalibrationCore:
-    """Draw all exposures of `design` on the instrument `truth` and let the runtime's core count them."""
+def simulate(
+    truth: Profile, design: Design, seed: int, light: NDArray[np.float64] | None = None
+) -> CalibrationCore:
+    """Draw all exposures of `design` on the instrument `truth` and let the runtime's core count them.
+
+    `light` are the photoelectrons (patterns,) of an exposure; without it a clear field stands before the detector.
+    """
     plan, core = design.plan, CalibrationCore(design.plan, design.n_cycles)
     model = detector_model(truth, plan.exposure_us)
-    light = np.append(design.drives, 0.0) * profile_level(truth, plan.exposure_us)
+    light = design.drives * profile_level(truth, plan.exposure_us) if light is None else light
+    light = np.append(light, 0.0)
     probability = first_click_probability(model, light)
     lit_and_dark = np.stack([probability[:-1], np.full(len(light) - 1, probability[-1])])
     rows = lit_and_dark if core.parallel else probability[:, None]

@@ -72,13 +72,22 @@ def design_run(profile: Profile, targets: Sequence[float], level: float, seconds
 
     PlanError when even one pixel at the lowest level is far too bright. `seed` chooses the lit pixels.
     """
-    exposure_us = calibration_exposure_us(profile)
     parallel = profile.mode == "parallel"
     n = profile.detector.channels if parallel else min(SEQUENTIAL_PATTERNS, profile.projector.pattern_memory)
     levels = _random_patterns(profile, np.resize(np.asarray(targets), n) / level, np.random.default_rng(seed))
     side = round(levels.shape[1] ** 0.5)
+    return design_of(profile, levels, (side, side), seconds)
+
+
+def design_of(profile: Profile, levels: NDArray[np.uint16], shape: tuple[int, int], seconds: float) -> Design:
+    """Lay out the patterns `levels` (n, pixels) of `shape` (rows, columns), dark slots between them, for `seconds` of instrument time.
+
+    PlanError when the profile cannot show them.
+    """
+    exposure_us = calibration_exposure_us(profile)
+    n = len(levels)
     bundle = Bundle(
-        name="calibration", task="calibration", classes=("light",), encoder="active", image_shape=(side, side),
+        name="calibration", task="calibration", classes=("light",), encoder="active", image_shape=shape,
         levels=profile.projector.levels, pattern_levels=levels, photons_per_level=profile_level(profile, exposure_us),
         head_onnx=None, table=None, golden_means=np.zeros((0, n), np.float32), golden_scores=np.zeros((0, 1), np.float32),
         provenance={},

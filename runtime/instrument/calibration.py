@@ -8,7 +8,6 @@ why a run must not use one."""
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -18,13 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import canonical_json, parse_json_object, read_file
-from pans.runtime.errors import ConfigError, DamagedFileError
+from pans.runtime.container import read_file
+from pans.runtime.errors import DamagedFileError
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, number_text
 
 from .click_law import ClickLaw, log_no_click
 from .profile import Profile
+from .sealed_json import check_made_for, sealed, unsealed
 
 FORMAT = "pans-calibration"
 VERSION = 1
@@ -103,9 +103,7 @@ def save_calibration(path: str | Path, values: Mapping[str, Any], *, force: bool
 
     UsageError if `path` exists, unless `force`.
     """
-    body = {"format": FORMAT, "version": VERSION, **values}
-    sealed = {**body, "sha256": hashlib.sha256(canonical_json(body)).hexdigest()}
-    data = (json.dumps(sealed, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+    data = sealed(values, FORMAT, VERSION)
     parse_calibration(data, str(path))
     write_file(path, data, force=force)
     return hashlib.sha256(data).hexdigest()
@@ -118,14 +116,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 def parse_calibration(data: bytes, where: str) -> Calibration:
     """Check the bytes of a calibration file; DamagedFileError names the first thing that cannot be."""
-    values = parse_json_object(data, where)
-    if values.get("format") != FORMAT or values.get("version") != VERSION:
-        found = f"{ascii(values.get('format'))[:40]} {ascii(values.get('version'))[:20]}"
-        raise DamagedFileError(f"{where}: format {found}, allowed: {FORMAT} {VERSION}")
-    body = {key: value for key, value in values.items() if key != "sha256"}
-    found = hashlib.sha256(canonical_json(body)).hexdigest()
-    if values.get("sha256") != found:
-        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
+    values = unsealed(data, where, FORMAT, VERSION)
     try:
         _check(values)
     except KeyError as error:
@@ -139,18 +130,7 @@ def find_objections(calibration: Calibration, profile: Profile, serial: str | No
     """Raise ConfigError if the calibration is of another profile or, where the device has told its serial number, another
     device.
     """
-    made_for = calibration.values["profile"]
-    if made_for["sha256"] != profile.sha256:
-        raise ConfigError(
-            f"{calibration.path}: made for the profile {made_for['name']} ({made_for['sha256'][:12]}…), this run uses {profile.name} "
-            f"({profile.sha256[:12]}…)",
-            remedy="calibrate with this profile: pans calibrate --profile " + profile.name,
-        )
-    of_device = calibration.values["device"].get("serial")
-    if serial is not None and of_device is not None and of_device != serial:
-        raise ConfigError(
-            f"{calibration.path}: made on the device {of_device}, this is {serial}", remedy="calibrate this device"
-        )
+    check_made_for(calibration.path, calibration.values, profile, serial, "pans calibrate")
 
 
 def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:

@@ -1,0 +1,174 @@
+"""The registration file: where the target stood, with intervals, when and how it was measured; beside the profile, never a rewrite of it.
+
+Owns the file (strict JSON with a checksum), its checks, and what a run takes from it. `load_registration` returns a `Registered` whose every
+figure is possible, or raises DamagedFileError; `check_usable` says why a run must not use one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.container import read_file
+from pans.runtime.errors import ConfigError, DamagedFileError
+from pans.runtime.imaging import Imaging
+from pans.runtime.instrument.calibration import MAX_AGE_H
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.instrument.sealed_json import check_made_for, sealed, unsealed
+from pans.runtime.outputs import write_file
+from pans.runtime.ranges import Range, demand, number_text
+
+from .estimate import Estimate
+from .parameters import DARK, PARAMETERS, Shape, Vector
+
+FORMAT, VERSION = "pans-registration", 1
+MAX_BYTES = 1 << 20
+SIDE = Range(1, 4096, whole=True)
+CLICKS = Range(1, 1 << 53, whole=True)
+FUTURE_H = 0.1  # by which clocks may differ
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """What one file says; `values` is everything in it, `sha256` that of its bytes."""
+
+    path: str
+    sha256: str
+    values: Mapping[str, Any]
+
+    @property
+    def made(self) -> datetime:
+        """When it was measured, UTC."""
+        return datetime.fromisoformat(self.values["made_utc"])
+
+    @property
+    def shape(self) -> Shape:
+        """Rows and columns of the grid."""
+        rows, columns = self.values["grid"]
+        return rows, columns
+
+    def imaging(self) -> Imaging:
+        """Return the measured table, with its flat field."""
+        return _imaging(self.values)
+
+    def applied_to(self, profile: Profile) -> Profile:
+        """Return the profile with the measured light, so that plans expose for what is there; unchanged where the interval holds 1."""
+        gain = self.values["parameters"]["gain"]
+        if gain["low"] <= 1.0 <= gain["high"]:
+            return profile
+        peak = profile.projector.peak_photoelectrons_hz * gain["value"]
+        return replace(profile, projector=replace(profile.projector, peak_photoelectrons_hz=peak))
+
+
+def registration_values(found: Estimate, shape: Shape) -> dict[str, Any]:
+    """Return what a file says of an estimate: values, standard errors, 95 % intervals, and how well it explains the counts."""
+    ends = found.intervals()
+    rows = zip(PARAMETERS, found.values.tolist(), found.errors.tolist(), ends.tolist())
+    return {
+        "grid": list(shape),
+        "parameters": {
+            one.name: {"value": max(value, 0.0) if one.name == "black" else value, "error": error, "low": low, "high": high}
+            for one, value, error, (low, high) in rows
+        },
+        "dark_per_exposure": float(found.values[DARK]),
+        "clicks": found.clicks,
+        "exposures": found.exposures,
+        "chi2": found.chi2,
+        "degrees_of_freedom": found.degrees,
+        "p_value": found.p_value,
+    }
+
+
+def save_registration(path: str | Path, values: Mapping[str, Any], *, force: bool = False) -> str:
+    """Write `values` whole or not at all; return the file's SHA-256. UsageError if `path` exists, unless `force`."""
+    data = sealed(values, FORMAT, VERSION)
+    parse_registration(data, str(path))
+    write_file(path, data, force=force)
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_registration(path: str | Path) -> Registered:
+    """Return what `path` holds; UsageError without a file, else DamagedFileError."""
+    return parse_registration(read_file(path, MAX_BYTES), str(path))
+
+
+def is_registration(path: str | Path) -> bool:
+    """Return whether the file at `path` says of itself that it is one; UsageError without a file."""
+    return f'"{FORMAT}"'.encode() in read_file(path, 4 * MAX_BYTES)
+
+
+def parse_registration(data: bytes, where: str) -> Registered:
+    """Check the bytes of a file; DamagedFileError names the first thing that cannot be."""
+    values = unsealed(data, where, FORMAT, VERSION)
+    try:
+        _check(values)
+    except KeyError as error:
+        raise DamagedFileError(f"{where}: {error.args[0]} is missing", remedy="register again") from error
+    except (TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise DamagedFileError(f"{where}: {error}", remedy="register again") from error
+    return Registered(where, hashlib.sha256(data).hexdigest(), values)
+
+
+def check_usable(
+    registered: Registered, profile: Profile, shape: Shape, now: datetime, max_age_h: float = MAX_AGE_H
+) -> None:
+    """Raise ConfigError if a run on `profile` with patterns of `shape` must not use it: another profile or grid, or too old."""
+    where = registered.path
+    check_made_for(where, registered.values, profile, None, "pans calibrate --registration")
+    if registered.shape != tuple(shape):
+        rows, columns = registered.shape
+        raise ConfigError(
+            f"{where}: of a grid of {rows} x {columns} pixels, the bundle's patterns have {shape[0]} x {shape[1]}",
+            remedy="register with a target of as many pixels: pans calibrate --registration --target FILE",
+        )
+    age = (now - registered.made).total_seconds() / 3600
+    if age > max_age_h:
+        raise ConfigError(
+            f"{where}: the registration is {age:.1f} h old, allowed are {max_age_h:g} h",
+            remedy="measure again: pans calibrate --registration, or allow more with --calibration-max-age-h",
+        )
+    if age < -FUTURE_H:
+        raise ConfigError(
+            f"{where}: the registration is from {-age:.1f} h in the future", remedy="check this machine's clock"
+        )
+
+
+def _imaging(values: Mapping[str, Any]) -> Imaging:
+    numbers = [values["parameters"][one.name]["value"] for one in PARAMETERS]
+    return Vector(np.array([*numbers, 0.0])).imaging(tuple(values["grid"]))
+
+
+def _check(values: Mapping[str, Any]) -> None:
+    grid = values["grid"]
+    demand(isinstance(grid, list) and len(grid) == 2, f"grid is {number_text(grid)}, allowed: rows and columns")
+    for size in grid:
+        SIDE.checked(size, "grid")
+    for one in PARAMETERS:
+        _check_parameter(values["parameters"][one.name], one.name, one.low, one.high)
+    made = values["made_utc"]
+    demand(isinstance(made, str), f"made_utc is {number_text(made)}, allowed: a date and time")
+    demand(datetime.fromisoformat(made).utcoffset() is not None, f"made_utc {made[:40]!a} has no time zone")
+    for key in ("name", "sha256"):
+        demand(isinstance(values["profile"][key], str), f"profile.{key} is no text")
+    demand(isinstance(values["device"], dict), "device holds no facts")
+    serial = values["device"].get("serial")
+    demand(serial is None or isinstance(serial, str), f"device.serial is {number_text(serial)}, allowed: text")
+    CLICKS.checked(values["clicks"], "clicks")
+    Range(0, 1).checked(values["p_value"], "p_value")
+    _imaging(values)  # refuses a flat field that is negative somewhere
+
+
+def _check_parameter(row: Mapping[str, Any], name: str, low: float, high: float) -> None:
+    allowed = Range(low, high)
+    allowed.checked(row["value"], f"{name}.value")
+    for key in ("low", "high", "error"):
+        Range(-1e6, 1e6).checked(row[key], f"{name}.{key}")
+    fits = row["low"] <= row["value"] <= row["high"] and math.isfinite(row["error"])
+    demand(fits, f"{name} {row['value']} is not within {row['low']} to {row['high']}")

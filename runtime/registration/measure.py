@@ -1,0 +1,135 @@
+"""A registration in two stages: what each shows, and from its counts to the estimate.
+
+Owns the shares of the two stages and what makes a measurement useless; the session is run by the caller, who brings the counts. Without
+clock, files and random numbers but those of the given seed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.core.calibration import (
+    CalibrationCore,
+    Design,
+    calibration_exposure_us,
+    count_model,
+    counts_of,
+    design_of,
+    joined_counts,
+    profile_level,
+)
+from pans.runtime.errors import UsageError, as_usage_error
+from pans.runtime.instrument.click_law import object_transmission
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.intervals import CHI2_95
+
+from .designs import SCATTERED, TELLING, scattered, telling
+from .estimate import Estimate, Library, Observed, estimate
+from .parameters import DARK, PARAMETERS, Shape, at_edge
+from .rates import Bench
+
+FIRST_SHARE = 0.12  # of the time
+SATURATED_SHARE = 0.95  # of the exposures with light
+MISFIT_CHANCE = 1e-4
+PRECISION_PX, PRECISION_DEG = 0.05, 0.1  # half of the 95 % interval
+LENGTHS, ANGLES = ("right_px", "down_px"), ("rotation_deg",)
+
+
+def bench_of(profile: Profile, target: NDArray[np.uint8]) -> Bench:
+    """Return what is known of `profile` before the target, uint8 (rows, columns), with the exposure of a calibration."""
+    exposure_us = calibration_exposure_us(profile)
+    transmission = np.asarray(object_transmission(profile, target), np.float64)
+    shape: Shape = (target.shape[0], target.shape[1])
+    return Bench(
+        transmission.reshape(-1),
+        shape,
+        profile_level(profile, exposure_us),
+        profile.projector.levels,
+        count_model(profile, exposure_us),
+    )
+
+
+class Registration:
+    """One measurement: `first` and `second` lay out what is shown, `take` is given what was counted of it."""
+
+    def __init__(self, profile: Profile, target: NDArray[np.uint8], seconds: float, seed: int, bench: Bench | None = None):
+        self.profile, self.seconds, self.seed = profile, seconds, seed
+        self.bench = bench_of(profile, target) if bench is None else bench
+        self.observed: Observed | None = None
+
+    def prepare(self, library: Library | None = None) -> None:
+        """Compute the target's appearance at every place of the search."""
+        self.library = Library(self.bench) if library is None else library
+
+    def first(self) -> Design:
+        """Return the first stage: scattered pixels."""
+        levels = scattered(self.bench, self.library, self.seed, self._at_most(SCATTERED))
+        return design_of(self.profile, levels, self.bench.shape, FIRST_SHARE * self.seconds)
+
+    def second(self, known: Estimate) -> Design:
+        """Return the second stage: the patterns that tell most where the target is `known` to be about."""
+        seconds, count = (1 - FIRST_SHARE) * self.seconds, self._at_most(TELLING)
+        trial = scattered(self.bench, self.library, self.seed, count)
+        plan = design_of(self.profile, trial, self.bench.shape, seconds)
+        exposures = plan.n_cycles * plan.plan.slots_per_cycle / (1.1 * count)
+        levels = telling(self.bench, known, self.seed + 1, exposures, count)
+        return design_of(self.profile, levels, self.bench.shape, seconds)
+
+    def take(self, design: Design, core: CalibrationCore, known: Estimate | None = None) -> Estimate:
+        """Add what was counted of `design` and return the estimate from all so far; UsageError where nothing can be told."""
+        counts = joined_counts(counts_of(core, design, self.profile))
+        seen = Observed.of(design.bundle.pattern_levels.astype(np.float64), counts)
+        check_saturation(seen)
+        self.observed = seen if self.observed is None else self.observed.joined(seen)
+        with as_usage_error():
+            return estimate(self.bench, self.observed, self.library, None if known is None else known.values)
+
+    def _at_most(self, count: int) -> int:
+        """As many patterns as the instrument can show: in parallel mode each channel has one."""
+        return self.profile.detector.channels if self.profile.mode == "parallel" else min(count, self.profile.projector.pattern_memory)
+
+
+def check_saturation(observed: Observed) -> None:
+    """Raise UsageError where nearly all exposures with light clicked, or hardly one did."""
+    lit = observed.lit
+    exposures, clicks = int(observed.exposures[lit].sum()), int(observed.clicks[lit].sum())
+    if clicks > SATURATED_SHARE * exposures:
+        raise UsageError(
+            f"the detector saturates: {clicks} of {exposures} exposures with light clicked, allowed up to {SATURATED_SHARE:.0%}",
+            remedy="put a filter of optical density 1 before the detector, or lower the light, and try again",
+        )
+    if not clicks:
+        raise UsageError(
+            f"none of {exposures} exposures with light clicked",
+            remedy="check the light path: the target must stand before the detector, and the light must be on",
+        )
+
+
+def check_estimate(found: Estimate, seconds: float, precision: tuple[float, float] = (PRECISION_PX, PRECISION_DEG)) -> None:
+    """Raise UsageError for an estimate at the edge of the search, one that does not explain the counts, or one that is too uncertain.
+
+    `precision` is what half of the 95 % interval may be, in px of shift and degrees of rotation.
+    """
+    if edges := at_edge(found.values[:DARK]):
+        raise UsageError(
+            f"the estimate lies at the edge of the search: {'; '.join(edges)}",
+            remedy="align the target by hand first, or check that it is the one that was named",
+        )
+    if found.p_value < MISFIT_CHANCE:
+        raise UsageError(
+            f"the model does not explain the counts: chi-square {found.chi2:.0f} over {found.degrees} degrees of freedom "
+            f"(p = {found.p_value:.1g}, allowed from {MISFIT_CHANCE:g})",
+            remedy="check that the target is the one that was named, that nothing moved, and that the light is steady",
+        )
+    wanted = {**dict.fromkeys(LENGTHS, precision[0]), **dict.fromkeys(ANGLES, precision[1])}
+    half = {one.name: math.sqrt(CHI2_95) * error for one, error in zip(PARAMETERS, found.errors.tolist())}
+    worst = max(wanted, key=lambda name: half[name] / wanted[name])
+    if half[worst] > wanted[worst]:
+        factor = (half[worst] / wanted[worst]) ** 2
+        raise UsageError(
+            f"too few photons: {worst} is known to ±{half[worst]:.3g} from {found.clicks} clicks, wanted ±{wanted[worst]:g}",
+            remedy=f"--seconds {seconds * factor * 1.1:.3g}: {seconds * (factor * 1.1 - 1):.3g} s more",
+        )

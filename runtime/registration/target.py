@@ -1,0 +1,73 @@
+"""The known target of a registration: the built-in one, or a user's picture.
+
+Owns the picture and its checks; what a modulator makes of it is the profile's. The built-in target is 6 x 6 cells of black and clear,
+which pixels represent exactly: 48 edges between cells, as many upright as level, and of 20 000 random ones of that kind the one whose
+autocorrelation has the lowest side lobes within two cells (0.25 of the peak), so that no shift looks like another.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pans.runtime.errors import UsageError
+from pans.runtime.npz_file import read_arrays
+
+CELLS = ("#.#..#", "##.#..", "..#..#", "..#...", "..#..#", "##.###")
+SIDE = 28
+LEAST_SIDE, MOST_PIXELS = 14, 4096  # fewer pixels than two per cell blur into each other; beyond, optics' matrices take too much memory
+TARGET_BYTES = 1 << 24
+LEAST_SPREAD = 0.05  # standard deviation of the transmission, below which a picture is hardly a target
+
+U8 = NDArray[np.uint8]
+
+
+def built_in_target(side: int = SIDE) -> U8:
+    """Return the built-in target, uint8 (side, side), 255 clear and 0 black; a margin of at least an eighth of the cells' width is black."""
+    if not LEAST_SIDE <= side or side * side > MOST_PIXELS:
+        raise ValueError(f"side must be from {LEAST_SIDE} to {int(MOST_PIXELS**0.5)}, found {side}")
+    cells = np.array([[255 * (mark == "#") for mark in row] for row in CELLS], np.uint8)
+    width = max(1, (side * 7 // 8) // len(CELLS))
+    inner = np.kron(cells, np.ones((width, width), np.uint8))
+    target = np.zeros((side, side), np.uint8)
+    first = (side - len(inner)) // 2
+    target[first : first + len(inner), first : first + len(inner)] = inner
+    return target
+
+
+def read_target(path: Path) -> U8:
+    """Return the picture in `path`, uint8 (rows, columns): a picture file (Pillow), or the first of `images` in a scene (.npz).
+
+    UsageError for a file that is neither, for too few or too many pixels, and for a picture without contrast.
+    """
+    if path.suffix == ".npz":
+        try:
+            images = read_arrays(path, ("images", "labels", "classes"), TARGET_BYTES).get("images")
+        except ValueError as error:
+            raise UsageError(f"{path}: not a readable scene: {error}", remedy="numpy.savez(FILE, images=)") from error
+        if images is None or images.ndim != 3 or images.dtype != np.uint8 or not images.size:
+            raise UsageError(f"{path}: no array `images`, uint8 (objects, rows, columns)", remedy="numpy.savez(FILE, images=)")
+        picture = images[0]
+    else:
+        from pans.runtime.images import read_grey
+
+        picture = read_grey(path)
+    return _checked(picture, str(path))
+
+
+def _checked(picture: U8, where: str) -> U8:
+    rows, columns = picture.shape
+    if min(rows, columns) < LEAST_SIDE or rows * columns > MOST_PIXELS:
+        raise UsageError(
+            f"{where}: {columns} x {rows} pixels, allowed: at least {LEAST_SIDE} a side, at most {MOST_PIXELS} in all",
+            remedy="one pixel of the target is one pixel of the patterns",
+        )
+    spread = float(picture.std()) / 255
+    if spread < LEAST_SPREAD:
+        raise UsageError(
+            f"{where}: the standard deviation of its transmission is {spread:.3g}, needed at least {LEAST_SPREAD:g}",
+            remedy="use a target with black and clear parts",
+        )
+    return np.ascontiguousarray(picture)
