@@ -1,6 +1,6 @@
 """What stands before the detector: a list of still images with their truth, or a calibration target.
 
-Owns the scene file (`.npz` with `images`, `labels`, `classes`), the shipped scenes, the targets `uniform` and `dark`.
+Owns the scene file (`.npz` with `images`, `labels`, `classes`), the shipped scenes, the targets `uniform`, `dark` and `registration`.
 Never computes light or clicks (optics.py, detector.py). `load_scene` returns a frozen `Scene` or raises ConfigError; a
 scene file is measured before anything is allocated, and never unpickled.
 """
@@ -19,6 +19,7 @@ from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.images import read_class_folder
 from pans.runtime.imaging import IDENTITY, Imaging
 from pans.runtime.npz_file import read_arrays
+from pans.runtime.registration.target import built_in_target
 
 MAX_OBJECTS = 1 << 17
 MAX_PIXELS = 1 << 22
@@ -27,7 +28,7 @@ MAX_CLASSES = 4096
 NAME_MAX = 250  # of a file: longer ones no system has
 UNKNOWN_LABEL = -1
 SCENE_FOLDER = Path(__file__).parent.parent / "scenes"
-TARGETS = ("uniform", "dark")
+TARGETS = ("uniform", "dark", "registration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +131,8 @@ def _is_file(path: Path) -> bool:
 
 def _target(name: str) -> Scene:
     label = np.full(1, UNKNOWN_LABEL, np.int16)
+    if name == "registration":
+        return Scene(name, _frozen(built_in_target()[None]), _frozen(label), ())
     return Scene(name, _frozen(np.full((1, 1, 1), 255, np.uint8)), _frozen(label), (), lit=name != "dark")
 
 

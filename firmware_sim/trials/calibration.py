@@ -78,9 +78,7 @@ def calibrate_one(profile: Profile, seconds: float, seed: int) -> Outcome:
     return Outcome(level, found, dark, dark_interval)
 
 
-def simulate(
-    truth: Profile, design: Design, seed: int, light: NDArray[np.float64] | None = None
-) -> CalibrationCore:
+def simulate(truth: Profile, design: Design, seed: int, light: NDArray[np.float64] | None = None) -> CalibrationCore:
     """Draw all exposures of `design` on the instrument `truth` and let the runtime's core count them.
 
     `light` are the photoelectrons (patterns,) of an exposure; without it a clear field stands before the detector.

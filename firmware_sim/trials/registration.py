@@ -51,7 +51,9 @@ def rendered(image: F64, truth: Imaging, finer: int = FINER) -> F64:
     y = (np.arange((rows + 2 * MARGIN) * finer) + 0.5) / finer - 0.5 - MARGIN
     x = (np.arange((columns + 2 * MARGIN) * finer) + 0.5) / finer - 0.5 - MARGIN
     down, right = np.meshgrid(y - (rows - 1) / 2 - truth.down_px, x - (columns - 1) / 2 - truth.right_px, indexing="ij")
-    position = (right - 1j * down) * np.exp(-1j * math.radians(truth.rotation_deg)) / truth.scale  # upwards is positive here
+    position = (
+        (right - 1j * down) * np.exp(-1j * math.radians(truth.rotation_deg)) / truth.scale
+    )  # upwards is positive here
     column = np.floor(position.real + (columns - 1) / 2 + 0.5).astype(int)
     row = np.floor(-position.imag + (rows - 1) / 2 + 0.5).astype(int)
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)

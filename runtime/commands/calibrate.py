@@ -1,8 +1,8 @@
-"""`pans calibrate`: photon level, dark rates and non-uniformity of one instrument, measured through the ordinary session, into
-a dated file.
+"""`pans calibrate`: photon level, dark rates and non-uniformity of one instrument, or with --registration where a known target stands,
+measured through the ordinary session, into a dated file.
 
-Owns the command's arguments, its two stages and its answer; the design is calibration_run.py's, the estimate calibrate.py's, the file
-calibration.py's.
+Owns the command's arguments, its two stages and its answers; designs and estimates are core's and registration's, files calibration.py's
+and registration's.
 """
 
 from __future__ import annotations
@@ -12,25 +12,32 @@ import math
 import shlex
 import sys
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
+from pans.runtime.cli.talk import is_quiet
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
+from .options import refuse_without
 from .run import profile_of
 from .run_files import files_of_url
 
 FIRST_STAGE_SHARE = 0.1
 PEAK_OFF = 0.2  # of the profile's brightness: beyond it the answer says so
+OF_REGISTRATION = {"target": None, "page": None, "precision_px": 0.05, "precision_deg": 0.1}  # and their defaults
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--device", required=True, help="device URL; a clear field must stand before it (sim: scene=uniform)"
+        "--device",
+        required=True,
+        help="device URL; a clear field must stand before it (sim: scene=uniform), or the target (sim: scene=registration)",
     )
     parser.add_argument("--profile", help="hardware profile: a shipped name or a TOML file (default: the sim: URL's)")
     parser.add_argument(
@@ -39,12 +46,35 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     add_force(parser)
     parser.add_argument("--seconds", type=Range(0.5, 86_400).option, default=10.0, help="instrument time (default 10)")
     parser.add_argument(
-        "--seed", type=Range(0, (1 << 63) - 1, whole=True).option, default=1, help="of the random patterns (default 1)"
+        "--seed", type=Range(0, (1 << 62) - 1, whole=True).option, default=1, help="of the random patterns (default 1)"
     )
+    group = parser.add_argument_group("registration (docs/how-to/calibrate.md#register-the-optical-table)")
+    group.add_argument(
+        "--registration",
+        action="store_true",
+        help="measure where a known target stands, sharpness, black level and flat field",
+    )
+    group.add_argument(
+        "--target", type=Path, metavar="FILE", help="a picture or a scene (.npz) of the target (default: built in)"
+    )
+    group.add_argument(
+        "--page", type=Path, metavar="FILE", help="write a page with pictures of target and residuals (.html)"
+    )
+    group.add_argument(
+        "--precision-px", type=Range(1e-4, 10).option, default=OF_REGISTRATION["precision_px"], metavar="PX",
+        help="half of the widest 95 %% interval of a shift that is accepted (default 0.05)",
+    )  # fmt: skip
+    group.add_argument(
+        "--precision-deg", type=Range(1e-4, 10).option, default=OF_REGISTRATION["precision_deg"], metavar="DEG",
+        help="the same of the rotation (default 0.1)",
+    )  # fmt: skip
 
 
 def _calibrate(args: argparse.Namespace) -> int:
     _check(args)
+    if args.registration:
+        return _register(args)
+    refuse_without(args, "--registration", OF_REGISTRATION)
     from pans.runtime.core.calibration import (
         LADDER,
         TELLING,
@@ -95,14 +125,15 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse what cannot be written before anything is measured."""
-    check_outputs([args.out], inputs=[args.profile, *files_of_url(args.device)], force=args.force)
+    outputs = [args.out] if args.page is None else [args.out, args.page]
+    check_outputs(outputs, inputs=[args.profile, args.target, *files_of_url(args.device)], force=args.force)
 
 
 def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str, Any], Counter[str]]:
     """Run one design through the ordinary session; return the core with its sums, the device's facts and what contradicts the evidence."""
     from pans.runtime.core.calibration import CalibrationCore
     from pans.runtime.link.base import open_link
-    from pans.runtime.live import RunConfig, run_live
+    from pans.runtime.live import Observers, RunConfig, run_live
     from pans.runtime.live.continuous import INTERRUPTED
     from pans.runtime.report.summary import contradictions_of
 
@@ -110,7 +141,9 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
     say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
     config = RunConfig(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
-    result = run_live(open_link(device), profile, design.bundle, design.plan, core, config)
+    with _bar(design.n_cycles * design.plan.slots_per_cycle) as tell:
+        seen = Observers(lambda run, _: tell(run.core.tracker.next_exposure), acts=False)
+        result = run_live(open_link(device), profile, design.bundle, design.plan, core, config, observers=seen)
     if result.ended == INTERRUPTED:
         raise KeyboardInterrupt(result.ended)
     if result.ended != "completed":
@@ -118,6 +151,61 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     keep = ("serial", "firmware", "name", "simulated")
     facts = {key: result.device[key] for key in keep if key in result.device}
     return core, facts, Counter(contradictions_of(result))
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Callable[[int], None]]:
+    """Yield what is told the exposures that have come, and shows them on a terminal."""
+    if is_quiet() or not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("exposures"), BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda done: progress.update(task, completed=min(done, total))
+
+
+def _register(args: argparse.Namespace) -> int:
+    from pans.runtime.instrument.calibration import now_utc
+    from pans.runtime.registration.file import registration_values, registration_words, save_registration
+    from pans.runtime.registration.measure import Registration, check_estimate
+    from pans.runtime.registration.target import BUILT_IN, built_in_target, read_target, target_sha256
+
+    profile = load_profile(args.profile or profile_of(args.device))
+    target = built_in_target() if args.target is None else read_target(args.target)
+    measurement = Registration(profile, target, args.seconds, args.seed)
+    say(f"registration: {measurement.words()}")
+    measurement.prepare()
+    first = measurement.first()
+    core, _, doubts = _measure(args.device, profile, first)
+    known = measurement.take(first, core)
+    second = measurement.second(known)
+    core, facts, more = _measure(args.device, profile, second)
+    doubts += more
+    found = measurement.take(second, core, known)
+    if args.page is not None:
+        from pans.runtime.pages.registration import write_registration_page
+
+        write_registration_page(args.page, measurement, found, simulated=bool(facts.get("simulated")), force=args.force)
+    check_estimate(found, args.seconds, (args.precision_px, args.precision_deg))
+    values = {
+        "made_utc": now_utc().isoformat(timespec="seconds"),
+        "profile": {"name": profile.name, "sha256": profile.sha256},
+        "target": {"name": BUILT_IN if args.target is None else args.target.name, "sha256": target_sha256(target)},
+        **registration_values(found, measurement.bench.shape),
+        "exposure_us": second.plan.exposure_us,
+        "instrument_seconds": sum(one.n_cycles * one.plan.cycle_us * 1e-6 for one in (first, second)),
+        **({"contradictions": dict(doubts)} if doubts else {}),
+        "command": shlex.join(["pans", *sys.argv[1:]]),
+        "seed": args.seed,
+        "device": facts,
+    }
+    sha256 = save_registration(args.out, values, force=args.force)
+    emit(args, {"registration": str(args.out), "sha256": sha256, **values}, registration_words(args.out, values))
+    return EXIT_TIMING if doubts else EXIT_FINE
 
 
 def _words(path: Path, values: dict[str, Any]) -> str:

@@ -100,7 +100,7 @@ OF_FLOW: Mapping[str, Any] = {
 }  # and their defaults
 
 
-def _refuse_without(args: argparse.Namespace, needed: str, defaults: Mapping[str, Any]) -> None:
+def refuse_without(args: argparse.Namespace, needed: str, defaults: Mapping[str, Any]) -> None:
     """Refuse options that have no effect without the option `needed`."""
     for name, default in defaults.items():
         if getattr(args, name, default) != default:
@@ -112,7 +112,7 @@ def _refuse_without(args: argparse.Namespace, needed: str, defaults: Mapping[str
 def flow_of(args: argparse.Namespace) -> FlowSettings | None:
     """Return the settings that the command line asks for, None without --flow."""
     if getattr(args, "flow", None) is None:
-        _refuse_without(args, "--flow", OF_FLOW)
+        refuse_without(args, "--flow", OF_FLOW)
         return None
     classes = tuple(name for part in args.gate_class for name in part.split(",") if name)
     settings = with_gate(read_flow(args.flow), classes, args.gate_delay_us)
@@ -147,7 +147,7 @@ def dark_of(args: argparse.Namespace) -> DarkSettings:
     if not hasattr(args, "calibration"):
         return DarkSettings()
     if args.calibration is None:
-        _refuse_without(args, "--calibration", {"calibration_max_age_h": MAX_AGE_H})
+        refuse_without(args, "--calibration", {"calibration_max_age_h": MAX_AGE_H})
     return DarkSettings(args.calibration, args.calibration_max_age_h, args.on_dark, warns=True)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .model import Imaging
 
+FEW_OBJECTS, WEIGHTS_AT_ONCE = 4, 1 << 21  # so few objects are met tap by tap, faster than by the matrix
 PIXELS_DENSE = 4096  # beyond it the matrix of all pairs of pixels would take more than 128 MiB
 REACH_SIGMA = 8.3  # beyond it the tail of a Gaussian is below the resolution of float64
 _OBJECTS_AT_ONCE = 2048
@@ -40,6 +41,8 @@ def seen(imaging: Imaging, images: F64, shape: Shape) -> F64:
     if imaging.rotation_deg == 0:
         down, along = _axis(imaging, shape[0], imaging.down_px), _axis(imaging, shape[1], imaging.right_px)
         return np.asarray(down @ pixels.reshape(-1, *shape) @ along.T).reshape(len(pixels), -1)
+    if len(pixels) <= FEW_OBJECTS:
+        return _gathered(imaging, pixels, shape)
     if shape[0] * shape[1] <= PIXELS_DENSE:
         return np.asarray(pixels @ operator(imaging, shape).T)
     return _gathered(imaging, pixels, shape)
@@ -75,6 +78,10 @@ def _gathered(imaging: Imaging, pixels: F64, shape: Shape) -> F64:
     (row, row_weight), (column, column_weight) = _taps(imaging, shape)
     row_weight, column_weight = row_weight * _inside(row, rows), column_weight * _inside(column, columns)
     row, column = row.clip(0, rows - 1), column.clip(0, columns - 1)
+    if len(pixels) <= FEW_OBJECTS and row.size * column.shape[1] <= WEIGHTS_AT_ONCE:
+        down, along = row[:, :, None], column[:, None, :]
+        near = (one.reshape(rows, columns)[down, along] for one in pixels)  # (grid, taps down, taps along)
+        return np.array([np.einsum("gd,gda,ga->g", row_weight, taps, column_weight, optimize=True) for taps in near])
     result = np.zeros((len(pixels), rows * columns))
     for first in range(0, len(pixels), _OBJECTS_AT_ONCE):
         part, into = pixels[first : first + _OBJECTS_AT_ONCE], result[first : first + _OBJECTS_AT_ONCE]

@@ -32,9 +32,7 @@ def unsealed(data: bytes, where: str, format_name: str, version: int) -> dict[st
         raise DamagedFileError(f"{where}: format {found}, allowed: {format_name} {version}")
     body = {key: value for key, value in values.items() if key != "sha256"}
     if values.get("sha256") != hashlib.sha256(canonical_json(body)).hexdigest():
-        raise DamagedFileError(
-            f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again"
-        )
+        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
     return values
 
 

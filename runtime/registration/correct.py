@@ -21,7 +21,9 @@ from pans.runtime.errors import ConfigError
 from pans.runtime.imaging import IDENTITY, Imaging, levelled, operator
 
 PRIOR_MEAN, PRIOR_SD, PRIOR_REACH_PX = 0.3, 0.3, 3.0
-LEAST_LIGHT = 0.8  # of what the trained patterns bring: less means that they reach beyond the grid, or that levels do not suffice
+LEAST_LIGHT = (
+    0.8  # of what the trained patterns bring: less means that they reach beyond the grid, or that levels do not suffice
+)
 CHANGES_MAX = 4000  # of one pattern
 _PATTERNS_AT_ONCE = 512
 F64 = NDArray[np.float64]
@@ -38,7 +40,9 @@ class Correction:
     error_after: float
 
 
-def corrected(bundle: Bundle, imaging: Imaging, trained: Imaging = IDENTITY, where: str = "") -> tuple[Bundle, Correction]:
+def corrected(
+    bundle: Bundle, imaging: Imaging, trained: Imaging = IDENTITY, where: str = ""
+) -> tuple[Bundle, Correction]:
     """Return `bundle` with the levels to show on the table `imaging`, of a bundle made for `trained` optics, and what that came to.
 
     `gain` is not corrected here: the exposure is (`Registered.applied_to`). ConfigError where more than a fifth of the light would be lost.
@@ -80,7 +84,8 @@ class _Task:
         each = levelled(replace(now, black=0.0), np.ones((1, seen.shape[0])), shape)[0] * (1.0 - now.black)
         mapped, prior = each[:, None] * seen, _prior(shape)
         sharp = operator(replace(now, psf_px=0.0, flat=None), shape)  # geometry alone
-        return _Task(mapped, unlit @ seen, prior, mapped @ prior @ mapped.T, sharp.T / np.maximum(each, 0.1), then, shape, top)
+        form = mapped @ prior @ mapped.T
+        return _Task(mapped, unlit @ seen, prior, form, sharp.T / np.maximum(each, 0.1), then, shape, top)
 
     def wanted(self, levels: NDArray[np.uint16]) -> F64:
         """What the trained patterns show an object on the table that they were trained for, (patterns, object pixels)."""
@@ -144,7 +149,9 @@ def _descend(levels: F64, slope: F64, form: F64, top: int) -> F64:
     return levels
 
 
-def _best_steps(levels: F64, slope: F64, curve: F64, top: int, barred: NDArray[np.intp] | None = None) -> tuple[F64, F64]:
+def _best_steps(
+    levels: F64, slope: F64, curve: F64, top: int, barred: NDArray[np.intp] | None = None
+) -> tuple[F64, F64]:
     """Return for each level the whole step that lowers the form most, at least one up or down, and what it changes (inf: none)."""
     flat = curve <= 1e-12 * curve.max()
     ideal = -slope / np.where(flat, 1.0, curve)

@@ -19,7 +19,11 @@ from .rates import Bench, information_per_exposure
 F64 = NDArray[np.float64]
 U16 = NDArray[np.uint16]
 SCATTERED, TELLING = 96, 128  # patterns of the two stages
-DRIVES = (0.4, 1.0, 2.5)  # photoelectrons per exposure of scattered patterns, if the profile is right; the clicks tell most from 0.5 to 2
+DRIVES = (
+    0.4,
+    1.0,
+    2.5,
+)  # photoelectrons per exposure of scattered patterns, if the profile is right; the clicks tell most from 0.5 to 2
 DRIVE = 1.0  # of telling ones: of a click's worth 0.92 of the most is left, and of an exposure's time 0.9
 SIZES = (2, 4, 8, 16, 24, 32, 48)  # lit pixels of candidates
 DIRECTIONS = 300

@@ -1,8 +1,8 @@
 """Maximum likelihood of where a known target stands, from clicks under known patterns.
 
 Owns the coarse search, Fisher scoring, the intervals and the test whether the model explains the counts. Pure functions of arrays: no
-clock, no file, no random number. The likelihood is that of the click law with light and dark counts as unknowns; read noise, threshold, dead
-time and afterpulses are the profile's. The search begins on a grid over shifts and rotations, 1 px and 2.5 degrees apart; the best few
+clock, no file, no random number. The likelihood is that of the click law with light and dark counts as unknowns; read noise, threshold,
+dead time and afterpulses are the profile's. The search begins on a grid over shifts and rotations, 1 px and 2.5 degrees apart; the best few
 are followed by Fisher scoring, so that a target whose structure is coarser than a step is not missed. Intervals (95 %) are those of
 the Fisher information at the estimate.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pans.runtime.instrument.estimate import SATURATED, Counts
 from pans.runtime.intervals import CHI2_95, chi2_tail
 
-from .parameters import DARK, FLAT, GEOMETRY, N_GEOMETRY, PARAMETERS, PSF_SEEN_FROM
+from .parameters import DARK, FLAT, PARAMETERS, PSF_SEEN_FROM
 from .rates import Bench
 
 F64 = NDArray[np.float64]
@@ -27,8 +27,8 @@ I64 = NDArray[np.int64]
 SHIFTS = np.arange(-3.0, 3.5, 1.0)
 ROTATIONS = np.arange(-5.0, 5.5, 2.5)
 PSF_START = 0.7
-STARTS, FIRST_STEPS, STEPS_MAX = 3, 3, 60
-SETTLED = 1e-7  # gain of the log likelihood in a step
+STARTS, FIRST_STEPS, STEPS_MAX = 3, 3, 40
+SETTLED = 1e-4  # gain of the log likelihood in a step: of about 0.01 standard errors
 LEAST_EXPECTED = 5.0  # clicks, and silent exposures, of a group in Pearson's sum
 
 
@@ -47,7 +47,9 @@ class Observed(NamedTuple):
     def of(patterns: F64, counts: Counts) -> Observed:
         """Return what was counted under `patterns`, levels (patterns, pixels)."""
         some = counts.exposures > 0
-        return Observed(patterns, counts.pattern[some], counts.clicks[some], counts.exposures[some], counts.log_other[some])
+        return Observed(
+            patterns, counts.pattern[some], counts.clicks[some], counts.exposures[some], counts.log_other[some]
+        )
 
     def joined(self, other: Observed) -> Observed:
         """Return both measurements as one."""
@@ -247,4 +249,3 @@ class _Fit:
 
 _LEAST_DARK = 1e-9  # photoelectrons per exposure
 _STRIDE = np.array([0.8, 0.8, 2.0, 0.03, 0.4, math.inf, 0.02, 0.3, 0.3, 0.3, 0.3, 0.3, math.inf])  # most in one step
-assert len(_STRIDE) == DARK + 1 and len(GEOMETRY) == N_GEOMETRY

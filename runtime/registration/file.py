@@ -1,7 +1,7 @@
 """The registration file: where the target stood, with intervals, when and how it was measured; beside the profile, never a rewrite of it.
 
-Owns the file (strict JSON with a checksum), its checks, and what a run takes from it. `load_registration` returns a `Registered` whose every
-figure is possible, or raises DamagedFileError; `check_usable` says why a run must not use one.
+Owns the file (strict JSON with a checksum), its checks, and what a run takes from it. `load_registration` returns a `Registered` whose
+every figure is possible, or raises DamagedFileError; `check_usable` says why a run must not use one.
 """
 
 from __future__ import annotations
@@ -48,6 +48,10 @@ class Registered:
         """When it was measured, UTC."""
         return datetime.fromisoformat(self.values["made_utc"])
 
+    def age_h(self, now: datetime) -> float:
+        """Its age in hours at `now` (UTC)."""
+        return (now - self.made).total_seconds() / 3600
+
     @property
     def shape(self) -> Shape:
         """Rows and columns of the grid."""
@@ -74,7 +78,12 @@ def registration_values(found: Estimate, shape: Shape) -> dict[str, Any]:
     return {
         "grid": list(shape),
         "parameters": {
-            one.name: {"value": max(value, 0.0) if one.name == "black" else value, "error": error, "low": low, "high": high}
+            one.name: {
+                "value": max(value, 0.0) if one.name == "black" else value,
+                "error": error,
+                "low": low,
+                "high": high,
+            }
             for one, value, error, (low, high) in rows
         },
         "dark_per_exposure": float(found.values[DARK]),
@@ -128,16 +137,37 @@ def check_usable(
             f"{where}: of a grid of {rows} x {columns} pixels, the bundle's patterns have {shape[0]} x {shape[1]}",
             remedy="register with a target of as many pixels: pans calibrate --registration --target FILE",
         )
-    age = (now - registered.made).total_seconds() / 3600
-    if age > max_age_h:
+    if stale := age_warnings(registered, now, max_age_h):
         raise ConfigError(
-            f"{where}: the registration is {age:.1f} h old, allowed are {max_age_h:g} h",
+            f"{where}: {stale[0]}",
             remedy="measure again: pans calibrate --registration, or allow more with --calibration-max-age-h",
         )
+
+
+def age_warnings(registered: Registered, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
+    """Return a sentence about a file that is too old, or from the future."""
+    age = registered.age_h(now)
+    if age > max_age_h:
+        return [f"the registration is {age:.1f} h old, allowed are {max_age_h:g} h"]
     if age < -FUTURE_H:
-        raise ConfigError(
-            f"{where}: the registration is from {-age:.1f} h in the future", remedy="check this machine's clock"
+        return [f"the registration is from {-age:.1f} h in the future: check this machine's clock"]
+    return []
+
+
+def registration_words(path: str | Path, values: Mapping[str, Any]) -> str:
+    """Return a table of the measured numbers for people."""
+    banner = "SIMULATED · " if values["device"].get("simulated") else ""
+    lines = [f"{banner}{path}"]
+    for one in PARAMETERS:
+        row = values["parameters"][one.name]
+        unit = f" {one.unit}" if one.unit else ""
+        lines.append(
+            f"  {one.name.removesuffix('_px').removesuffix('_deg'):<9} {row['value']:+.4f}{unit:<9} "
+            f"95 % {row['low']:+.4f} to {row['high']:+.4f}"
         )
+    fit = f"chi-square {values['chi2']:.0f} over {values['degrees_of_freedom']} (p = {values['p_value']:.2g})"
+    lines.append(f"  {values['clicks']} clicks in {values['exposures']} exposures; {fit}")
+    return "\n".join(lines)
 
 
 def _imaging(values: Mapping[str, Any]) -> Imaging:

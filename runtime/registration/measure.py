@@ -55,10 +55,21 @@ def bench_of(profile: Profile, target: NDArray[np.uint8]) -> Bench:
 class Registration:
     """One measurement: `first` and `second` lay out what is shown, `take` is given what was counted of it."""
 
-    def __init__(self, profile: Profile, target: NDArray[np.uint8], seconds: float, seed: int, bench: Bench | None = None):
+    def __init__(
+        self, profile: Profile, target: NDArray[np.uint8], seconds: float, seed: int, bench: Bench | None = None
+    ):
         self.profile, self.seconds, self.seed = profile, seconds, seed
         self.bench = bench_of(profile, target) if bench is None else bench
         self.observed: Observed | None = None
+
+    def words(self) -> str:
+        """Return what will be looked for, in words."""
+        rows, columns = self.bench.shape
+        right, down, turn = PARAMETERS[:3]
+        return (
+            f"target of {columns} x {rows} pixels on {self.profile.name}, looked for within ±{min(right.high, down.high):g} px and "
+            f"±{turn.high:g} degrees, {self.seconds:g} s of instrument time"
+        )
 
     def prepare(self, library: Library | None = None) -> None:
         """Compute the target's appearance at every place of the search."""
@@ -89,7 +100,11 @@ class Registration:
 
     def _at_most(self, count: int) -> int:
         """As many patterns as the instrument can show: in parallel mode each channel has one."""
-        return self.profile.detector.channels if self.profile.mode == "parallel" else min(count, self.profile.projector.pattern_memory)
+        return (
+            self.profile.detector.channels
+            if self.profile.mode == "parallel"
+            else min(count, self.profile.projector.pattern_memory)
+        )
 
 
 def check_saturation(observed: Observed) -> None:
@@ -108,7 +123,9 @@ def check_saturation(observed: Observed) -> None:
         )
 
 
-def check_estimate(found: Estimate, seconds: float, precision: tuple[float, float] = (PRECISION_PX, PRECISION_DEG)) -> None:
+def check_estimate(
+    found: Estimate, seconds: float, precision: tuple[float, float] = (PRECISION_PX, PRECISION_DEG)
+) -> None:
     """Raise UsageError for an estimate at the edge of the search, one that does not explain the counts, or one that is too uncertain.
 
     `precision` is what half of the 95 % interval may be, in px of shift and degrees of rotation.

@@ -36,15 +36,18 @@ GEOMETRY = (
     Parameter("down_px", "px", -3.0, 3.0, 0.05),
     Parameter("rotation_deg", "degrees", -5.0, 5.0, 0.05),
     Parameter("scale", "", 0.94, 1.06, 0.01),
-    Parameter("psf_px", "px", 0.05, 2.0, 0.1),
+    Parameter("psf_px", "px", 0.002, 2.0, 0.1),
 )
 GAIN = Parameter("gain", "", 0.02, 50.0, 0.05)
 BLACK = Parameter("black", "", -0.002, 0.1, 0.001)
 FLAT_NAMES = ("flat_x", "flat_y", "flat_xx", "flat_xy", "flat_yy")
 FLAT = tuple(Parameter(name, "", -0.5, 0.5, 0.1) for name in FLAT_NAMES)
+NO_FLAT = (0.0,) * len(FLAT)
 LIGHT = (GAIN, BLACK, *FLAT)
 PARAMETERS = (*GEOMETRY, *LIGHT)
-DARK = len(PARAMETERS)  # where the vector holds the dark photoelectrons of an exposure, a nuisance: calibrations measure it
+DARK = len(
+    PARAMETERS
+)  # where the vector holds the dark photoelectrons of an exposure, a nuisance: calibrations measure it
 N_GEOMETRY = len(GEOMETRY)
 PSF_SEEN_FROM = 0.15  # px: the light changes with the square of less, and an interval in px begins at 0
 
@@ -77,7 +80,7 @@ class Vector:
         return Imaging(**geometry, black=black, gain=float(self.values[5]), flat=flat)
 
 
-def vector_of(imaging: Imaging, flat: ArrayLike = (0.0,) * len(FLAT), dark: float = 0.0) -> F64:
+def vector_of(imaging: Imaging, flat: ArrayLike = NO_FLAT, dark: float = 0.0) -> F64:
     """Return the vector of the facts in `imaging`, but for its flat field, which is given by its coefficients."""
     facts = imaging.numbers()
     geometry = [facts[one.name] for one in GEOMETRY]

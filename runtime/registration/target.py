@@ -7,6 +7,7 @@ autocorrelation has the lowest side lobes within two cells (0.25 of the peak), s
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,11 @@ from pans.runtime.npz_file import read_arrays
 
 CELLS = ("#.#..#", "##.#..", "..#..#", "..#...", "..#..#", "##.###")
 SIDE = 28
-LEAST_SIDE, MOST_PIXELS = 14, 4096  # fewer pixels than two per cell blur into each other; beyond, optics' matrices take too much memory
+BUILT_IN = "built-in"
+LEAST_SIDE, MOST_PIXELS = (
+    14,
+    4096,
+)  # fewer pixels than two per cell blur into each other; beyond, optics' matrices take too much memory
 TARGET_BYTES = 1 << 24
 LEAST_SPREAD = 0.05  # standard deviation of the transmission, below which a picture is hardly a target
 
@@ -25,8 +30,8 @@ U8 = NDArray[np.uint8]
 
 
 def built_in_target(side: int = SIDE) -> U8:
-    """Return the built-in target, uint8 (side, side), 255 clear and 0 black; a margin of at least an eighth of the cells' width is black."""
-    if not LEAST_SIDE <= side or side * side > MOST_PIXELS:
+    """Return the built-in target, uint8 (side, side), 255 clear and 0 black, with a black margin."""
+    if side < LEAST_SIDE or side * side > MOST_PIXELS:
         raise ValueError(f"side must be from {LEAST_SIDE} to {int(MOST_PIXELS**0.5)}, found {side}")
     cells = np.array([[255 * (mark == "#") for mark in row] for row in CELLS], np.uint8)
     width = max(1, (side * 7 // 8) // len(CELLS))
@@ -48,12 +53,14 @@ def read_target(path: Path) -> U8:
         except ValueError as error:
             raise UsageError(f"{path}: not a readable scene: {error}", remedy="numpy.savez(FILE, images=)") from error
         if images is None or images.ndim != 3 or images.dtype != np.uint8 or not images.size:
-            raise UsageError(f"{path}: no array `images`, uint8 (objects, rows, columns)", remedy="numpy.savez(FILE, images=)")
+            raise UsageError(
+                f"{path}: no array `images`, uint8 (objects, rows, columns)", remedy="numpy.savez(FILE, images=)"
+            )
         picture = images[0]
     else:
         from pans.runtime.images import read_grey
 
-        picture = read_grey(path)
+        picture = read_grey(path, MOST_PIXELS)
     return _checked(picture, str(path))
 
 
@@ -71,3 +78,9 @@ def _checked(picture: U8, where: str) -> U8:
             remedy="use a target with black and clear parts",
         )
     return np.ascontiguousarray(picture)
+
+
+def target_sha256(target: U8) -> str:
+    """Return the SHA-256 of a target's size and pixels."""
+    size = f"{target.shape[0]}x{target.shape[1]}:".encode()
+    return hashlib.sha256(size + np.ascontiguousarray(target).tobytes()).hexdigest()

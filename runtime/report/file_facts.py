@@ -20,6 +20,7 @@ from pans.runtime.bundle.optics import Analyser
 from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
+from pans.runtime.registration.file import load_registration
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
@@ -38,8 +39,8 @@ def file_facts(path: str | Path) -> dict[str, Any]:
         return {"kind": kind, "path": str(path), "sha256": sha256, **_bundle_facts(bundle)}
     if kind == "recording":
         return {"kind": kind, "path": str(path), **_recording_facts(open_recording(path, salvage=True))}
-    if kind == "calibration":
-        calibration = load_calibration(path)
+    if kind in ("calibration", "registration"):
+        calibration = load_calibration(path) if kind == "calibration" else load_registration(path)
         facts = {key: value for key, value in calibration.values.items() if key != "sha256"}
         return {
             "kind": kind,

@@ -25,6 +25,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import OnnxDecider
 from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
+from pans.runtime.registration.file import age_warnings, is_registration, load_registration
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
@@ -57,7 +58,7 @@ class FileVerdict:
 
 
 def file_kind(path: str | Path) -> str:
-    """Return `bundle`, `recording`, `profile` or `calibration`; UsageError for a missing file, DamagedFileError for anything else."""
+    """Return `bundle`, `recording`, `profile`, `calibration` or `registration`; UsageError for a missing file, DamagedFileError for anything else."""
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
     if is_of_parts(path):
@@ -67,6 +68,8 @@ def file_kind(path: str | Path) -> str:
     suffixes = {".pans": "bundle", ".pansrec": "recording", ".toml": "profile", ".json": "calibration"}
     by_magic = {BUNDLE_MAGIC: "bundle", RECORDING_MAGIC: "recording"}
     kind = by_magic.get(start) or suffixes.get(Path(path).suffix)  # a damaged magic still has its name
+    if kind == "calibration" and is_registration(path):
+        kind = "registration"
     if kind is None:
         raise DamagedFileError(
             f"{path}: it starts with {start!a}, which is no file of this project",
@@ -86,6 +89,8 @@ def verify_file(path: str | Path) -> FileVerdict:
             _verify_recording(read_recording(path), verdict)
         elif verdict.kind == "calibration":
             verdict.alerts += find_warnings(load_calibration(path), now_utc())
+        elif verdict.kind == "registration":
+            verdict.alerts += age_warnings(load_registration(path), now_utc())
         else:
             load_profile(str(path))
     except UsageError:

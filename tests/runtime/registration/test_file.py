@@ -1,0 +1,115 @@
+"""The registration file: what it keeps, what is refused, and `info` and `verify` on it."""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pans.runtime.cli import main
+from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
+from pans.runtime.imaging import Imaging
+from pans.runtime.instrument.calibration import now_utc
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.sealed_json import sealed
+from pans.runtime.registration.estimate import Estimate
+from pans.runtime.registration.file import (
+    FORMAT,
+    VERSION,
+    check_usable,
+    load_registration,
+    parse_registration,
+    registration_values,
+    save_registration,
+)
+from pans.runtime.registration.parameters import DARK, vector_of
+
+PROFILE = load_profile("dmd-spad")
+TABLE = Imaging(right_px=1.0, down_px=-0.5, rotation_deg=2.0, scale=1.01, psf_px=0.6, black=0.002, gain=0.9)
+
+
+def values(**changes: Any) -> dict[str, Any]:
+    found = Estimate(vector_of(TABLE, (0.1, 0.0, 0.0, 0.0, 0.0), 0.004), np.eye(DARK + 1) * 1e-4, 0.0, 9.0, 9, 100, 200)
+    return {
+        "made_utc": now_utc().isoformat(timespec="seconds"),
+        "profile": {"name": PROFILE.name, "sha256": PROFILE.sha256},
+        "device": {},
+        **registration_values(found, (28, 28)),
+        **changes,
+    }
+
+
+def test_what_is_written_is_read_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "table.json"
+    sha256 = save_registration(path, values())
+    found = load_registration(path)
+    assert found.sha256 == sha256
+    assert found.imaging().numbers() == pytest.approx(TABLE.numbers())
+    flat = found.imaging().flat
+    assert flat is not None
+    assert flat[0, 27] == pytest.approx(1.1)
+    assert flat[:, 0] == pytest.approx(0.9)
+    check_usable(found, PROFILE, (28, 28), now_utc())
+    assert found.applied_to(PROFILE).projector.peak_photoelectrons_hz == pytest.approx(0.9 * 2000)
+    with pytest.raises(UsageError, match="exists already"):
+        save_registration(path, values())
+    assert main(["verify", str(path)]) == 0
+    assert main(["info", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (told["kind"], told["parameters"]["right_px"]["value"]) == ("registration", 1.0)
+
+
+def test_a_byte_that_changed_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "table.json"
+    save_registration(path, values())
+    path.write_text(path.read_text().replace('"value": 2.0', '"value": 2.5'))
+    with pytest.raises(DamagedFileError, match="altered"):
+        load_registration(path)
+    assert main(["verify", str(path)]) != 0
+
+
+@pytest.mark.parametrize(
+    ("key", "row", "words"),
+    [
+        ("right_px", {"value": 5.0, "low": 4.0, "high": 6.0, "error": 0.1}, "right_px.value"),
+        ("scale", {"value": 1.0, "low": 1.01, "high": 1.02, "error": 0.1}, "not within 1.01 to 1.02"),
+        ("flat_x", {"value": -0.5, "low": -0.6, "high": 0.0, "error": 0.1}, None),
+        ("black", {"value": 0.0, "low": 0.0, "error": 0.1}, "high is missing"),
+        ("psf_px", [], "register again|list"),
+    ],
+)
+def test_what_cannot_be_is_refused(key: str, row: Any, words: str | None) -> None:
+    changed = values()
+    changed["parameters"][key] = row
+    data = sealed(changed, FORMAT, VERSION)
+    if words is None:  # at its limit, and possible
+        assert parse_registration(data, "table.json").values["parameters"][key] == row
+        return
+    with pytest.raises(DamagedFileError, match=words):
+        parse_registration(data, "table.json")
+
+
+def test_a_flat_field_without_light_is_refused() -> None:
+    changed = values()
+    for key in ("flat_x", "flat_y", "flat_xy"):
+        changed["parameters"][key] = {"value": -0.5, "low": -0.6, "high": 0.0, "error": 0.1}
+    with pytest.raises(DamagedFileError, match="flat"):
+        parse_registration(sealed(changed, FORMAT, VERSION), "table.json")
+
+
+def test_a_run_refuses_what_is_of_another_table(tmp_path: Path) -> None:
+    path = tmp_path / "table.json"
+    save_registration(path, values())
+    found, now = load_registration(path), now_utc()
+    with pytest.raises(ConfigError, match=r"grid of 28 x 28 pixels, the bundle's patterns have 14 x 28"):
+        check_usable(found, PROFILE, (14, 28), now)
+    with pytest.raises(ConfigError, match="made for the profile dmd-spad .* this run uses ideal"):
+        check_usable(found, load_profile("ideal"), (28, 28), now)
+    with pytest.raises(ConfigError, match=r"25\.0 h old, allowed are 24 h"):
+        check_usable(found, PROFILE, (28, 28), now + timedelta(hours=25))
+    with pytest.raises(ConfigError, match=r"1\.0 h in the future"):
+        check_usable(found, PROFILE, (28, 28), now - timedelta(hours=1))
