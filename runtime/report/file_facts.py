@@ -20,10 +20,10 @@ from pans.runtime.bundle.optics import Analyser
 from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
-from pans.runtime.registration.file import load_registration
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
+from pans.runtime.registration.file import load_registration
 
 from .handshakes import handshakes
 from .verify import file_kind

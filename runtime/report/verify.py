@@ -25,7 +25,6 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import OnnxDecider
 from pans.runtime.errors import ConfigError, DamagedFileError, PansError, UsageError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc
-from pans.runtime.registration.file import age_warnings, is_registration, load_registration
 from pans.runtime.instrument.profile import load_profile, parse_profile, shipped_profiles
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.format import MAGIC as RECORDING_MAGIC
@@ -33,6 +32,7 @@ from pans.runtime.record.part_index import compare_with_index
 from pans.runtime.record.part_keeper import INDEX_SUFFIX
 from pans.runtime.record.parts import chain_violations, find_parts, first_decision, is_of_parts, parts_in, stem_of
 from pans.runtime.record.replaying import replay_faults
+from pans.runtime.registration.file import age_warnings, is_registration, load_registration
 from pans.runtime.wire.messages import MalformedMessage, unpack_body
 from pans.runtime.wire.session import ANSWER_TYPES
 
@@ -58,7 +58,10 @@ class FileVerdict:
 
 
 def file_kind(path: str | Path) -> str:
-    """Return `bundle`, `recording`, `profile`, `calibration` or `registration`; UsageError for a missing file, DamagedFileError for anything else."""
+    """Return `bundle`, `recording`, `profile`, `calibration` or `registration`.
+
+    UsageError for a missing file, DamagedFileError for anything else.
+    """
     if str(path) in shipped_profiles() and not Path(path).exists():
         return "profile"
     if is_of_parts(path):

@@ -107,7 +107,7 @@ def test_a_run_refuses_what_is_of_another_table(tmp_path: Path) -> None:
     found, now = load_registration(path), now_utc()
     with pytest.raises(ConfigError, match=r"grid of 28 x 28 pixels, the bundle's patterns have 14 x 28"):
         check_usable(found, PROFILE, (14, 28), now)
-    with pytest.raises(ConfigError, match="made for the profile dmd-spad .* this run uses ideal"):
+    with pytest.raises(ConfigError, match=r"made for the profile dmd-spad .* this run uses ideal"):
         check_usable(found, load_profile("ideal"), (28, 28), now)
     with pytest.raises(ConfigError, match=r"25\.0 h old, allowed are 24 h"):
         check_usable(found, PROFILE, (28, 28), now + timedelta(hours=25))
