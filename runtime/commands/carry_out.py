@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.monitor import Monitor
     from pans.runtime.record import AnyRecorder
+    from pans.runtime.registration.use import InUse
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch import Watchdog
 
@@ -146,7 +147,7 @@ def _monitor_of(job: Job) -> Monitor:
 class _Prepared:
     """All that a run needs beside its link, made while the port opens."""
 
-    bundle: Bundle
+    bundle: Bundle  # with the patterns that are shown
     bundle_sha256: str
     decider: Decider
     dark: DarkRun
@@ -156,6 +157,7 @@ class _Prepared:
     config: RunConfig
     header: dict[str, Any]
     expected_decisions: int
+    registration: InUse | None = None
 
 
 def _prepare(job: Job, started_ns: int) -> _Prepared:
@@ -165,14 +167,20 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
+    from pans.runtime.instrument.calibration import now_utc
     from pans.runtime.live import RunConfig
     from pans.runtime.live.dark_run import DarkRun
     from pans.runtime.live.flow_run import FlowRun
     from pans.runtime.live.gates import open_actuator
+    from pans.runtime.registration.use import in_use
 
     bundle, bundle_sha256 = load_bundle(job.bundle_path)
     decider = make_decider(bundle, shots=job.shots, backend=job.backend, confidence=job.confidence)
-    dark = DarkRun.of(job.dark, job.profile)
+    placed = in_use(job.dark.registration, bundle, job.profile, now_utc(), job.dark.max_age_h)
+    if placed is not None:
+        say(f"pans: {placed.words()}")
+        bundle = placed.shown
+    dark = DarkRun.of(job.dark, placed.profile if placed and not job.dark.calibration else job.profile)
     n_objects, flow_run, seconds = -(-job.decisions // job.trials), None, job.seconds
     core: LiveCore
     if job.flow is not None:
@@ -199,9 +207,11 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     )
     header = recording_header(job, bundle_sha256, decider, n_objects, plan.drive)
     header["config"]["dark"] = dark.header()
+    header["config"] |= {} if placed is None else {"registration": placed.header()}
     if flow_run is not None:
         header["config"]["flow"] = flow_run.header()
-    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, n_objects * job.trials)
+    decisions = n_objects * job.trials
+    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, decisions, placed)
 
 
 def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
@@ -284,6 +294,8 @@ def _watched(
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
+            if ready.registration is not None:
+                ready.registration.check_device(dark.serial_of(run))
             _name_scene(run, job.device)
             seen.prepared(run)
             monitor.prepared(run)
@@ -338,6 +350,7 @@ def _summary(job: Job, ready: _Prepared, result: RunResult) -> Summary:
         flow=None if ready.flow_run is None else ready.flow_run.figures(),
         dark=ready.dark.figures(result.dark),
         walks=walks,
+        registration=None if ready.registration is None else ready.registration.facts(),
     )
 
 

@@ -128,11 +128,17 @@ def add_dark_options(parser: argparse.ArgumentParser) -> None:
         "--calibration", type=Path, metavar="FILE", help="what `pans calibrate` measured on this instrument"
     )
     group.add_argument(
+        "--registration",
+        type=Path,
+        metavar="FILE",
+        help="correct the patterns for the table that `pans calibrate --registration` measured",
+    )
+    group.add_argument(
         "--calibration-max-age-h",
         type=RANGES["calibration_max_age_h"].option,
         default=MAX_AGE_H,
         metavar="H",
-        help=f"older is stale (default {MAX_AGE_H:g})",
+        help=f"older is stale: a calibration is warned about, a registration refused (default {MAX_AGE_H:g})",
     )
     group.add_argument(
         "--on-dark",
@@ -146,9 +152,11 @@ def dark_of(args: argparse.Namespace) -> DarkSettings:
     """Return what the command line asks for; `pans demo` has no instrument to calibrate, and asks for nothing."""
     if not hasattr(args, "calibration"):
         return DarkSettings()
-    if args.calibration is None:
-        refuse_without(args, "--calibration", {"calibration_max_age_h": MAX_AGE_H})
-    return DarkSettings(args.calibration, args.calibration_max_age_h, args.on_dark, warns=True)
+    if args.calibration is None and args.registration is None:
+        refuse_without(args, "--calibration or --registration", {"calibration_max_age_h": MAX_AGE_H})
+    return DarkSettings(
+        args.calibration, args.calibration_max_age_h, args.on_dark, warns=True, registration=args.registration
+    )
 
 
 def add_continuous_options(parser: argparse.ArgumentParser) -> None:

@@ -54,7 +54,7 @@ def check_run_files(job: Job) -> None:
 
 def input_files(job: Job) -> list[str | Path | None]:
     """Return the files that a run reads."""
-    return [*job.inputs, job.bundle_path, job.dark.calibration, *files_of_url(job.device)]
+    return [*job.inputs, job.bundle_path, job.dark.calibration, job.dark.registration, *files_of_url(job.device)]
 
 
 def _check_disk(job: Job) -> None:

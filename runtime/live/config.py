@@ -63,6 +63,7 @@ class DarkSettings:
     max_age_h: float = MAX_AGE_H
     policy: str = "warn"
     warns: bool = False  # about a calibration that is missing or old
+    registration: Path | None = None  # of the optical table; its age is checked like a calibration's
 
 
 @dataclass(slots=True)

@@ -121,12 +121,17 @@ class DarkRun:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
         if run.compiled is not None:
             self.light.take_many(np.zeros(0, DECISION_DTYPE), int(NOT_MEASURED))  # compiles or loads its kernel
-        welcome = run.connection.session.welcome
-        serial = None if welcome is None else welcome.facts.get("serial")
         if self.calibration is not None:
-            find_objections(self.calibration, self.profile, None if serial is None else str(serial))
+            find_objections(self.calibration, self.profile, self.serial_of(run))
         for warning in self.warnings:
             run.journal.note("calibration_warning", words=warning)
+
+    @staticmethod
+    def serial_of(run: LiveRun) -> str | None:
+        """The serial number that the device told, if any."""
+        welcome = run.connection.session.welcome
+        serial = None if welcome is None else welcome.facts.get("serial")
+        return None if serial is None else str(serial)
 
     def look(self, run: LiveRun, output: Output) -> None:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""

@@ -82,6 +82,7 @@ class Summary:
     calibration: dict[str, Any] | None
     calibration_warnings: list[str]
     light: dict[str, Any] | None
+    registration: dict[str, Any] | None = None  # of the optical table, and what the correction of the patterns came to
 
     @property
     def accuracy(self) -> float | None:
@@ -115,6 +116,7 @@ def summarise(
     flow: FlowFigures | None = None,
     dark: DarkFigures | None = None,
     walks: WalkFigures | None = None,
+    registration: dict[str, Any] | None = None,
 ) -> Summary:
     """Return the summary of `result`; `illumination` is per decision, in photoelectrons per unit transmission."""
     timing = result.timing
@@ -157,6 +159,7 @@ def summarise(
         calibration=dark.calibration,
         calibration_warnings=dark.warnings,
         light=dark.light,
+        registration=registration,
     )
 
 
