@@ -1,13 +1,14 @@
 """The calibration file: what was measured on one instrument, when and how; beside the profile, never a rewrite of it.
 
-Owns the file (strict JSON with a checksum over all of it), its checks, and what a run takes from it: the brightness of the
-projector, the dark rates and their intervals. Never measures (estimate.py) and never watches (cusum.py, light_level.py).
-`load_calibration` returns a `Calibration` whose every figure is possible, or raises DamagedFileError; `find_objections` says
-why a run must not use one."""
+Owns the file (strict JSON with a checksum over all of it, as registrations have it too), its checks, and what a run takes from it:
+the brightness of the projector, the dark rates and their intervals. Never measures (estimate.py) and never watches (cusum.py,
+light_level.py). `load_calibration` returns a `Calibration` whose every figure is possible, or raises DamagedFileError;
+`find_objections` says why a run must not use one."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -17,14 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import read_file
-from pans.runtime.errors import DamagedFileError
+from pans.runtime.container import canonical_json, parse_json_object, read_file
+from pans.runtime.errors import ConfigError, DamagedFileError
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, number_text
 
 from .click_law import ClickLaw, log_no_click
 from .profile import Profile
-from .sealed_json import check_made_for, sealed, unsealed
 
 FORMAT = "pans-calibration"
 VERSION = 1
@@ -124,6 +124,39 @@ def parse_calibration(data: bytes, where: str) -> Calibration:
     except (TypeError, ValueError, OverflowError) as error:
         raise DamagedFileError(f"{where}: {error}", remedy="calibrate again") from error
     return Calibration(where, hashlib.sha256(data).hexdigest(), values)
+
+
+def sealed(values: Mapping[str, Any], format_name: str, version: int) -> bytes:
+    """Return the file's bytes: `values` (JSON-able) with format, version and checksum."""
+    body = {"format": format_name, "version": version, **values}
+    whole = {**body, "sha256": hashlib.sha256(canonical_json(body)).hexdigest()}
+    return (json.dumps(whole, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def unsealed(data: bytes, where: str, format_name: str, version: int) -> dict[str, Any]:
+    """Return what the bytes of a file hold; DamagedFileError for another format, or where the checksum does not fit."""
+    values = parse_json_object(data, where)
+    if values.get("format") != format_name or values.get("version") != version:
+        found = f"{ascii(values.get('format'))[:40]} {ascii(values.get('version'))[:20]}"
+        raise DamagedFileError(f"{where}: format {found}, allowed: {format_name} {version}")
+    body = {key: value for key, value in values.items() if key != "sha256"}
+    if values.get("sha256") != hashlib.sha256(canonical_json(body)).hexdigest():
+        raise DamagedFileError(f"{where}: altered: its checksum does not fit what it says", remedy="calibrate again")
+    return values
+
+
+def check_made_for(where: str, values: Mapping[str, Any], profile: Profile, serial: str | None, command: str) -> None:
+    """Raise ConfigError if the file is of another profile or, where the device has told its serial number, of another device."""
+    made_for = values["profile"]
+    if made_for["sha256"] != profile.sha256:
+        raise ConfigError(
+            f"{where}: made for the profile {made_for['name']} ({made_for['sha256'][:12]}…), this run uses {profile.name} "
+            f"({profile.sha256[:12]}…)",
+            remedy=f"calibrate with this profile: {command} --profile {profile.name}",
+        )
+    of_device = values["device"].get("serial")
+    if serial is not None and of_device is not None and of_device != serial:
+        raise ConfigError(f"{where}: made on the device {of_device}, this is {serial}", remedy="calibrate this device")
 
 
 def find_objections(calibration: Calibration, profile: Profile, serial: str | None) -> None:

@@ -21,9 +21,7 @@ from pans.runtime.errors import ConfigError
 from pans.runtime.imaging import IDENTITY, Imaging, levelled, operator
 
 PRIOR_MEAN, PRIOR_SD, PRIOR_REACH_PX = 0.3, 0.3, 3.0
-LEAST_LIGHT = (
-    0.8  # of what the trained patterns bring: less means that they reach beyond the grid, or that levels do not suffice
-)
+LEAST_ON_GRID = 0.8  # of the light of the trained patterns: the rest would have to shine beyond the grid
 CHANGES_MAX = 4000  # of one pattern
 _PATTERNS_AT_ONCE = 512
 F64 = NDArray[np.float64]
@@ -45,22 +43,23 @@ def corrected(
 ) -> tuple[Bundle, Correction]:
     """Return `bundle` with the levels to show on the table `imaging`, of a bundle made for `trained` optics, and what that came to.
 
-    `gain` is not corrected here: the exposure is (`Registered.applied_to`). ConfigError where more than a fifth of the light would be lost.
+    `gain` is not corrected here: the exposure is (`Registered.applied_to`). ConfigError where more than a fifth of the light has its place beyond the grid.
     """
     shape, top = bundle.image_shape, bundle.levels - 1
     now, then = replace(imaging, gain=1.0), replace(trained, gain=1.0)
     task = _Task.of(now, then, shape, top)
     wanted_of = task.wanted(bundle.pattern_levels)
+    on_grid = task.on_grid(wanted_of)
+    if on_grid < LEAST_ON_GRID:
+        raise ConfigError(
+            f"{where}: on the measured table {on_grid:.0%} of the patterns' light has its place on the grid, needed {LEAST_ON_GRID:.0%}",
+            remedy="align the table by hand first",
+        )
     levels = np.empty_like(bundle.pattern_levels)
     for first in range(0, len(levels), _PATTERNS_AT_ONCE):
         rows = slice(first, first + _PATTERNS_AT_ONCE)
         levels[rows] = task.solve(bundle.pattern_levels[rows].astype(np.float64), wanted_of[rows])
     found = task.judged(bundle.pattern_levels, levels, wanted_of)
-    if found.light_kept < LEAST_LIGHT:
-        raise ConfigError(
-            f"{where}: on the measured table {found.light_kept:.0%} of the patterns' light would be left, needed {LEAST_LIGHT:.0%}",
-            remedy="align the table by hand first: the patterns reach beyond the grid, or their top level is too dim",
-        )
     return replace(bundle, pattern_levels=frozen(levels)), found
 
 
@@ -91,6 +90,11 @@ class _Task:
         """What the trained patterns show an object on the table that they were trained for, (patterns, object pixels)."""
         light = levelled(self.trained, levels.astype(np.float64), self.shape, float(self.top))
         return light if self.trained.in_place else np.asarray(light @ operator(self.trained, self.shape))
+
+    def on_grid(self, wanted: F64) -> float:
+        """Return the share of the wanted light that is for object pixels which the grid can reach."""
+        reached = self.there.sum(axis=1)
+        return float((wanted @ (reached / max(float(reached.max()), 1e-300))).sum() / wanted.sum())
 
     def solve(self, trained: F64, wanted: F64) -> F64:
         """Return the levels of patterns (n, pixels) that bring `wanted`."""

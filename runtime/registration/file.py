@@ -19,9 +19,8 @@ import numpy as np
 from pans.runtime.container import read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
 from pans.runtime.imaging import Imaging
-from pans.runtime.instrument.calibration import MAX_AGE_H
+from pans.runtime.instrument.calibration import MAX_AGE_H, check_made_for, sealed, unsealed
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.instrument.sealed_json import check_made_for, sealed, unsealed
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, demand, number_text
 

@@ -16,8 +16,8 @@ from pans.runtime.bundle.facts import Bundle
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import IDENTITY, Imaging
 from pans.runtime.imaging.spec import tolerance_of
+from pans.runtime.instrument.calibration import check_made_for
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.instrument.sealed_json import check_made_for
 
 from .correct import Correction, corrected
 from .file import Registered, check_usable, load_registration

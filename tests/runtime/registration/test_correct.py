@@ -80,7 +80,9 @@ def test_the_flat_field_is_levelled(fashion10: Bundle) -> None:
 
 
 def test_a_table_that_loses_the_light_is_refused(fashion10: Bundle) -> None:
-    with pytest.raises(ConfigError, match=r"table\.json: on the measured table .* needed 80%"):
+    with pytest.raises(
+        ConfigError, match=r"table\.json: on the measured table .* has its place on the grid, needed 80%"
+    ):
         corrected(inside(fashion10, 4, 5), Imaging(right_px=16.0), where="table.json")
 
 

@@ -13,9 +13,8 @@ import pytest
 from pans.runtime.cli import main
 from pans.runtime.errors import ConfigError, DamagedFileError, UsageError
 from pans.runtime.imaging import Imaging
-from pans.runtime.instrument.calibration import now_utc
+from pans.runtime.instrument.calibration import now_utc, sealed
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.instrument.sealed_json import sealed
 from pans.runtime.registration.estimate import Estimate
 from pans.runtime.registration.file import (
     FORMAT,
