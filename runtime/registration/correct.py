@@ -43,7 +43,8 @@ def corrected(
 ) -> tuple[Bundle, Correction]:
     """Return `bundle` with the levels to show on the table `imaging`, of a bundle made for `trained` optics, and what that came to.
 
-    `gain` is not corrected here: the exposure is (`Registered.applied_to`). ConfigError where more than a fifth of the light has its place beyond the grid.
+    `gain` is not corrected here: the exposure is (`Registered.applied_to`). ConfigError where more than a fifth of the
+    light has its place beyond the grid.
     """
     shape, top = bundle.image_shape, bundle.levels - 1
     now, then = replace(imaging, gain=1.0), replace(trained, gain=1.0)
