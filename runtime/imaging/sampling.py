@@ -79,8 +79,8 @@ def _gathered(imaging: Imaging, pixels: F64, shape: Shape) -> F64:
     row_weight, column_weight = row_weight * _inside(row, rows), column_weight * _inside(column, columns)
     row, column = row.clip(0, rows - 1), column.clip(0, columns - 1)
     if len(pixels) <= FEW_OBJECTS and row.size * column.shape[1] <= WEIGHTS_AT_ONCE:
-        down, along = row[:, :, None], column[:, None, :]
-        near = (one.reshape(rows, columns)[down, along] for one in pixels)  # (grid, taps down, taps along)
+        place = row[:, :, None], column[:, None, :]
+        near = (one.reshape(rows, columns)[place] for one in pixels)  # (grid, taps down, taps along)
         return np.array([np.einsum("gd,gda,ga->g", row_weight, taps, column_weight, optimize=True) for taps in near])
     result = np.zeros((len(pixels), rows * columns))
     for first in range(0, len(pixels), _OBJECTS_AT_ONCE):

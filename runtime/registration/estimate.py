@@ -137,10 +137,10 @@ def estimate(bench: Bench, observed: Observed, library: Library | None = None, s
 def coarse(bench: Bench, observed: Observed, library: Library, count: int = STARTS) -> list[F64]:
     """Return the `count` best vectors of the search: at every place, light and background are fitted to the means that the clicks tell."""
     lit = observed.lit
-    rows, told, weight = observed.pattern[lit], _told_means(bench, observed)[lit], observed.exposures[lit]
+    rows, told = observed.pattern[lit], _told_means(bench, observed)[lit]
     shapes = observed.patterns @ library.appearance.T * bench.photons_per_level
     shapes = shapes[rows]  # (groups, places)
-    weight = weight / np.maximum(told, np.median(told) / 10)  # variance of a mean, nearly
+    weight = observed.exposures[lit] / np.maximum(told, np.median(told) / 10)  # variance of a mean, nearly
     mean_x, mean_y = weight @ shapes / weight.sum(), weight @ told / weight.sum()
     x, y = shapes - mean_x, told - mean_y
     xy, xx = (weight * y) @ x, weight @ (x * x)

@@ -63,7 +63,7 @@ def flat_basis(shape: Shape) -> F64:
 
 
 def _marks(size: int) -> F64:
-    return (np.arange(size) - (size - 1) / 2) / max((size - 1) / 2, 1.0)
+    return (np.arange(size, dtype=np.float64) - (size - 1) / 2) / max((size - 1) / 2, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
