@@ -67,23 +67,31 @@ typedef struct { uint64_t index, tick, exposure; uint32_t object, shot, clicks; 
 #pragma pack(pop)
 void prepare(void) { make_tables(); }
 
+typedef struct { const uint8_t *data, *end; uint32_t session, schema, seq; uint8_t *kept; int64_t out; } wire_t;
+static uint8_t body[70000];
+
+/* The next message into `body`, kept as a record is; its size without the checksum, 0 at the end, -1 where it is not in order. */
+static int64_t next(wire_t *w) {
+    if (w->data >= w->end) return 0;
+    const uint8_t *stop = memchr(w->data, 0, w->end - w->data);
+    if (!stop) return -1;
+    int64_t size = unstuff(w->data, stop - w->data, body) - 4;
+    w->data = stop + 1;
+    if (size < 12 || crc(body, size, w->schema) != u32(body + size) || u32(body + 4) != w->session || u32(body + 8) != w->seq++) return -1;
+    memcpy(w->kept + w->out, body, size); w->out += size;
+    if (w->out > 900000) w->out = 0;
+    return size;
+}
+
 /* Frames in `data`: marks and CLICKS of a walk, one cycle for each object; rows of decisions out. Returns how many, -1 at anything else. */
 int64_t walks(const uint8_t *data, int64_t n, uint32_t session, uint32_t schema, int64_t ticks, const uint32_t *successors, int64_t states,
               const uint16_t *labels, const float *probabilities, const int64_t *step_at, int64_t slots, int64_t features,
               const uint32_t *count_crc, uint32_t zero_crc, row_t *rows, uint8_t *kept, int64_t *steps) {
-    static uint8_t body[70000];
-    int64_t rows_n = 0, exposure = 0, node = 0, clicks = 0, lit = 0, out = 0, blocks = 0;
-    uint32_t seq = 0, cc = zero_crc;
+    int64_t rows_n = 0, exposure = 0, node = 0, clicks = 0, lit = 0, blocks = 0, size;
+    uint32_t cc = zero_crc;
     int16_t truth = -1;
-    const uint8_t *end = data + n;
-    while (data < end) {
-        const uint8_t *stop = memchr(data, 0, end - data);
-        if (!stop) return -1;
-        int64_t size = unstuff(data, stop - data, body) - 4;
-        data = stop + 1;
-        if (size < 12 || crc(body, size, schema) != u32(body + size) || u32(body + 4) != session || u32(body + 8) != seq++) return -1;
-        memcpy(kept + out, body, size); out += size;
-        if (out > 900000) out = 0;
+    wire_t wire = {data, data + n, session, schema, 0, kept, 0};
+    while ((size = next(&wire)) > 0) {
         if (body[0] == 0x92) { truth = (int16_t)(body[16] | body[17] << 8); node = clicks = lit = 0; cc = zero_crc; continue; }
         if (body[0] != 0x90 || u64(body + 24) != (uint64_t)exposure) return -1;
         int64_t decoded = now(), count = body[36] | body[37] << 8, object = u32(body + 40);
@@ -103,7 +111,7 @@ int64_t walks(const uint8_t *data, int64_t n, uint32_t session, uint32_t schema,
         int64_t decided = now(), *s = steps + 4 * (blocks++ & 1023);
         s[0] = decoded; s[1] = decided; s[2] = rows_n; s[3] = now();
     }
-    return rows_n;
+    return size ? -1 : rows_n;
 }
 
 /* FRAMES of words of `width` bytes that a table decides, every lit frame a row. */
@@ -111,19 +119,10 @@ int64_t words(const uint8_t *data, int64_t n, uint32_t session, uint32_t schema,
               const uint16_t *labels, const float *probabilities,
               const int64_t *word_rows, const uint32_t *word_crc, uint32_t zero_crc, const uint8_t *lit, int64_t slots, int64_t width,
               row_t *rows, uint8_t *kept) {
-    static uint8_t body[70000];
-    int64_t rows_n = 0, exposure = 0, out = 0, shot = 0;
-    uint32_t seq = 0;
+    int64_t rows_n = 0, exposure = 0, shot = 0, size;
     int16_t truth = -1;
-    const uint8_t *end = data + n;
-    while (data < end) {
-        const uint8_t *stop = memchr(data, 0, end - data);
-        if (!stop) return -1;
-        int64_t size = unstuff(data, stop - data, body) - 4;
-        data = stop + 1;
-        if (size < 12 || crc(body, size, schema) != u32(body + size) || u32(body + 4) != session || u32(body + 8) != seq++) return -1;
-        memcpy(kept + out, body, size); out += size;
-        if (out > 900000) out = 0;
+    wire_t wire = {data, data + n, session, schema, 0, kept, 0};
+    while ((size = next(&wire)) > 0) {
         if (body[0] == 0x92) { truth = (int16_t)(body[16] | body[17] << 8); continue; }
         if (body[0] != 0x91 || u64(body + 24) != (uint64_t)exposure) return -1;
         int64_t count = body[36] | body[37] << 8, object = u32(body + 40), slot = exposure % slots;
@@ -140,7 +139,7 @@ int64_t words(const uint8_t *data, int64_t n, uint32_t session, uint32_t schema,
             rows_n++, shot++;
         }
     }
-    return rows_n;
+    return size ? -1 : rows_n;
 }
 """
 )
