@@ -117,6 +117,14 @@ class Analyser:
         light = incident_intensity(images, self.light, self.optics).reshape(len(images), -1).astype(np.float64)
         return np.asarray(light @ wide)
 
+    def reaching(self, images: NDArray[np.uint8]) -> float:
+        """Return the photoelectrons per object of `images`, on average, that must reach optics which give what W gives, at least."""
+        light = 0.0
+        for start in range(0, len(images), _IMAGES_AT_ONCE):
+            field = incident_field(images[start : start + _IMAGES_AT_ONCE], self.light, self.optics)
+            light += float(np.square(np.abs(field)).sum(dtype=np.float64))
+        return amplification(self.kind, self.matrix) * self.full_scale_photoelectrons * light / len(images)
+
     @property
     def fingerprint(self) -> str:
         """SHA-256 (hex) of everything that decides on the light: two sensors that agree in it measure the same."""
@@ -124,6 +132,18 @@ class Analyser:
         digest = hashlib.sha256("\n".join(facts).encode())
         digest.update(np.ascontiguousarray(self.matrix).data)
         return digest.hexdigest()
+
+
+def amplification(kind: str, matrix: NDArray[Any]) -> float:
+    """Return how much light optics with this W (d_f, pixels) give at most for light of 1, in float64.
+
+    Coherent: the largest singular value squared. Incoherent: the largest sum of a column. Above 1, W makes light that no passive optics
+    make: a real device gives the same from that many times the light.
+    """
+    if kind == "incoherent":
+        return float(matrix.sum(axis=0, dtype=np.float64).max())
+    wide = matrix.astype(np.complex128 if np.iscomplexobj(matrix) else np.float64)
+    return float(np.linalg.norm(wide, ord=2)) ** 2
 
 
 def check_analyser(analyser: Analyser) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle, load_bundle
-from pans.runtime.bundle.optics import Analyser
+from pans.runtime.bundle.optics import Analyser, amplification
 from pans.runtime.bundle.walks import shortest_walk
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.instrument.calibration import load_calibration, now_utc
@@ -98,15 +98,15 @@ def _automaton_facts(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
 
 
 def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
-    singular = np.linalg.svd(analyser.matrix, compute_uv=False)
     return {
         "light": analyser.light,
         "optics": analyser.optics,
         "complex": bool(np.iscomplexobj(analyser.matrix)),
         "full_scale_photoelectrons": analyser.full_scale_photoelectrons,
         "exposure_us": analyser.exposure_us,
-        "largest_singular_value": float(singular[0]),
+        "largest_singular_value": amplification("coherent", analyser.matrix) ** 0.5,
         "largest_column_sum": float(np.abs(analyser.matrix).sum(axis=0).max()),
+        "amplification": amplification(analyser.kind, analyser.matrix),
         "fingerprint": analyser.fingerprint,
     }
 

@@ -10,7 +10,6 @@ import re
 from pathlib import Path
 
 from pans.runtime.outputs import replace_file
-from pans.trainer import frontier
 from pans.trainer.frontier.summary import by_point, click_budgets, error_of, margins
 from pans.trainer.paper.page import Column, Rows, Table, read_rows
 from pans.trainer.paper.tables import FIRST, FIRST_OBJECTS
@@ -42,7 +41,7 @@ def index_table(folder: Path, page: str = "{page}") -> Table:
 
 def claims_of(name: str, rows: Rows) -> list[tuple[str, Claim]]:
     """Return what a page claims, each with the heading of its table."""
-    if name in frontier.NAMES:
+    if name == "frontier":
         return _of_the_frontier(rows)
     tables: list[Table] = list(page_of(name).tables(rows))
     return [

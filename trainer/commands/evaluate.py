@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.automaton import CONFIDENCE_RANGE
+from pans.runtime.bundle.optics import amplification
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
@@ -118,6 +119,7 @@ def _evaluate(args: argparse.Namespace) -> int:
                 **walk_payload(walks),
                 **_compared(bundle, measured, held_out, args),
             }
+        more |= passive_light(bundle, held_out)
     payload = {
         **asdict(measured),
         **more,
@@ -193,6 +195,17 @@ def _draw(args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, condition
     return [str(path) for path in written]
 
 
+def passive_light(bundle: Bundle, held_out: HeldOut) -> dict[str, Any]:
+    """Return what a passive sensor's figures stand on: how much light its W makes, and how much must reach real optics for it."""
+    if bundle.analyser is None:
+        return {}
+    reaching = bundle.analyser.reaching(held_out.objects.images)
+    return {
+        "amplification": amplification(bundle.analyser.kind, bundle.analyser.matrix),
+        "reaching_photons": reaching,
+    }
+
+
 def words_of(
     measured: Measured | MeasuredPictures | MeasuredWalks, more: Mapping[str, Any] = MappingProxyType({})
 ) -> str:
@@ -201,6 +214,8 @@ def words_of(
     if "exposures_mean" in figures:
         return _walk_words(figures, more)
     light = f"  clicks {measured.clicks_mean:.3f}   photons {measured.photons_mean:.2f}   illumination {measured.illumination:.1f}"
+    if "reaching_photons" in more:
+        light += f"\n  {_reaching_words(more)}"
     if "ssim_mean" in figures:
         return (
             f"SIMULATED SSIM {figures['ssim_mean']:.4f}, mean squared error {figures['mse_mean']:.4f}  "
@@ -214,6 +229,13 @@ def words_of(
         f"  spread over trials      {100 * figures['accuracy_std']:.2f} points\n"
         f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}"
     )
+
+
+def _reaching_words(more: Mapping[str, Any]) -> str:
+    words = f"at least {more['reaching_photons']:,.0f} photoelectrons per object must reach the optics"
+    if more["amplification"] > 1:
+        words += f": W is unconstrained and gives up to {more['amplification']:,.3g} times its light"
+    return words
 
 
 def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:

@@ -32,7 +32,7 @@ from pans.trainer.options import (
 
 from .arguments import add_data_dir, add_threads, needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
-from .evaluate import words_of
+from .evaluate import passive_light, words_of
 from .train_own import Chosen, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ OF_AUTOMATA = (
     *("exposures", "states", "patterns", "grey", "strength", "decide", "outcomes", "exposure_price", "soft", "teacher"),
 )
 AS_GIVEN = (
-    *("features", "photons", "budget", "complex_field", "conserving", "optics"),
+    *("features", "photons", "budget", "complex_field", "optics"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
 )
 
@@ -164,7 +164,15 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
 def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     """Optics, estimator and head; the budget of light, which automata have too."""
     parser.add_argument("--complex-field", action="store_true", help="a coherent encoder's W is complex, not real")
-    parser.add_argument("--conserving", action="store_true", help="a passive encoder gives no more light than it gets")
+    made = parser.add_mutually_exclusive_group()
+    made.add_argument(
+        "--conserving", action="store_true", help="a passive encoder gives no more light than it gets (default)"
+    )
+    made.add_argument(
+        "--unconstrained",
+        action="store_true",
+        help="a passive encoder may give more light than it gets, as the paper's does",
+    )
     parser.add_argument(
         "--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local; of pictures ste"
     )
@@ -264,10 +272,10 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
     from pans.trainer.evaluate.held_out import HeldOut, measure, trials_needed
 
     bundle = exported.bundle
-    trials = trials_needed(bundle)
-    measured, of_first = (
-        measure(bundle, HeldOut(task, task.test.first(count), profile), trials=trials) for count in (None, 200)
-    )
+    trials, every = trials_needed(bundle), HeldOut(task, task.test, profile)
+    measured = measure(bundle, every, trials=trials)
+    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials)
+    light = passive_light(bundle, every)
     figures = {
         "sha256": exported.sha256,
         **asdict(measured),
@@ -278,8 +286,9 @@ def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile)
         "words_compared": exported.words_compared,
         "dead_patterns": exported.dead_patterns,
         "validation_losses": trained.validation_losses,
+        **light,
     }
-    return figures, words_of(measured)
+    return figures, words_of(measured, light)
 
 
 def _history(args: argparse.Namespace, options: Options, checkpoint: Path, task: Task) -> History | None:
@@ -312,6 +321,10 @@ def _options(args: argparse.Namespace, task: Task, profile: Profile) -> Options:
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
     given: dict[str, Any] = {"optics": stated_tolerance(profile) if encoder == "active" else None}
     given |= {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
+    if encoder != "active":
+        given["conserving"] = not args.unconstrained
+    elif args.unconstrained:
+        raise UsageError("--unconstrained belongs to a passive encoder", remedy="leave it out")
     return Options(alpha=alpha, estimator=estimator, encoder=encoder, head=head, **given)
 
 

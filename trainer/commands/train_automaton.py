@@ -51,7 +51,18 @@ TAKEN = (
 )
 FOREIGN = (
     *("features", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
-    *("polish", "similarity", "mix", "shots", "hidden", "slope", "clamp", "complex_field", "conserving"),
+    *(
+        "polish",
+        "similarity",
+        "mix",
+        "shots",
+        "hidden",
+        "slope",
+        "clamp",
+        "complex_field",
+        "conserving",
+        "unconstrained",
+    ),
 )
 
 

@@ -1,6 +1,7 @@
 """The page `frontier`: every row there is, the tables made of the rows, and the pictures.
 
-Owns the order of the work (one seed of everything before the next) and the tables; the recipes are in ways.py.
+Owns the list of the package's pages; of this one the order of the work (one seed of everything before the next) and the tables. Its recipes
+are in ways.py.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from pans.trainer.tasks.registry import Task, load_task
 from . import pictures, plots
 from .automata import bundle_path
 from .fixed import PAPER, fixed_rows, paper_rows
+from .one_photon import one_photon_page, one_photon_tables
+from .reaching import reaching_page, reaching_tables
 from .summary import by_point, click_budgets, commands, largest, margins, missing
 from .ways import AUTOMATON, TASKS, Point, points, row_of
 
@@ -98,4 +101,10 @@ def frontier_tables(rows: Rows) -> list[Table]:
     return [*tables, Table(columns("point_missing"), lacking, "## Not measured yet")] if lacking else tables
 
 
-PAGES = pages({"frontier": (frontier_page, frontier_tables)})
+PAGES = pages(
+    {
+        "frontier": (frontier_page, frontier_tables),
+        "reaching": (reaching_page, reaching_tables),
+        "one-photon": (one_photon_page, one_photon_tables),
+    }
+)

@@ -1,4 +1,4 @@
-"""The frontier as a picture: accuracy against photons and against clicks, one colour per way.
+"""The pages of the package as pictures: accuracy against photons, clicks and the light at the optics, one colour per way.
 
 Owns axes, colours and labels; never measures.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.paper.page import Rows
@@ -30,6 +32,10 @@ STYLES: dict[str, dict[str, Any]] = {
     STOPPING: {"color": "C0", "marker": "v", "mfc": "w", "ls": "--"},
     MASKS: {"color": "C2", "marker": "D", "ms": 4},
     HADAMARD: {"color": "C4", "marker": "P"},
+}
+REACHING: dict[str, dict[str, Any]] = {  # by encoder
+    "unconstrained": {"color": "C3", "marker": "o", "ls": ""},
+    "conserving": {"color": "C1", "marker": "s", "ls": "--"},
 }
 AXES = (("photons_mean", "photons detected per decision"), ("clicks_mean", "clicks per decision"))
 
@@ -70,3 +76,25 @@ def _ways(axis: Any, points: Rows, key: str) -> None:
         shared = {"ms": 5, "lw": 1.3, "capsize": 2} | style
         x, y = ([row[part][k] for row in curve] for k in (key, "accuracy_mean"))
         axis.errorbar(x, [100 * value for value in y], errors, **shared, label=words)
+
+
+def reaching(path: Path, rows: Rows) -> None:
+    """Draw a panel per task: accuracy over the light that must reach the optics, of both kinds of W and of direct imaging there."""
+    names = list(dict.fromkeys(row["task"] for row in rows))
+    figure, panels = new_figure(width=11, height=8.5, panels=2, rows=-(-len(names) // 2))
+    for axis, name in zip(np.ravel(panels), names):
+        of_task = sorted((row for row in rows if row["task"] == name), key=lambda row: float(row["reaching"]))
+        for kind, style in REACHING.items():
+            part = [row for row in of_task if row["encoder"] == kind]
+            axis.plot(
+                [row["reaching"] for row in part], [row["value"] for row in part], label=f"PANS, W {kind}", **style
+            )
+        direct = sorted({(row["direct"]["photons"], row["direct"]["value"]) for row in of_task})
+        ways = " or ".join(dict.fromkeys(row["direct"]["way"] for row in of_task))
+        axis.plot(*zip(*direct), color="C0", marker=".", label=f"direct imaging, {ways}")
+        words = "photons that must reach the optics, per decision"
+        axis.set(xscale="log", xlabel=words, ylabel="accuracy, %", title=name, ylim=(45, 101))
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, loc="lower right")
+    figure.suptitle("held-out objects of our generators, no dark counts in direct imaging (SIMULATED)", fontsize=10)
+    save_figure(figure, path)

@@ -12,6 +12,7 @@ SIMULATED on the profile `ideal`. Finished figures lie in the cache folder, one 
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from dataclasses import replace
@@ -23,8 +24,8 @@ from pans.runtime.bundle.optics import incident_field
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.outputs import replace_file
 from pans.trainer.baselines.bayes import bayes
+from pans.trainer.baselines.common import Decide, Measurement, run_trials
 from pans.trainer.baselines.common import measure as measure_frames
-from pans.trainer.baselines.common import run_trials
 from pans.trainer.baselines.direct import aware_cnn
 from pans.trainer.model.field_basis import principal_fields
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
@@ -82,18 +83,24 @@ def equal_page(asked: Asked) -> Made:
     rows = []
     for ways in (WAYS[:3], WAYS[3:]):  # the networks last: they take longest
         for name in TASKS:
-            task = None
             wanted = [way for way in ways if way != "equal light" or name in FIELD_RATES]
-            for way, photons in ((way, photons) for way in wanted for photons in PHOTONS):
-                path = asked.cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
-                found = _finished(path, name, way, photons)
-                if found is None and not asked.collect:
-                    task = task or load_task(name, asked.data_dir)
-                    found = _made(path, task, way, photons)
-                    asked.report(f"{name}, {way}, {photons:g} photons: {found['value']:.2f} %")
-                if found is not None:
-                    rows.append(found)
-    return Made(rows)
+            rows += [equal_row(asked, name, way, photons) for way in wanted for photons in PHOTONS]
+    return Made([row for row in rows if row is not None])
+
+
+def equal_row(asked: Asked, name: str, way: str, photons: float) -> Row | None:
+    """Return the row of a task, way and level, measured now if need be; None where it is missing and `collect` is asked for."""
+    path = asked.cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
+    found = _finished(path, name, way, photons)
+    if found is None and not asked.collect:
+        found = _made(path, _task(name, asked.data_dir), way, photons)
+        asked.report(f"{name}, {way}, {photons:g} photons: {found['value']:.2f} %")
+    return found
+
+
+@functools.lru_cache(maxsize=1)  # the rows of a task share it
+def _task(name: str, data_dir: str | None) -> Task:
+    return load_task(name, data_dir)
 
 
 def _finished(path: Path, name: str, way: str, photons: float) -> Row | None:
@@ -137,9 +144,14 @@ def _direct(task: Task, way: str, photons: float) -> Row:
         decide, _ = bayes(frames, photons, "counting", seed=0, floor=how["floor"])
     else:
         decide = aware_cnn(frames, photons, "counting", seed=0, epochs=how["epochs"])
+    return how | direct_figures(task, frames, photons, decide)
+
+
+def direct_figures(task: Task, frames: Measurement, photons: float, decide: Decide) -> Row:
+    """Return the figures of a row of direct imaging at `photons`, decided by `decide`, over `TRIALS` trials of all held-out frames."""
     done = run_trials(frames, photons, "counting", decide, trials=TRIALS, seed=0)
     whole, first = done.measured(), done.measured(200)
-    return how | {
+    return {
         "value": 100 * whole.accuracy_mean,
         "first_200": 100 * first.accuracy_mean,
         "spread_trials": 100 * whole.accuracy_std,

@@ -24,8 +24,9 @@ from torch import Tensor
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import replace_file
 from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
-from pans.trainer.export.writer import export_trained
+from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
+from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.ssim import ssim
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks import barcode as task_barcode
@@ -140,7 +141,17 @@ def measure(name: str, task: Task, trained: Trained) -> Row:
             "clicks": float((p.sum(dim=1) * share).sum()),
             "photons": float((light.sum(dim=1) * share).sum()),
             "illumination": float(trained.encoder.illumination()),
-        }
+        } | _reaching(name, task, objects, trained)
+
+
+def _reaching(name: str, task: Task, objects: Objects, trained: Trained) -> Row:
+    """Photons per object that must reach optics that give what W gives: its amplification times the light of the field.
+
+    Nothing for active encoders, whose light is `illumination`, and for the release's speckle, which is no field of an instrument.
+    """
+    if isinstance(trained.encoder, ActiveIllumination) or name in SPECKLE:
+        return {}
+    return {"reaching": analyser_of(trained, task, load_profile(PROFILE)).reaching(objects.images)}
 
 
 def light_of(task: Task, objects: Objects, trained: Trained) -> Tensor:
@@ -216,7 +227,8 @@ def passive_page(asked: Asked) -> Made:
 
 def passive_tables(name: str, rows: Rows) -> list[Table]:
     """Return the table of draw 0, that of other draws, and of `barcode` that of classes equally likely."""
-    shown = columns("passive_ssim" if table_of(name).measure == "SSIM" else "passive")
+    light = "passive_reaching" if any("reaching" in row for row in rows) else "passive"
+    shown = columns("passive_ssim" if table_of(name).measure == "SSIM" else light)
     seeded = (*shown[:2], Column("data seed", "{data_seed}"), *shown[2:])
     rows = [row | _beside(name, row) for row in rows]
     balanced = [row for row in rows if "balanced" in row]

@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
+from pans.runtime.bundle.optics import Analyser, amplification
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.encoders import ActiveIllumination, CoherentField, IncoherentIntensity, new_encoder
 from pans.trainer.options import Options
@@ -155,3 +156,31 @@ def test_a_top_level_above_the_brightest_pixel_comes_down():
         light.log_top -= 0.5  # brighter pixels than the top level are clipped: nothing to lower
     light.lower_top()
     assert light.brightest() == pytest.approx(brightest * np.exp(-0.5), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["coherent", "complex", "incoherent"])
+def test_no_light_in_gives_more_than_the_amplification(kind):
+    """Against power iteration, and by the light that many inputs give out."""
+    rng = np.random.default_rng(4)
+    matrix = rng.normal(size=(5, 8)).astype(np.float32)
+    if kind == "complex":
+        matrix = (matrix + 1j * rng.normal(size=(5, 8))).astype(np.complex64)
+    if kind == "incoherent":
+        matrix = np.abs(matrix)
+        out, best = matrix @ rng.random((8, 500)) @ np.eye(500), matrix @ np.eye(8)[:, matrix.sum(axis=0).argmax()]
+        light_in, light_out = np.ones(1), np.array([best.sum()])
+        assert (out.sum(axis=0) <= amplification("incoherent", matrix) * 8).all()
+    else:
+        x = rng.normal(size=8).astype(matrix.dtype)
+        for _ in range(2000):
+            x = matrix.conj().T @ (matrix @ x)
+            x /= np.linalg.norm(x)
+        light_in, light_out = np.array([np.vdot(x, x).real]), np.array([np.vdot(matrix @ x, matrix @ x).real])
+    found = amplification("incoherent" if kind == "incoherent" else "coherent", matrix)
+    assert light_out[0] / light_in[0] == pytest.approx(found, rel=1e-5)
+
+
+def test_what_must_reach_the_optics_grows_with_the_light_that_they_make():
+    images = np.full((3, 2, 2), 255, np.uint8)
+    seen = Analyser("coherent", 3 * np.eye(4, dtype=np.float32)[:2], "field", "none", 0.5, 100.0)
+    assert seen.reaching(images) == pytest.approx(9 * 0.5 * 4)  # amplitude 3, half a photoelectron in each of 4 pixels
