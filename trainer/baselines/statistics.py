@@ -113,8 +113,7 @@ def _blurs(shape: tuple[int, ...], sigma: float) -> tuple[F32, ...]:
 
 def _blurred(frames: F32, blurs: tuple[F32, ...]) -> F32:
     rows, columns = blurs
-    blurred: F32 = rows @ frames @ columns.T
-    return blurred
+    return np.asarray(rows @ frames @ columns.T, np.float32)
 
 
 def _threshold(values: F64, labels: I64) -> tuple[float, float]:
