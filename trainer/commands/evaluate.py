@@ -23,6 +23,8 @@ from pans.runtime.outputs import check_outputs
 from .arguments import add_data_dir, needing, usage_errors
 from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
 
+MADE = 1e-3  # of the light: beyond what W in float32 is off by
+
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
@@ -233,7 +235,7 @@ def words_of(
 
 def _reaching_words(more: Mapping[str, Any]) -> str:
     words = f"at least {more['reaching_photons']:,.0f} photoelectrons per object must reach the optics"
-    if more["amplification"] > 1:
+    if more["amplification"] > 1 + MADE:
         words += f": W is unconstrained and gives up to {more['amplification']:,.3g} times its light"
     return words
 

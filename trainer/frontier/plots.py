@@ -36,6 +36,7 @@ STYLES: dict[str, dict[str, Any]] = {
 REACHING: dict[str, dict[str, Any]] = {  # by encoder
     "unconstrained": {"color": "C3", "marker": "o", "ls": ""},
     "conserving": {"color": "C1", "marker": "s", "ls": "--"},
+    "of intensities, conserving": {"color": "C2", "marker": "D", "ls": "--"},
 }
 AXES = (("photons_mean", "photons detected per decision"), ("clicks_mean", "clicks per decision"))
 
@@ -86,6 +87,8 @@ def reaching(path: Path, rows: Rows) -> None:
         of_task = sorted((row for row in rows if row["task"] == name), key=lambda row: float(row["reaching"]))
         for kind, style in REACHING.items():
             part = [row for row in of_task if row["encoder"] == kind]
+            if not part:
+                continue
             axis.plot(
                 [row["reaching"] for row in part], [row["value"] for row in part], label=f"PANS, W {kind}", **style
             )

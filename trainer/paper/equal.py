@@ -51,7 +51,8 @@ FLOOR = (
     5e-3  # of the mean light, by which the posterior lifts every pixel: the middle one of those that it may choose from
 )
 TRIALS = 2
-WAYS = ("PANS", "equal light", "posterior", "network")
+PANS, EQUAL_LIGHT, INCOHERENT = "PANS", "equal light", "equal light, incoherent"  # the last is of the page `reaching`
+WAYS = (PANS, EQUAL_LIGHT, "posterior", "network")
 DIRECT = WAYS[2:]
 LIGHT_SIZE = 100  # fields in which an encoder that conserves light is sought: those that hold most of it
 LIGHT_RATE = 1e-2
@@ -78,19 +79,27 @@ def light_recipe(name: str, photons: float) -> Options:
     return replace(fields, conserving=True, input_photons=photons)
 
 
+def recipe_of(name: str, way: str, photons: float) -> Options:
+    """Return what PANS is trained with in one of its ways; `INCOHERENT` is a mask of intensities, trained pixel by pixel."""
+    if way == PANS:
+        return recipe(name, photons)
+    conserving = light_recipe(name, photons)
+    return conserving if way == EQUAL_LIGHT else replace(conserving, encoder="incoherent", light=1.0)
+
+
 def equal_page(asked: Asked) -> Made:
     """Return one row per task, way and level; with `collect` only what is finished."""
     rows = []
     for ways in (WAYS[:3], WAYS[3:]):  # the networks last: they take longest
         for name in TASKS:
-            wanted = [way for way in ways if way != "equal light" or name in FIELD_RATES]
+            wanted = [way for way in ways if way != EQUAL_LIGHT or name in FIELD_RATES]
             rows += [equal_row(asked, name, way, photons) for way in wanted for photons in PHOTONS]
     return Made([row for row in rows if row is not None])
 
 
 def equal_row(asked: Asked, name: str, way: str, photons: float) -> Row | None:
     """Return the row of a task, way and level, measured now if need be; None where it is missing and `collect` is asked for."""
-    path = asked.cache / f"equal-{name}-{way.replace(' ', '-')}-{photons:g}.json"
+    path = asked.cache / f"equal-{name}-{way.replace(',', '').replace(' ', '-')}-{photons:g}.json"
     found = _finished(path, name, way, photons)
     if found is None and not asked.collect:
         found = _made(path, _task(name, asked.data_dir), way, photons)
@@ -105,7 +114,7 @@ def _task(name: str, data_dir: str | None) -> Task:
 
 def _finished(path: Path, name: str, way: str, photons: float) -> Row | None:
     if way not in DIRECT:
-        return finished(path, (recipe if way == "PANS" else light_recipe)(name, photons))
+        return finished(path, recipe_of(name, way, photons))
     found = cached_row(path, "way") or {}
     return found if direct_recipe(name, way).items() <= found.items() else None
 
@@ -126,11 +135,10 @@ def _made(path: Path, task: Task, way: str, photons: float) -> Row:
 
 
 def _pans(task: Task, way: str, photons: float) -> Row:
-    if way == "PANS":
-        options = recipe(task.name, photons)
+    options, basis = recipe_of(task.name, way, photons), None
+    if way == PANS:
         basis = basis_of(task.name, task, options)
-    else:
-        options = light_recipe(task.name, photons)
+    elif way == EQUAL_LIGHT:
         x = torch.from_numpy(incident_field(task.train.images, task.light, task.optics)).flatten(1)
         basis = principal_fields(x, task.image_shape, LIGHT_SIZE)
     trained = train(task, load_profile(PROFILE), options, basis=basis)
