@@ -30,8 +30,9 @@ from pans.runtime.turn.engine import Limits, Turn
 from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
 from pans.runtime.turn.watching import FrameWatch
 from pans.runtime.wire.frame import Messages
-from pans.runtime.wire.messages import Opcode
-from pans.runtime.wire.session import STREAM_TYPES
+from pans.runtime.wire.messages import Opcode, decode_ack
+from pans.runtime.wire.schema import HEADER
+from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
 if TYPE_CHECKING:
     from .run import LiveRun
@@ -266,6 +267,9 @@ class CompiledTurns:
         session = run.connection.session
         session.continue_from(int(control[ring.OLDEST_ID]), int(control[ring.OLDEST_NS]), sent, Opcode.SHOW)
         session.next_id = first + len(shows)
+        for span in turn.answers[turn.answers[:, ring.WHAT] == ring.REFUSAL]:
+            ack = decode_ack(turn.bytes_of(span)[HEADER.size :])
+            session.refusals.append(Refusal(ack.refused_id, ack.status, ack.text, Opcode.SHOW))
         if run.driver is not None:
             exposure, state = control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1].tolist()
             run.driver.went_on((exposure, state), shows[:, ring.TIME] - shows[:, ring.WHAT])

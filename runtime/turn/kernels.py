@@ -17,7 +17,7 @@ from pans.runtime.wire.bare import bare
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
 from . import rings as ring
-from .shows import send_show, take_ack
+from .shows import IS_ODD, IS_REFUSED, send_show, take_ack
 from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
 
 READ_BYTES = 1 << 16  # at once, as link/serial.py
@@ -183,11 +183,14 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
         if not _has_room(walk, rings, control, stop - start):
             return ring.FULL
         if buffer[start] == _ACK and control[ring.DRIVES]:
-            if load_session(buffer, start) != walk.state[core.SESSION] or not take_ack(
-                buffer, _U(start), _U(stop), control
-            ):
+            if load_session(buffer, start) != walk.state[core.SESSION]:
+                return ring.ODD
+            answer = take_ack(buffer, _U(start), _U(stop), control)
+            if answer == IS_ODD:
                 return ring.ODD
             _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
+            if answer == IS_REFUSED:
+                rings.answers[control[ring.N_ANSWERS] - 1, ring.WHAT] = ring.REFUSAL
             control[ring.PLACE] += 1
             continue
         if not control[ring.OPEN]:

@@ -33,8 +33,9 @@ ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARR
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)
 # messages, answers and shows, int64 (n, 4): where a body (of `shows`: a frame) stands in `kept`, the time at which it came or left, and
-# its type (of `shows`: the arrival that it answers)
+# its type (of `shows`: the arrival that it answers; of `answers` REFUSAL where a SHOW was refused)
 BEGIN, END, TIME, WHAT = range(4)
+REFUSAL = -1
 
 ALL_TAKEN, DUE, FULL, ODD, GONE, SIGNALLED, BROKEN = range(7)  # why a call ended
 WHY = ("all taken", "due", "full", "odd", "gone", "signalled", "broken")

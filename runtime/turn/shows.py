@@ -21,6 +21,7 @@ from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 ACK_BYTES = STRUCTS["ACK"].size
 ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
 TAIL_AT = EXPOSURE_AT + 8
+IS_ODD, IS_DONE, IS_REFUSED = range(3)  # what `take_ack` says of an acknowledgement
 WRITE_WAIT_NS = 20_000_000  # for room; what then is left, the caller sends
 _U = np.uint64
 
@@ -123,19 +124,25 @@ def _send(control, data, begin, end, scratch):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
-    """Account for an acknowledgement that refuses nothing and answers the oldest command; else False, and nothing done."""
+    """Account for an acknowledgement that answers the oldest command, and say whether it is done or refused; else IS_ODD, and nothing done.
+
+    A refusal is taken of a single SHOW of this call: what is named late is refused, and must not make the next name late.
+    """
     at = start + _U(stream.BODY_HEADER)
     if stop - at < _U(ACK_BYTES) or control[ring.WAITING]:
-        return False
+        return IS_ODD
     last, refused = np.int64(load4(buffer, at)), np.int64(load4(buffer, at + _U(4)))
     outcome = load4(buffer, at + _U(12))
     status, text_bytes = outcome & _U(0xFFFF), outcome >> _U(16)
     if stop - at != _U(ACK_BYTES) + text_bytes or text_bytes > _U(MAX_ACK_TEXT_BYTES) or (status and not refused):
-        return False
+        return IS_ODD
     oldest = control[ring.OLDEST_ID]
-    if not oldest <= last < control[ring.NEXT_ID] or refused >= oldest or last - oldest > COMMAND_WINDOW:
-        return False  # an earlier refusal stays named, and has been told
-    if load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1)):
-        return False
+    if not oldest <= last < control[ring.NEXT_ID] or last - oldest > COMMAND_WINDOW:
+        return IS_ODD
+    fresh = load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1))
+    own = oldest >= control[ring.NEXT_ID] - control[ring.N_SHOWS]
+    is_refused = refused == last and last == oldest and own and status != _U(0) and fresh == _U(1)
+    if not is_refused and (fresh != _U(0) or refused >= oldest):
+        return IS_ODD  # an earlier refusal stays named, and has been told
     control[ring.OLDEST_ID], control[ring.OLDEST_NS] = last + 1, control[ring.ARRIVAL_NS]
-    return True
+    return IS_REFUSED if is_refused else IS_DONE

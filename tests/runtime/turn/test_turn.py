@@ -49,7 +49,7 @@ from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.automata import unpack_show
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import FrameDecoder
-from pans.runtime.wire.messages import DARK_PATTERN, Opcode, decode_command
+from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
 
 pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
 LONG_NS = 10_000_000_000
@@ -164,6 +164,26 @@ def streaming() -> tuple[StreamCore, list[bytes]]:
     plan, decider = shot_major(3, 2), make_decider(head_bundle(random_layers([3, 12, 3], seed=3)), backend="table")
     sent = [(int(slot), 1) for _ in range(4) for slot in plan.slot_pattern]
     return StreamCore(plan, decider, 1, 0, SESSION), click_frames(plan, sent, np.random.default_rng(1), 4)
+
+
+def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
+    """One late name must not make the next one late; any other refusal is Python's."""
+    control = np.zeros(ring.N_CONTROL, np.int64)
+    control[[ring.NEXT_ID, ring.OLDEST_ID, ring.N_SHOWS, ring.ARRIVAL_NS]] = 12, 9, 3, 55
+
+    def told(last: int, refused: int, status: int, mask: int) -> int:
+        frame = FrameDecoder().feed(encode_ack(Ack(last, refused, status, "late", mask), SESSION))[0]
+        body = np.frombuffer(pack_body(frame), np.uint8).copy()
+        return int(shows.take_ack(body, np.uint64(0), np.uint64(len(body)), control))
+
+    assert told(11, 11, 5, 1) == shows.IS_ODD  # three at once
+    assert told(9, 9, 0, 1) == shows.IS_ODD  # without a reason
+    assert told(9, 9, 5, 3) == shows.IS_REFUSED
+    assert control[[ring.OLDEST_ID, ring.OLDEST_NS]].tolist() == [10, 55]
+    assert told(10, 9, 5, 2) == shows.IS_DONE  # the refusal before it stays named
+    control[ring.N_SHOWS] = 0
+    assert told(11, 11, 5, 1) == shows.IS_ODD  # sent by another call, or by Python
+    assert control[ring.OLDEST_ID] == 11
 
 
 def test_a_signal_ends_a_call_that_waits() -> None:
