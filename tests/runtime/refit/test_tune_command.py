@@ -32,6 +32,7 @@ def tune(capsys, device: str, out: Path, *more: object, code: int = 0):
     return json_of(capsys, "tune", BUNDLE, "--device", device, "--only", "shift", "-o", out, *more, code=code)
 
 
+@pytest.mark.slow
 def test_a_budget_ends_it_whole_and_it_can_be_resumed(
     device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
