@@ -45,6 +45,9 @@ VALIDATION_SAMPLES = 8  # of the clicks, where the words cannot be enumerated
 DUAL_RATE = 0.02  # how fast the weight of a budget follows its excess, per batch; faster where the batches are few
 DUAL_TRAVEL = 20.0  # the least sum of these rates over a training, so that small tasks reach their budgets too
 DUAL_RATE_MAX = 0.06
+FINE_LEVELS = (
+    1 << 16
+)  # of patterns through optics, from the start: dark pixels leak a part of the top level, which is then trained too
 FINAL_DRAWS = 1 << 40  # of optics: those of validation and of the head's fit come after those of all epochs
 HEAD_DRAWS = 4  # optics through which the head sees every object when it is fitted
 
@@ -141,6 +144,8 @@ class Run:
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = new_generator(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
+        if data.optics is not None and isinstance(self.encoder, ActiveIllumination):
+            self.encoder.start_quantising(FINE_LEVELS)
         self.head = new_head(options, data.n_outputs, data.image_shape, self.random)
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
@@ -275,7 +280,7 @@ class Run:
         """Freeze the optics (active: as levels), then fit the head to what they show of all training objects."""
         quantised, floats = None, None
         if isinstance(self.encoder, ActiveIllumination):
-            if self.encoder.levels is None:  # too few epochs for the stage of whole levels
+            if self.encoder.levels != self.profile.projector.levels:  # too few epochs for the stage of whole levels
                 self.encoder.start_quantising(self.profile.projector.levels)
             self.encoder.lower_top()
             with torch.no_grad():
