@@ -26,7 +26,7 @@ ROWS_AT_ONCE = 1024  # patterns that are compared with all others
 NUMBERS_MAX = 1 << 27  # objects times patterns, of which the light is kept: 512 MiB
 HARDLY = 1e-3  # chance to reach a state, below which an object is left out of that state's choice
 GLARE = 1e-3  # of the price of a detected photoelectron, what one sent out costs: else a bright spot where hardly anything is would do
-GLARE_MIN = 1e-5  # nats, where detected light is cheap: with 2e-7 a budget of 40 photons took four times the illumination of free patterns
+GLARE_MIN = 1e-5  # nats, where detected light is cheap: at 40 photons 96 patterns took an illumination of 5269 without it, and take 1065
 SURE = 1e-4  # of a state's cost, by which another pattern must be better
 
 
