@@ -159,10 +159,10 @@ def registration_words(path: str | Path, values: Mapping[str, Any]) -> str:
     lines = [f"{banner}{path}"]
     for one in PARAMETERS:
         row = values["parameters"][one.name]
-        unit = f" {one.unit}" if one.unit else ""
+        unit, digits = f" {one.unit}" if one.unit else "", 6 if one.name == "black" else 4
         lines.append(
-            f"  {one.name.removesuffix('_px').removesuffix('_deg'):<9} {row['value']:+.4f}{unit:<9} "
-            f"95 % {row['low']:+.4f} to {row['high']:+.4f}"
+            f"  {one.name.removesuffix('_px').removesuffix('_deg'):<9} {row['value']:+.{digits}f}{unit:<9} "
+            f"95 % {row['low']:+.{digits}f} to {row['high']:+.{digits}f}"
         )
     fit = f"chi-square {values['chi2']:.0f} over {values['degrees_of_freedom']} (p = {values['p_value']:.2g})"
     lines.append(f"  {values['clicks']} clicks in {values['exposures']} exposures; {fit}")
