@@ -55,6 +55,7 @@ MEANINGS = {
     "detector.between_exposures": "gated: off between exposures; free-running: on, and blinded by what it detects there",
     "detector.afterpulse_probability": "that a click causes another one in the next exposure",
     "detector.crosstalk_probability": "that a click causes one in a neighbouring channel",
+    "detector.photon_number_max": "largest photon number that a readout can state; 1: a click or none",
     "exposure.min_us": "shortest exposure; at least 10 ticks of the clock",
     "exposure.max_us": "longest exposure",
     "exposure.readout_us": "time after an exposure before the next may start: readout, settling of mirrors",
