@@ -150,7 +150,7 @@ def _words(text: str) -> dict[str, str]:
     for part in text.split(":"):
         key, equals, value = part.partition("=")
         if key not in KEYS or not equals or not value:
-            raise ValueError(f"optics: {ascii(part)[:60]} is not KEY=VALUE, allowed keys: {', '.join(KEYS)}")
+            raise ValueError(f"optics: {ascii(part)[:60]}, allowed: KEY=VALUE with the keys {', '.join(KEYS)}")
         if key in found:
             raise ValueError(f"optics: {key} is given twice, allowed: once")
         found[key] = value

@@ -49,8 +49,8 @@ _INTERVALS = {  # whose ends have the range of that number, and whether both end
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
-    """The facts of one file; `text` are its bytes' SHA-256, `values` everything that stands in it."""
+class MeasuredFile:
+    """A file of something measured; `sha256` is that of its bytes, `values` everything that stands in it."""
 
     path: str
     sha256: str
@@ -64,6 +64,12 @@ class Calibration:
     def age_h(self, now: datetime) -> float:
         """Its age in hours at `now` (UTC)."""
         return (now - self.made).total_seconds() / 3600
+
+
+class Calibration(MeasuredFile):
+    """The facts of one calibration."""
+
+    __slots__ = ()
 
     def dark_probability(self, profile: Profile, exposure_us: float, channels: int) -> tuple[F64, F64, F64]:
         """Click probability of a dark exposure of `exposure_us`, with the ends of its 95 % interval, each float64 (channels,).

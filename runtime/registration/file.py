@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from pans.runtime.container import read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
 from pans.runtime.imaging import Imaging
-from pans.runtime.instrument.calibration import MAX_AGE_H, check_made_for, sealed, unsealed
+from pans.runtime.instrument.calibration import MAX_AGE_H, MeasuredFile, check_made_for, sealed, unsealed
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, demand, number_text
@@ -34,22 +34,10 @@ CLICKS = Range(1, 1 << 53, whole=True)
 FUTURE_H = 0.1  # by which clocks may differ
 
 
-@dataclass(frozen=True, slots=True)
-class Registered:
-    """What one file says; `values` is everything in it, `sha256` that of its bytes."""
+class Registered(MeasuredFile):
+    """What one registration says."""
 
-    path: str
-    sha256: str
-    values: Mapping[str, Any]
-
-    @property
-    def made(self) -> datetime:
-        """When it was measured, UTC."""
-        return datetime.fromisoformat(self.values["made_utc"])
-
-    def age_h(self, now: datetime) -> float:
-        """Its age in hours at `now` (UTC)."""
-        return (now - self.made).total_seconds() / 3600
+    __slots__ = ()
 
     @property
     def shape(self) -> Shape:
