@@ -48,8 +48,8 @@ def test_the_edges_are_the_corners_of_shift_and_rotation():
     [
         ("", "0 characters"),
         ("x" * 500, "500 characters"),
-        ("shift", "not KEY=VALUE"),
-        ("tilt=1", "allowed keys: shift, rotate"),
+        ("shift", "allowed: KEY=VALUE"),
+        ("tilt=1", "with the keys shift, rotate"),
         ("psf=0.5:psf=0.6", "psf is given twice"),
         ("shift=1", "allowed: shift=RIGHT,DOWN"),
         ("psf=nan", "a finite number"),
