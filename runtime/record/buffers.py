@@ -23,15 +23,18 @@ class RowBuffer:
         self.rows = np.full(BUFFER_ROWS, 0, dtype=dtype)  # touched, which np.zeros leaves to the first use
         self.used = 0
 
+    def room(self) -> int:
+        return len(self.rows) - self.used
+
     def add(self, row: Sequence[Any]) -> bool:
         """Store one row; True when the table is full."""
         self.rows[self.used] = row
         self.used += 1
-        return self.used == len(self.rows)
+        return not self.room()
 
     def add_many(self, rows: np.ndarray[Any, np.dtype[np.void]]) -> int:
         """Store as many rows as there is room for; return how many."""
-        n = min(len(rows), len(self.rows) - self.used)
+        n = min(len(rows), self.room())
         self.rows[self.used : self.used + n] = rows[:n]
         self.used += n
         return n

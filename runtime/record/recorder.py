@@ -182,7 +182,7 @@ class Recorder:
 
     def add_decisions(self, rows: NDArray[np.void]) -> None:
         """Keep many decisions, DECISION_DTYPE (n,), behind those already added; more than a buffer holds go out at once."""
-        if self._decisions.used + len(rows) < BUFFER_ROWS:
+        if len(rows) < self._decisions.room():
             self._decisions.add_many(rows)
             return
         self._empty(self._decisions)
@@ -219,7 +219,7 @@ class Recorder:
         done = 0
         while done < len(rows):
             done += buffer.add_many(rows[done:])
-            if buffer.used == BUFFER_ROWS:
+            if not buffer.room():
                 self._empty(buffer)
 
     def add_event(self, event: Mapping[str, Any]) -> None:

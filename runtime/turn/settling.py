@@ -33,8 +33,8 @@ def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objec
     """Add rows, DECISION_DTYPE (n,), to what decisions add up to; return how many runs of one object they were.
 
     marked int64 and photons_of float32 (MARK_SLOTS,): MarkArrays; plan int64 (2,): K and after how many objects the first one is shown
-    again (0: never). sums int64 (N_SUMS,), photons float64 (1,), table int64 (classes, classes), trials int64 (m, 2) with room for all
-    are added to; objects int64 (n, 3) is filled from its beginning.
+    again (0: never). photons float64 (1,), table int64 (classes, classes) and trials int64 (m, 2) with room for all are added to.
+    sums int64 (N_SUMS,) are of these rows alone, and objects int64 (n, 3) is filled from its beginning.
     """
     numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
     truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
