@@ -37,6 +37,8 @@ COMMANDS = {  # words, what is there already, what else is read
     "data": ("data scene cells -o OUT.npz --objects 2", "OUT.npz", None),
     "reproduce json": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.json", None),
     "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
+    "refit": ("refit b.pans r.pansrec -o OUT", "OUT", "b.pans"),
+    "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
     "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }
 WRITES_NO_FILE = {
