@@ -197,6 +197,7 @@ SMALL = AutomatonOptions(
 
 def test_a_training_ends_in_a_bundle_that_is_evaluated(tmp_path):
     task, profile = bars_task(), load_profile("oled-qcmos")
+    profile = replace(profile, detector=replace(profile.detector, photon_number_max=3))
     trained = train_automaton(task, profile, SMALL)
     made = export_automaton(tmp_path / "bars.pans", trained, task, profile, name="bars", provenance={})
     automaton = load_bundle(tmp_path / "bars.pans")[0].automaton

@@ -32,6 +32,7 @@ from pans.trainer.evaluate.walks import (
 
 RNG = np.random.default_rng(0)
 PROFILE = load_profile("oled-qcmos")
+COUNTING = replace(PROFILE, detector=replace(PROFILE.detector, photon_number_max=15))
 LABELS = RNG.integers(0, 3, 60)
 IMAGES = RNG.integers(0, 256, (60, 2, 2), dtype=np.uint8)
 
@@ -259,10 +260,10 @@ def test_photon_numbers_are_summed_over_all_words() -> None:
             right = decider.decide_leaf(states.leaf).label == label
             seen = sum(word[: len(states.states)])
             sums += chance * np.array([right, seen, light[states.states].sum(), len(states.states)])
-    found = measured_walks(walks_of(model, PROFILE, images, labels, dark=0.02))
+    found = measured_walks(walks_of(model, COUNTING, images, labels, dark=0.02))
     wanted = (found.accuracy_mean, found.clicks_mean, found.photons_mean, found.exposures_mean)
     np.testing.assert_allclose(sums / 6, wanted, rtol=1e-9)
-    drawn = measured_walks(walks_of(model, PROFILE, images, labels, dark=0.02, trials=3000, seed=1))
+    drawn = measured_walks(walks_of(model, COUNTING, images, labels, dark=0.02, trials=3000, seed=1))
     assert abs(drawn.clicks_mean - found.clicks_mean) < 5 * 3 * 4 / math.sqrt(6 * 3000)
     assert abs(drawn.accuracy_mean - found.accuracy_mean) < 5 * found.accuracy_std / math.sqrt(3000)
 
