@@ -51,7 +51,7 @@ def compiler() -> str:
 
 def engine_program(folder: Path = FOLDER) -> Path:
     """Return the program, built now if no earlier build of the same sources is in the cache; ConfigError where that is not possible."""
-    return _built("reference", folder, [*map(str, program_sources(folder)), "-lm"])
+    return _built("reference", folder, [*map(str, program_sources(folder)), "-lm", "-pthread"])
 
 
 def engine_library(folder: Path = FOLDER) -> Path:

@@ -1,6 +1,7 @@
 /* The program: an instrument behind its port, until standard input ends. */
-#define _XOPEN_SOURCE 700
+#define _GNU_SOURCE /* SCHED_IDLE, where there is one */
 #include <errno.h>
+#include <pthread.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -48,6 +49,30 @@ void write_all(const void *bytes, size_t count)
     }
 }
 
+#ifdef SCHED_IDLE
+/* A core that halts between two slots, a virtual one above all, takes tens of microseconds to wake. This thread of idle priority keeps it
+   awake. The loop itself may not spin: the kernel stops those at real-time priority for 50 ms in every second (sched_rt_runtime_us). */
+static void *spin(void *unused)
+{
+    if (sched_setscheduler(0, SCHED_IDLE, &(struct sched_param){0}) == 0) /* 0: this thread */
+        for (;;) {
+        }
+    return unused;
+}
+
+static void keep_awake(void)
+{
+    pthread_t thread;
+    if (pthread_create(&thread, NULL, spin, NULL) != 0)
+        fprintf(stderr, "pans-reference: the core is not kept awake: no thread for it\n");
+}
+#else
+static void keep_awake(void)
+{
+    fprintf(stderr, "pans-reference: the core is not kept awake: this system has no SCHED_IDLE\n");
+}
+#endif
+
 int main(void)
 {
     static struct settings settings;
@@ -55,6 +80,8 @@ int main(void)
     read_settings(&settings);
     bench.clock = (struct clock){settings.limits.tick_hz, settings.offset_ticks, settings.drift};
     open_port(&bench.port, settings.listen);
+    if (settings.awake)
+        keep_awake();
     struct pans_device *device = switch_on(&settings, &bench, clock_tick(&bench.clock));
     sched_setscheduler(0, SCHED_FIFO, &(struct sched_param){.sched_priority = FIFO_PRIORITY}); /* where it is allowed */
     write_all(bench.port.url, strlen(bench.port.url));
@@ -62,7 +89,7 @@ int main(void)
     for (;;) {
         if (pans_turn(device))
             continue;
-        uint64_t wait_ns = settings.awake ? 0 : clock_ns_until(&bench.clock, pans_next_tick(device));
+        uint64_t wait_ns = clock_ns_until(&bench.clock, pans_next_tick(device));
         port_wait(&bench.port, wait_ns < LONGEST_WAIT_NS ? wait_ns : LONGEST_WAIT_NS, pans_has_output(device));
     }
 }
