@@ -26,6 +26,8 @@ COUNT_OUTCOMES = (3, 16)  # of a detector that counts; two are clicks
 POSTERIOR_SUM_TOLERANCE = 1e-5
 DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
 CONFIDENCE_RANGE = Range(1e-6, 1.0)
+DOSE_PARTS = 64  # of the cap, to which the doses of walks that meet are told apart
+DOSE_ROUNDING = 1e-9  # of a cap: sums of light come in another order here than elsewhere
 _EDGES_AT_ONCE = 1 << 20  # explored together, so that memory stays small
 _UNREACHED = 0xFFFF  # as a depth: above SLOTS_MAX
 
@@ -138,6 +140,74 @@ def stopped(automaton: Automaton, confidence: float) -> Automaton:
         automaton.dwell_steps,
         leads_to[automaton.successors],
         np.concatenate([automaton.posteriors, automaton.posteriors[:n_states][sure]]),
+        automaton.counts,
+    )
+
+
+def capped(automaton: Automaton, light: ArrayLike, cap: float, most_states: int = STATES_MAX) -> Automaton:
+    """Return the automaton whose walks never pass a dose: where the next state would, the walk ends with that state's posterior.
+
+    `light` float (states,) is what each state brings, at least 0; `cap` the most that one walk may bring. A state that is reached with
+    several doses is parted by them, into as many states as `most_states` allows; those of one part go by their largest dose, so that
+    no walk ever passes the cap. ValueError where the first state alone does.
+    """
+    dose = np.asarray(light, np.float64)
+    fits = dose.shape == (automaton.n_states,) and bool((dose >= 0).all() and np.isfinite(dose).all())
+    demand(fits, f"light of shape {dose.shape} for {automaton.n_states} states, allowed: one number of 0 or more each")
+    demand(bool(dose[0] <= cap), f"the first exposure brings {dose[0]:.6g}, the dose may not pass {cap:.6g}")
+    parts = DOSE_PARTS
+    while True:
+        found = _parted(automaton, dose, cap, parts)
+        if found.n_states <= max(most_states, automaton.n_states) or parts == 1:
+            return found
+        parts //= 2
+
+
+def _parted(automaton: Automaton, light: NDArray[np.float64], cap: float, parts: int) -> Automaton:
+    """`capped` with each state in at most `parts` parts of equal width in dose; parts that do the same are one again."""
+    n_states = automaton.n_states
+    levels = [(np.zeros(1, np.int64), np.zeros(1))]  # states, and the dose before each
+    edges = []  # of each level: an entry of the next one, or -1 - the node at which the walk ends
+    while len(levels[-1][0]):
+        state, before = levels[-1]
+        after = automaton.successors[state].astype(np.int64)
+        reached = np.broadcast_to((before + light[state])[:, None], after.shape)
+        goes_on = after < n_states
+        goes_on[goes_on] = reached[goes_on] + light[after[goes_on]] <= cap * (1 + DOSE_ROUNDING)
+        part = np.minimum((reached[goes_on] / max(cap, 1e-300) * parts).astype(np.int64), parts - 1)
+        keys, entry = np.unique(after[goes_on] * parts + part, return_inverse=True)
+        most = np.zeros(len(keys))
+        np.maximum.at(most, entry.reshape(-1), reached[goes_on])
+        edge = -1 - after
+        edge[goes_on] = entry.reshape(-1)
+        edges.append(edge)
+        levels.append((keys // parts, most))
+    return _joined([state for state, _ in levels[:-1]], edges, automaton)
+
+
+def _joined(states: list[NDArray[np.int64]], edges: list[NDArray[np.int64]], automaton: Automaton) -> Automaton:
+    """Put levels together from the last one up; entries that show the same state and lead to the same nodes become one."""
+    kept: list[NDArray[np.int64]] = []
+    number = np.zeros(0, np.int64)
+    for state, edge in zip(reversed(states), reversed(edges)):
+        inner = edge >= 0
+        edge[inner] = number[edge[inner]]
+        rows, number = np.unique(np.column_stack([state, edge]), axis=0, return_inverse=True)
+        number = number.reshape(-1)
+        kept.insert(0, rows)
+    starts = np.cumsum([0, *(len(rows) for rows in kept)])
+    total = int(starts[-1])
+    successors = []
+    for start, rows in zip(starts[1:], kept):
+        edge = rows[:, 1:]
+        successors.append(np.where(edge >= 0, edge + start, total - 1 - edge))
+    shown = np.concatenate([rows[:, 0] for rows in kept])
+    return reachable_automaton(
+        automaton.pattern[shown],
+        automaton.dwell[shown],
+        automaton.dwell_steps,
+        np.concatenate(successors),
+        np.concatenate([automaton.posteriors[shown], automaton.posteriors]),
         automaton.counts,
     )
 

@@ -21,6 +21,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
 from .arguments import add_data_dir, needing, usage_errors
+from .evaluate_dose import add_dose, bleaching_given, evaluate_dose, is_dosed
 from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
 
 MADE = 1e-3  # of the light: beyond what W in float32 is off by
@@ -32,7 +33,15 @@ if TYPE_CHECKING:
     from pans.trainer.evaluate.walks import MeasuredWalks
 
 
-PICTURE_FILES = ("patterns.png", "pictures.png", "confusion.png", "tsne.png", "reliability.png", "optics.png")
+PICTURE_FILES = (
+    "patterns.png",
+    "pictures.png",
+    "confusion.png",
+    "tsne.png",
+    "reliability.png",
+    "optics.png",
+    "dose.png",
+)
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -68,6 +77,7 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     )
     add_force(parser)
     add_optics(parser)
+    add_dose(parser)
     parser.add_argument(
         "--data-seed", type=int, metavar="N", help="of a drawn task (default: that of the bundle's training)"
     )
@@ -94,10 +104,12 @@ def _evaluate(args: argparse.Namespace) -> int:
     bundle, digest = load_bundle(args.bundle)
     if args.exact and bundle.picture_shape is not None:
         raise UsageError("--exact: pictures are compared by trials", remedy="use --trials")
-    several = several_tables(args)
+    several, dosed = several_tables(args), is_dosed(args)
     with usage_errors():
         imaging = None if several else one_table(args.optics)
-    conditions = Conditions(args.profile, args.eta, args.dark, args.seed, args.data_seed, args.confidence, imaging)
+        bleaching = bleaching_given(args)
+    given = (args.profile, args.eta, args.dark, args.seed, args.data_seed, args.confidence)
+    conditions = Conditions(*given, imaging, bleaching)
     trials = args.trials
     if trials is None and not args.exact and bundle.automaton is None:
         trials = default_trials(bundle)
@@ -110,6 +122,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         note(f"evaluating {bundle.name} on {held_out.task.name}")
         if several:
             return evaluate_tables(args, bundle, digest, held_out, conditions)
+        if dosed:
+            return evaluate_dose(args, bundle, digest, held_out, conditions)
         started = time.perf_counter()
         if bundle.automaton is None:
             measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
@@ -275,5 +289,6 @@ EVALUATE = Command(
     examples=(
         "pans evaluate parts.pans --exact",
         "pans evaluate parts.pans --profile my-lab.toml --shots 3",
+        "pans evaluate parts.pans --dose-cap curve --bleach 40",
     ),
 )

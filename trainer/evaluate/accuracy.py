@@ -19,7 +19,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
-from pans.runtime.imaging import IDENTITY, Imaging, met
+from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, cannot_count, counting
 from pans.runtime.instrument.profile import Profile
@@ -64,11 +64,13 @@ def light_of(
     eta: float = 1.0,
     dark: float | None = None,
     imaging: Imaging = IDENTITY,
+    bleaching: Bleaching = NO_BLEACHING,
 ) -> Light:
     """Show the patterns of `bundle` on `images` (n, height, width) through `profile`, or look at them through its passive optics.
 
     `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `imaging` is how the object stands on the
-    grid of the patterns. ValueError for images of another shape, and for an `imaging` of passive optics.
+    grid of the patterns, `bleaching` what the light does to it: patterns are shown in their order, once. ValueError for images of
+    another shape, for an `imaging` of passive optics, and for bleaching where no pattern follows another.
     """
     if images.shape[1:] != bundle.image_shape:
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
@@ -76,8 +78,8 @@ def light_of(
         raise ValueError(f"{bundle.name} has an automaton: what it shows depends on the clicks (walks.walks_of)")
     law = law_of(bundle, profile, eta, dark)
     if bundle.analyser is not None:
-        if not imaging.is_identity:
-            raise ValueError(f"{bundle.name} is passive: it shows no patterns that could miss the object")
+        if not (imaging.is_identity and bleaching.is_none):
+            raise ValueError(f"{bundle.name} is passive: it shows no patterns that could miss or bleach the object")
         with as_usage_error():
             light = bundle.analyser.photoelectrons(images) * eta
         return Light(light, click_probability(law, light), law, 0.0)
@@ -86,12 +88,23 @@ def light_of(
         full = bundle.photons_per_level * (bundle.levels - 1) * eta
         patterns = met(imaging, patterns, bundle.image_shape, full)
         illumination = float(patterns.sum())
+    if not bleaching.is_none:
+        demand_sequence(profile)
+        patterns = bleached(bleaching, patterns)
     light = np.empty((len(images), bundle.n_features))
     step = max(1, _CHUNK_NUMBERS // bundle.n_pixels)
     for start in range(0, len(images), step):
         part = images[start : start + step]
         light[start : start + step] = object_transmission(profile, part.reshape(len(part), -1)) @ patterns.T
     return Light(light, click_probability(law, light), law, illumination)
+
+
+def demand_sequence(profile: Profile) -> None:
+    """Raise ValueError where `profile` shows all patterns at once: there no dose comes before another."""
+    if profile.mode != "sequential":
+        raise ValueError(
+            f"{profile.name} shows all patterns at once ({profile.mode}), allowed with a dose: profiles that show pattern after pattern"
+        )
 
 
 def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None) -> ClickLaw:

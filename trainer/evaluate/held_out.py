@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
-from pans.runtime.imaging import Imaging
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.tasks.remembered import remembered_task
@@ -41,6 +41,7 @@ class Conditions:
     data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
     confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
     imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
+    bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +128,8 @@ def measure(
         return measured_walks(walks_on(bundle, held_out, shots=shots, trials=trials, conditions=conditions))
     if conditions.confidence:
         raise ValueError(f"confidence is {conditions.confidence:g}, but {bundle.name} has no automaton")
+    if shots != 1 and not conditions.bleaching.is_none:
+        raise ValueError(f"shots is {shots}, allowed with bleaching: 1 (each shot would meet another sample)")
     light = light_of(
         bundle,
         held_out.profile,
@@ -134,6 +137,7 @@ def measure(
         eta=conditions.eta,
         dark=conditions.dark,
         imaging=imaging_on(held_out, conditions),
+        bleaching=conditions.bleaching,
     )
     if bundle.picture_shape is not None:
         if trials is None:
@@ -169,6 +173,7 @@ def walks_on(
         trials=trials,
         seed=told.seed,
         imaging=imaging_on(held_out, told),
+        bleaching=told.bleaching,
     )
 
 

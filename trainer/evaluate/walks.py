@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,13 @@ from pans.runtime.bundle.walks import EXPECTED_KEYS
 from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
-from pans.runtime.imaging import IDENTITY, Imaging, met
+from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
-from .accuracy import outcome_law_of
+from .accuracy import demand_sequence, outcome_law_of
+from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
@@ -100,11 +101,13 @@ def walks_of(
     trials: int | None = None,
     seed: int = 0,
     imaging: Imaging = IDENTITY,
+    bleaching: Bleaching = NO_BLEACHING,
 ) -> Walks:
     """Show the automaton of `bundle` to `images` (n, height, width) through `profile`; exact, or `trials` walks per object.
 
     `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `confidence` stops early, `imaging`
-    is how the object stands on the grid of the patterns. ValueError for what does not fit.
+    is how the object stands on the grid of the patterns, `bleaching` what the light of a walk does to it: that needs `trials`, as what is
+    left in a state depends on the walk to it. ValueError for what does not fit.
     """
     if bundle.automaton is None:
         raise ValueError(f"{bundle.name} has no automaton")
@@ -112,11 +115,16 @@ def walks_of(
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if trials is not None and trials < 1:
         raise ValueError(f"trials is {trials}, allowed: 1 or more")
+    if not bleaching.is_none:
+        demand_sequence(profile)
+        if trials is None:
+            raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
     law = outcome_law_of(bundle, profile, eta, dark)
     automaton = stopped(bundle.automaton, confidence) if confidence else bundle.automaton
     leaf_labels = leaf_verdicts(automaton, confidence).labels
     parts: list[Walks] = []
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
+    step = step if bleaching.is_none else min(step, BLEACHED_AT_ONCE)
     rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
     afterpulse = profile.detector.afterpulse_probability
     patterns: NDArray[Any] = bundle.pattern_levels
@@ -130,7 +138,12 @@ def walks_of(
             found = expected_walk(automaton, patterns, seen, law, scale, afterpulse=afterpulse)
             sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
         else:
-            sums = _sampled(automaton, patterns, seen, (law, afterpulse), scale, trials, rng)
+            lit: _Lit = _Steady(automaton, patterns, seen, scale)
+            if not bleaching.is_none:
+                lit = BleachedObjects(automaton, patterns, seen, scale, bleaching)
+            sums = _sampled(
+                automaton, lit, patterns.sum(axis=1, dtype=np.float64) * scale, (law, afterpulse), trials, rng
+            )
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     return _together(parts, trials or 0)
 
@@ -157,30 +170,56 @@ def _together(parts: list[Walks], trials: int) -> Walks:
     return replace(parts[0], **joined, by_class=by_class, trials=trials)
 
 
+class _Lit(Protocol):
+    """What the objects give when states are shown to them."""
+
+    n: int
+
+    def fresh(self) -> None:
+        """Begin new walks, each with an object that no light has met."""
+
+    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
+        """Show one state to each of the objects `rows`, and return the photoelectrons expected, all int64 or float64 (n,)."""
+
+
+class _Steady:
+    """Objects that stay as they are."""
+
+    def __init__(self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float) -> None:
+        self.n, self._pattern, self._share = len(seen), automaton.pattern, automaton.dwell / automaton.dwell_steps
+        self._light = pattern_light(patterns, seen, scale)
+
+    def fresh(self) -> None:
+        """See `_Lit`."""
+
+    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
+        """See `_Lit`."""
+        return np.asarray(self._light[rows, self._pattern[states]] * self._share[states])
+
+
 def _sampled(
     automaton: Automaton,
-    patterns: NDArray[Any],
-    seen: NDArray[Any],
+    lit: _Lit,
+    whole: F64,
     detector: tuple[ClickLaw | CountLaw, float],
-    scale: float,
     trials: int,
     rng: np.random.Generator,
 ) -> _Sums:
-    """Draw `trials` walks of every object; means per walk, and the share of each leaf."""
+    """Draw `trials` walks of every object; means per walk, and the share of each leaf. `whole` is the illumination of each pattern."""
     law, afterpulse = detector
-    n, rows = len(seen), np.arange(len(seen))
-    light = pattern_light(patterns, seen, scale)
-    whole = patterns.sum(axis=1, dtype=np.float64) * scale
+    n, rows = lit.n, np.arange(lit.n)
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
     for _ in range(trials):
         node, going, before = np.zeros(n, np.int64), rows, np.zeros(n, np.bool_)
+        lit.fresh()
         while going.size:
             state = node[going]
-            pattern, share = automaton.pattern[state], automaton.dwell[state] / automaton.dwell_steps
-            photoelectrons = light[going, pattern] * share
+            shown = whole[automaton.pattern[state]] * (automaton.dwell[state] / automaton.dwell_steps)
+            photoelectrons = lit.photoelectrons(going, state)
             outcome = _drawn(law, photoelectrons, afterpulse * before[going], rng)
             before[going] = outcome > 0
-            for total, values in zip(sums, (outcome, photoelectrons, whole[pattern] * share, 1.0)):
+            each: tuple[Any, ...] = (outcome, photoelectrons, shown, 1.0)
+            for total, values in zip(sums, each):
                 total[going] += values
             node[going] = automaton.successors[state, outcome]
             going = going[node[going] < automaton.n_states]
