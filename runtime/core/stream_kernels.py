@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.bare import bare
-from pans.runtime.wire.kernels import load4, load8
+from pans.runtime.wire.bare import bare, load4, load8
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
@@ -63,7 +63,7 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
     return ALL_DONE
 
 
-@njit(cache=True, nogil=True)
+@inner
 def take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take the message from `start` to `stop`, uint64: TOOK_MARK, TOOK_BLOCK, ODD where it is not ordinary (and nothing is done).
 
@@ -97,7 +97,7 @@ def take_message(buffer, start, stop, state, marks, windows, tables, rows, count
     return TOOK_BLOCK
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-def]
     """Remember an object's truth; False, and nothing done, when the message is not the next one."""
     if not stream.is_next_mark(buffer, payload, stop, state):
@@ -119,7 +119,7 @@ def _take_mark(buffer, payload, stop, state, marks):  # type: ignore[no-untyped-
     return True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Account for a block of frames that is the next one and fits the plan; else False, and nothing done."""
     count, word_bytes = stream.next_block(buffer, payload, stop, state)
@@ -128,7 +128,7 @@ def _accept_block(buffer, payload, stop, state, windows):  # type: ignore[no-unt
     return _accept(buffer, payload, count, state, windows)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-untyped-def]
     """Count a block of one detector's exposures, if it is the next one and fits the plan; else False, and nothing done."""
     count = stream.next_clicks(buffer, payload, stop, state)
@@ -153,7 +153,7 @@ def _accept_clicks(buffer, payload, stop, state, windows):  # type: ignore[no-un
     return True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-def]
     """Account for the next block, of `count` exposures, if it fits the plan; else False, and nothing done."""
     first = state[stream.NEXT_EXPOSURE]
@@ -187,7 +187,7 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     return True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _begin_visit(windows):  # type: ignore[no-untyped-def]
     """No window has anything yet; element by element: numba takes seconds to compile the assignment of a slice."""
     counts, seen, nodes = windows.counts, windows.seen, windows.walks.nodes
@@ -201,7 +201,7 @@ def _begin_visit(windows):  # type: ignore[no-untyped-def]
         nodes[walk] = 0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _is_due(visit, relative, state, windows):  # type: ignore[no-untyped-def]
     """Whether no window waits that ended before exposure `relative` of `visit`: a block before this one may have been left out."""
     n_windows = windows.last.size
@@ -210,7 +210,7 @@ def _is_due(visit, relative, state, windows):  # type: ignore[no-untyped-def]
     return visit == state[VISIT] + 1 and state[NEXT_WINDOW] == n_windows and windows.longest[1, 0] >= relative
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untyped-def]
     shape = load4(buffer, payload + _U(28))
     first = np.int64(load8(buffer, payload + _U(16)))
@@ -232,7 +232,7 @@ def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untype
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no-untyped-def]
     """K = 1 with a table, frames from state[FRAME] on: every frame with light is a window, every word a row.
 
@@ -266,7 +266,7 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
     state[N_ROWS], state[FRAME] = n_rows, done
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Any K and any back end, frames from state[FRAME] on: clicks gather in byte lanes until a window, a block or a lane is full."""
     window_at, last, counts, seen = windows.window_at, windows.last, windows.counts, windows.seen
@@ -317,14 +317,14 @@ def _take_windows(buffer, block, state, windows, tables, rows, counts_out):  # t
     state[N_ROWS], state[FRAME] = n_rows, done
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _keep_counts(counts_out, row, counts):  # type: ignore[no-untyped-def]
     """Keep the clicks of a window for the back end."""
     for feature in range(counts.size):
         counts_out[row, feature] = counts[feature]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Rows of the windows that CLICKS `block`, whose exposures are counted, settles; False while some wait for room."""
     need, last, counts, seen = windows.walks.need, windows.last, windows.counts, windows.seen
@@ -353,7 +353,7 @@ def _settle(block, state, windows, tables, rows, counts_out):  # type: ignore[no
     return True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _look_up(labels, probabilities, index):  # type: ignore[no-untyped-def]
     """Label, probability and flags of a row of the table."""
     label, probability = np.int64(labels[index]), probabilities[index]
@@ -362,7 +362,7 @@ def _look_up(labels, probabilities, index):  # type: ignore[no-untyped-def]
     return label, probability, _AMBIGUOUS if probability > 0 else _NOT_FINITE
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _put_row(row, state, block, i, shot, decided):  # type: ignore[no-untyped-def]
     """Write the decision `decided` (clicks, label, flags, probability, checksum) on a window that frame `i` ends, and count it."""
     row["index"] = state[N_DECISIONS]

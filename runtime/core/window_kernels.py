@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import DARK_PATTERN
 
 DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
@@ -143,7 +144,7 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
             tallies[WRONG_PATTERNS] += 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
     """The counts of a window whose last exposure has come, into `whole`."""
     if seen[window, 0] != 0:  # it began in an earlier block
@@ -155,7 +156,7 @@ def complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyp
         seen[window, 0] = held * whole.size
 
 
-@njit(cache=True, nogil=True)
+@inner
 def spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
     """Add the byte lanes to the counts of their window."""
     n_features = counts.shape[1]
@@ -167,7 +168,7 @@ def spill(lanes, counts, seen, window, held):  # type: ignore[no-untyped-def]
     seen[window, 0] += held * n_features
 
 
-@njit(cache=True, nogil=True)
+@inner
 def unpack(lanes, whole):  # type: ignore[no-untyped-def]
     """The byte lanes as counts: all of a window that one block holds."""
     for p in range(lanes.size):
@@ -177,7 +178,7 @@ def unpack(lanes, whole):  # type: ignore[no-untyped-def]
             lane >>= _U(8)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
     """Clicks, row of the table and checksum of a window's counts."""
     clicks, index = np.int64(0), np.int64(0)

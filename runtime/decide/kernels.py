@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pans.runtime.wire.inner import inner
+
 STEP = 8  # rows of the first matrix taken at once
 _U = np.uint64  # unsigned indices: a signed one is tested for being negative, and then nothing is vectorised
 LANES = 16  # hidden widths are padded to it: one vector of float32 or int32 at most
@@ -68,7 +70,7 @@ def _add_rows(weights, width, n_rows, rows, f, out):  # type: ignore[no-untyped-
             )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _add_groups(counts, i, n_features, bits, tables, start, width, out):  # type: ignore[no-untyped-def]
     """out[0, :width] = the first layer of the single shot counts[i]: one row for each group of `bits` patterns, two groups at a time.
 
@@ -89,7 +91,7 @@ def _add_groups(counts, i, n_features, bits, tables, start, width, out):  # type
         first = False
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _group_row(counts, i, n_features, bits, feature, at, columns):  # type: ignore[no-untyped-def]
     """Where the row of the group that begins at `feature` stands, then the next group's first pattern and place; no branch on a click."""
     word, size = _U(0), min(bits, n_features - feature)
@@ -113,7 +115,7 @@ def _dots(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
         out[k + 1] += b
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _fired(counts, i, n_features, shots, rows, factors):  # type: ignore[no-untyped-def]
     """Write down which patterns clicked and how often per shot, padded to STEP; return how many."""
     n_fired = 0
@@ -129,7 +131,7 @@ def _fired(counts, i, n_features, shots, rows, factors):  # type: ignore[no-unty
     return n_fired
 
 
-@njit(cache=True, nogil=True)
+@inner
 def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[no-untyped-def]
     """Scores of the object whose clicks are counts[i], integers (n, d_f); they stand in the row of `work` that is returned."""
     n_layers, n_features, width = meta[0], meta[1], meta[2]
@@ -200,7 +202,7 @@ def float_run(counts, shots, meta, numbers, room, scores, labels, probabilities)
 # --------------------------------------------------------------------------------------------------------------- int8 heads
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _dots_of_steps(weights, start, n_out, n_in, x, out):  # type: ignore[no-untyped-def]
     """out[k] = x . weights[start + k * n_in:][:n_in], x int16, weights int8; exact in int32."""
     for k in range(n_out):
@@ -211,7 +213,7 @@ def _dots_of_steps(weights, start, n_out, n_in, x, out):  # type: ignore[no-unty
         out[k] = total
 
 
-@njit(cache=True, nogil=True)
+@inner
 def int8_scores(counts, i, shots, meta, numbers, room, scores):  # type: ignore[no-untyped-def]
     """Scores scores[i] of the object whose clicks are counts[i], integers (n, d_f), by integer sums.
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import numba
 
+from pans.runtime.wire.inner import inner
+
 # state, int64 (N_STATE,)
 (
     NEXT,
@@ -36,7 +38,7 @@ DARK, NEVER_CAME = -1, -2
 W, ON, OFF, LONGEST, REFRACTORY, BACKGROUND, VALLEY_FRAMES, VALLEY_SIGMA2, DARK_CYCLE, N_LIMITS = range(10)
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def popcount(word):  # type: ignore[no-untyped-def]
     """Number of bits set in a uint64."""
     n = 0
@@ -46,7 +48,7 @@ def popcount(word):  # type: ignore[no-untyped-def]
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _tally(word, channels):  # type: ignore[no-untyped-def]
     channel = 0
     while word:
@@ -90,7 +92,7 @@ def skip_frames(first, stop, words, counts, state):  # type: ignore[no-untyped-d
         state[FLAGS] |= BROKEN
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _close(state, limits, last, release, flags, row):  # type: ignore[no-untyped-def]
     """Write the open passage into `row`: the centroid is that of the clicks beyond the background's."""
     n = release - state[FIRST] + 1

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from numba import njit
 
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.kernels import load4, load8
+from pans.runtime.wire.bare import load4, load8
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import NO_OBJECT
 
 from .kernels import EMPTY_FRAMES, NEXT, put_frames, scan
@@ -103,7 +104,7 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
     return at - place
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _take_mark(buffer, payload, marks, number):  # type: ignore[no-untyped-def]
     row = marks.rows[number]
     row[M_SEQ], row[M_OBJECT] = np.int64(load4(buffer, payload)), np.int64(load4(buffer, payload + _U(4)))
@@ -112,7 +113,7 @@ def _take_mark(buffer, payload, marks, number):  # type: ignore[no-untyped-def]
     stream.mark_photons(buffer, payload, marks.photons, number)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _note_end(tick, count, facts, slot_offsets):  # type: ignore[no-untyped-def]
     """Note when the block's last exposure ended, and by how much that is not the plan's time."""
     last = facts[stream.NEXT_EXPOSURE] - 1

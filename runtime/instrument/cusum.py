@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.wire.frame import read_only
+from pans.runtime.wire.inner import inner
 
 from .cusum_design import RATE_MAX, CusumDesign, design_cusum
 
@@ -215,14 +216,14 @@ def _design(rate: float, ratio: float, arl: float, guard: float) -> CusumDesign:
     return design_cusum(rate, ratio, arl, guard)
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _put(zero, row, clicks):  # type: ignore[no-untyped-def]
     """zero[row] = clicks, channel by channel: numba takes seconds to compile the assignment of a slice."""
     for channel in range(clicks.size):
         zero[row, channel] = clicks[channel]
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _silence(state, row, until, zero, clicks):  # type: ignore[no-untyped-def]
     """Take the silent trials before number `until`; return the trial at which the threshold was passed, else -1."""
     n = until - state[row, LAST]
@@ -245,7 +246,7 @@ def _silence(state, row, until, zero, clicks):  # type: ignore[no-untyped-def]
     return -1
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _note(alarms, n, test, exposure, trials, state, zero, clicks):  # type: ignore[no-untyped-def]
     """Write down an alarm and start the test again from 0."""
     if n < alarms.shape[0]:
@@ -258,7 +259,7 @@ def _note(alarms, n, test, exposure, trials, state, zero, clicks):  # type: igno
     return n + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _catch_up(state, row, until, trials, zero, clicks, alarms, n):  # type: ignore[no-untyped-def]
     """Take silent trials up to `until`, as many alarms as they give."""
     while True:
@@ -268,7 +269,7 @@ def _catch_up(state, row, until, trials, zero, clicks, alarms, n):  # type: igno
         n = _note(alarms, n, row, passed // trials, trials, state, zero, clicks)
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def _click(state, row, trial, trials, zero, clicks, alarms, n):  # type: ignore[no-untyped-def]
     """Take the click of trial `trial`; the silent ones before it have been taken, and `clicks` holds it already."""
     total = state[row, SUM] + state[row, CLICK_STEP]

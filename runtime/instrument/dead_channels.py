@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.frame import read_only
+from pans.runtime.wire.inner import inner
 
 from .cusum import FLOOR_RATE
 
@@ -244,7 +245,7 @@ def note_silence(words, silent, clicking, limits):  # type: ignore[no-untyped-de
     return passed
 
 
-@numba.njit(cache=True, nogil=True)
+@inner
 def note_seen(seen, byte, exposures, silent, clicking, limits):  # type: ignore[no-untyped-def]
     """As `note_silence` for the eight channels of one byte, of which `seen` has those that clicked in a block of `exposures`."""
     passed = False

@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
+from pans.runtime.wire.inner import inner
+
 # counts, int64 (N_COUNTS,): LightWatch's own, by their names there; decisions, batches and clicks when each sum last was 0
 DECISIONS, CLICKS, IN_BATCH, N, SUM, SQUARES, BATCHES, TOTAL, FALL, RISE, BATCH, N_COUNTS = *range(9), 11, 14, 15
 # levels, float64 (N_LEVELS,): the two sums; of the baseline mean, slack and threshold; before it, its least error and batches
@@ -47,7 +49,7 @@ def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyp
     return clicks.size, ALL_TAKEN
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _learn(total, counts, levels):  # type: ignore[no-untyped-def]
     """Add a batch; whether its mean is known well enough."""
     counts[N] += 1
@@ -62,7 +64,7 @@ def _learn(total, counts, levels):  # type: ignore[no-untyped-def]
     return mean > 0 and (error <= levels[ERROR] * mean or n >= levels[MOST])
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _compare(total, counts, levels):  # type: ignore[no-untyped-def]
     """Add a batch to both sums; which of them has passed."""
     counts[BATCHES] += 1

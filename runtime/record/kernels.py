@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pans.runtime.wire.kernels import copy_span
+from pans.runtime.wire.bare import copy_span
+from pans.runtime.wire.inner import inner
 
 from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
@@ -97,7 +98,7 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # ty
     return n_runs, n_new
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _open(run, row, continues):  # type: ignore[no-untyped-def]
     run["index"] = row["index"]
     run["tick"] = row["tick"]
@@ -108,7 +109,7 @@ def _open(run, row, continues):  # type: ignore[no-untyped-def]
     run["continues"] = continues
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _close(run, part, tick_step, exposure_step, shot_step, count):  # type: ignore[no-untyped-def]
     stepped = count != _ONE  # of a single row no steps are known
     run["count"] = part
@@ -117,12 +118,12 @@ def _close(run, part, tick_step, exposure_step, shot_step, count):  # type: igno
     run["shot_step"] = shot_step if stepped else _U(0)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _slot_of(first, second, third):  # type: ignore[no-untyped-def]
     return ((first ^ (second * _MIX) ^ (third << _U(13))) * _MIX) >> _FOLD
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _widen(n_known, mask, keys, slots):  # type: ignore[no-untyped-def]
     """Twice as many slots, whose mask is returned: few verdicts stay close together, where the cache has them."""
     mask = _U(2) * mask + _ONE
@@ -136,7 +137,7 @@ def _widen(n_known, mask, keys, slots):  # type: ignore[no-untyped-def]
     return mask
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _keep(row, verdict):  # type: ignore[no-untyped-def]
     verdict["clicks"] = row["clicks"]
     verdict["label"] = row["label"]
@@ -192,7 +193,7 @@ def pack_stamped(buffer, spans, first, out, used):  # type: ignore[no-untyped-de
     return first, used
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _pack(buffer, begin, end, host_ns, out, used):  # type: ignore[no-untyped-def]
     """Put one body behind out[:used]; return the bytes used."""
     for i in range(8):

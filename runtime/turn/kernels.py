@@ -13,7 +13,8 @@ from pans.runtime.core import stream_kernels as core
 from pans.runtime.timing.evidence import OVERSLEPT_NS
 from pans.runtime.wire import kernels as wire
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.bare import bare
+from pans.runtime.wire.bare import bare, copy_span, load4
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
 from . import rings as ring
@@ -66,7 +67,7 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
         control[ring.N_ARRIVALS] += 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no-untyped-def]
     """Read as soon as something is there; ALL_TAKEN when it is decoded, or why the call ends."""
     quiet_ns = QUIET_NS if control[ring.DRIVES] else 0  # the caller's work fits into the exposure behind a SHOW
@@ -101,19 +102,19 @@ def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no
         # a terminal says so when nothing is there
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
     """Decode the next of the reads that were made elsewhere."""
     size, at = reads[control[ring.NEXT_READ], 0], control[ring.READ_AT]
     control[ring.ARRIVAL_NS] = reads[control[ring.NEXT_READ], 1]
     control[ring.NEXT_READ] += 1
     held = _make_room(decoder)
-    wire.copy_span(fed, _U(at), _U(at + size), decoder.buffer, _U(held))
+    copy_span(fed, _U(at), _U(at + size), decoder.buffer, _U(held))
     control[ring.READ_AT] += size
     _decode(decoder, control, held, size)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _begin(walk, control):  # type: ignore[no-untyped-def]
     """Nothing has come in this call yet."""
     for column in range(ring.ERRNO, ring.N_CONTROL):
@@ -121,7 +122,7 @@ def _begin(walk, control):  # type: ignore[no-untyped-def]
     walk.state[core.N_ROWS] = 0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _make_room(decoder):  # type: ignore[no-untyped-def]
     """Move what waits for the rest of its frame to the beginning of the buffer; return how many bytes those are."""
     buffer, tally = decoder.buffer, decoder.tally
@@ -133,7 +134,7 @@ def _make_room(decoder):  # type: ignore[no-untyped-def]
     return held
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _decode(decoder, control, held, found):  # type: ignore[no-untyped-def]
     """Decode `found` new bytes behind `held` ones."""
     tally, used = decoder.tally, held + found
@@ -143,14 +144,14 @@ def _decode(decoder, control, held, found):  # type: ignore[no-untyped-def]
     tally[wire.BYTES_IN] += found
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _failed(control, found):  # type: ignore[no-untyped-def]
     """Why a call ends whose wait or read gave `found`, 0 or minus errno."""
     control[ring.ERRNO] = -found
     return ring.SIGNALLED if found == -INTERRUPTED else ring.GONE
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
     """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/evidence.py)."""
     n = control[ring.N_NOTES]
@@ -163,7 +164,7 @@ def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-
     control[ring.N_NOTES] += 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _read(decoder, control, scratch):  # type: ignore[no-untyped-def]
     """Read behind what waits in the buffer, stamp and decode it; return the bytes read, 0, or minus errno."""
     held = _make_room(decoder)
@@ -174,7 +175,7 @@ def _read(decoder, control, scratch):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True, nogil=True)
+@inner
 def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Take decoded bodies until none is left, one is not ordinary, or a ring is nearly full; say which."""
     buffer, bodies = decoder.buffer, decoder.bodies
@@ -215,13 +216,13 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
     return ring.ALL_TAKEN
 
 
-@njit(cache=True, nogil=True)
+@inner
 def load_session(buffer, start):  # type: ignore[no-untyped-def]
     """The session of the body at `start`, int64."""
-    return np.int64(wire.load4(buffer, _U(start) + _U(4)))
+    return np.int64(load4(buffer, _U(start) + _U(4)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
     """Whether another body of `size` bytes, what it answers and all its decisions fit."""
     return (
@@ -234,11 +235,11 @@ def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _keep(buffer, start, stop, kept, spans, count, control):  # type: ignore[no-untyped-def]
     """Copy a body behind what is kept, and say where it stands; `count` is the column of `control` that counts the spans."""
     at = control[ring.KEPT]
-    wire.copy_span(buffer, _U(start), _U(stop), kept, _U(at))
+    copy_span(buffer, _U(start), _U(stop), kept, _U(at))
     span = spans[control[count]]
     span[ring.BEGIN], span[ring.END], span[ring.TIME] = at, at + stop - start, control[ring.ARRIVAL_NS]
     span[ring.WHAT] = buffer[start]
@@ -247,7 +248,7 @@ def _keep(buffer, start, stop, kept, spans, count, control):  # type: ignore[no-
     control[ring.HEARD_NS] = control[ring.ARRIVAL_NS]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # type: ignore[no-untyped-def]
     """Keep when a block came, was decoded, decided and kept, and what has come of all up to it."""
     step = steps[control[ring.N_STEPS]]
@@ -269,7 +270,7 @@ def unpack_blocks(kept, messages, stamps, bits):  # type: ignore[no-untyped-def]
     for i in range(messages.shape[0]):
         if messages[i, ring.WHAT] == stream.CLICKS:
             payload = _U(messages[i, ring.BEGIN] + stream.BODY_HEADER)
-            count = np.int64(wire.load4(kept, payload + _U(28)) & _U(0xFFFF))
+            count = np.int64(load4(kept, payload + _U(28)) & _U(0xFFFF))
             if used + count > stamps.size:
                 break
             stream.unpack_clicks(kept, payload, count, stamps[used:], bits[used:])

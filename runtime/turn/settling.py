@@ -13,6 +13,7 @@ from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.stream_kernels import MARK_SLOTS
 from pans.runtime.timing.clock import LARGEST_NS, STEP_MARGIN_NS
 from pans.runtime.timing.ledger import SUB_BITS
+from pans.runtime.wire.inner import inner
 
 from . import rings as ring
 
@@ -117,7 +118,7 @@ def judge_blocks(steps, rows, fit, anchors, deadline_ns, histograms, judged, run
     return n_runs, n_marked
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _judge(marks, count, unsure_ns, deadline_ns, histograms, judged):  # type: ignore[no-untyped-def]
     """Count the stages and the total of a block's `count` decisions; whether they are late."""
     slowest, longest_ns = 0, marks[1] - marks[0]

@@ -11,7 +11,9 @@ from numba import njit
 
 from pans.runtime.core import stream_kernels as core
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.kernels import crc32_span, load4
+from pans.runtime.wire.bare import load4
+from pans.runtime.wire.inner import inner
+from pans.runtime.wire.kernels import crc32_span
 from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
 from pans.runtime.wire.session import COMMAND_WINDOW
 
@@ -26,7 +28,7 @@ WRITE_WAIT_NS = 20_000_000  # for room; what then is left, the caller sends
 _U = np.uint64
 
 
-@njit(cache=True, nogil=True)
+@inner
 def following(walk, drive):  # type: ignore[no-untyped-def]
     """Exposure and state of the next step: of the walk under way, or of the next one when this one is over or lost."""
     slots, walks = drive.sizes[0], drive.sizes[1]
@@ -39,7 +41,7 @@ def following(walk, drive):  # type: ignore[no-untyped-def]
     return (cycle + 1) * slots + drive.slot_of[0], np.int64(0)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _walk_state(walk, visit, window, step):  # type: ignore[no-untyped-def]
     """As DecisionWindows.walk_state: -1 when the walk is over, or what came before is not known."""
     if visit != walk.state[core.VISIT]:
@@ -49,7 +51,7 @@ def _walk_state(walk, visit, window, step):  # type: ignore[no-untyped-def]
     return node if known else np.int64(-1)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def put_show(drive, number, exposure, state, out, at):  # type: ignore[no-untyped-def]
     """Put the frame of SHOW command `number` for `exposure` and `state` behind out[:at]; return where it ends."""
     plain, tail = drive.plain, drive.tails.shape[1]
@@ -103,7 +105,7 @@ def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-
     return sent
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _send(control, data, begin, end, scratch):  # type: ignore[no-untyped-def]
     """Write data[begin:end]; False, with the rest's size and errno in `control`, when the other end takes no more."""
     while begin < end:

@@ -15,6 +15,8 @@ import numba
 import numpy as np
 from numba import njit, types
 
+from pans.runtime.wire.inner import inner
+
 # perf_counter_ns, which stamps everything else, reads the same clock: CLOCK_MONOTONIC, on macOS CLOCK_UPTIME_RAW
 _CLOCK = np.int32(8 if sys.platform == "darwin" else 1)
 _IN, _OUT = np.int64(1), np.int64(4)  # POLLIN, POLLOUT
@@ -42,12 +44,12 @@ elif sys.platform not in ("linux", "darwin"):
         """No clock: whoever feeds a turn stamps what it took."""
         return np.int64(0)
 
-    @njit(cache=True, nogil=True)
+    @inner
     def wait_for(fd, wait_ns, to_write, scratch):  # type: ignore[no-untyped-def]
         """Not offered here."""
         return np.int64(-_NOT_OFFERED)
 
-    @njit(cache=True, nogil=True)
+    @inner
     def read_now(fd, buffer, at, size):  # type: ignore[no-untyped-def]
         """Not offered here."""
         return np.int64(-_NOT_OFFERED)
@@ -75,7 +77,7 @@ else:
         _clock_gettime(_CLOCK, scratch.ctypes.data + 16)
         return scratch[2] * NS_PER_S + scratch[3]
 
-    @njit(cache=True, nogil=True)
+    @inner
     def wait_for(fd, wait_ns, to_write, scratch):  # type: ignore[no-untyped-def]
         """Wait at most `wait_ns` until `fd` can be read (or written): above 0 when it can or is gone, 0 when not, else minus errno."""
         scratch[0] = np.int64(fd) | (_OUT if to_write else _IN) << np.int64(32)
@@ -86,13 +88,13 @@ else:
             found = _ppoll(scratch.ctypes.data, np.uint64(1), scratch.ctypes.data + 16, 0)
         return np.int64(found) if found >= 0 else -np.int64(_errno_at()[0])
 
-    @njit(cache=True, nogil=True)
+    @inner
     def read_now(fd, buffer, at, size):  # type: ignore[no-untyped-def]
         """Read at most `size` bytes to buffer[at:]: how many, 0 at the end (or of a terminal without data), else minus errno."""
         found = _read(np.int32(fd), buffer.ctypes.data + at, np.uint64(size))
         return np.int64(found) if found >= 0 else -np.int64(_errno_at()[0])
 
-    @njit(cache=True, nogil=True)
+    @inner
     def write_now(fd, buffer, at, size):  # type: ignore[no-untyped-def]
         """Write buffer[at : at + size]: how many bytes were taken, else minus errno."""
         found = _write(np.int32(fd), buffer.ctypes.data + at, np.uint64(size))

@@ -17,9 +17,9 @@ from pans.runtime.instrument.channel_health import Finding
 from pans.runtime.instrument.cusum import take_words
 from pans.runtime.instrument.dead_channels import DeadArrays, note_object, note_seen
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.bare import bare
+from pans.runtime.wire.bare import bare, load4, load8
 from pans.runtime.wire.frame import read_only
-from pans.runtime.wire.kernels import load4, load8
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.messages import FrameBlock, decode_frames
 from pans.runtime.wire.schema import HEADER, NO_OBJECT
 
@@ -145,7 +145,7 @@ def watch_frames(kept, messages, first, maps, scratch, watch, dead, place):  # t
     return messages.shape[0], ALL_SEEN
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-def]
     """Gather a block's dark frames and return how many; which channels clicked in any frame and in lit ones, -1 where none was lit."""
     dark_slot, lit = maps
@@ -173,7 +173,7 @@ def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-de
     return n_dark
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _note_object(number, seen, dead, place):  # type: ignore[no-untyped-def]
     """As DeadChannelTest.take_object; return whether the object before it has gone and channels are due to be looked at."""
     due = False

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from .bare import copy_span, load4, load8
+from .inner import inner
 from .schema import MessageType
 
 FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = (
@@ -40,36 +42,6 @@ def _crc_tables() -> npt.NDArray[np.uint32]:
 
 
 CRC_TABLES = _crc_tables()
-
-
-@njit(cache=True, nogil=True)
-def load8(data, i):  # type: ignore[no-untyped-def]
-    """Eight bytes as a little-endian uint64 from position `i` (uint64); the compiler makes it one load."""
-    return (
-        _U(data[i])
-        | _U(data[i + _ONE]) << _EIGHT
-        | _U(data[i + _U(2)]) << _S16
-        | _U(data[i + _U(3)]) << _S24
-        | _U(data[i + _U(4)]) << _S32
-        | _U(data[i + _U(5)]) << _S40
-        | _U(data[i + _U(6)]) << _S48
-        | _U(data[i + _U(7)]) << _S56
-    )
-
-
-@njit(cache=True, nogil=True)
-def load4(data, i):  # type: ignore[no-untyped-def]
-    """Four bytes as a little-endian number, in a uint64, from position `i` (uint64)."""
-    return (
-        _U(data[i]) | _U(data[i + _ONE]) << _EIGHT | _U(data[i + _U(2)]) << _S16 | _U(data[i + _U(3)]) << _S24
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def copy_span(source, start, stop, target, at):  # type: ignore[no-untyped-def]
-    """Copy source[start:stop] to target[at:], uint8, places uint64; numba takes seconds to compile the assignment of a slice."""
-    for i in range(stop - start):
-        target[at + i] = source[start + i]
 
 
 @njit(cache=True, nogil=True)
@@ -124,7 +96,7 @@ def find_zero(data, start, stop):  # type: ignore[no-untyped-def]
     return i
 
 
-@njit(cache=True, nogil=True)
+@inner
 def unstuff(data, start, stop):  # type: ignore[no-untyped-def]
     """Undo COBS on data[start:stop] in place: the body stands at start+1..; return its end, or 0 if it is no COBS string.
 
@@ -153,7 +125,7 @@ def unstuff(data, start, stop):  # type: ignore[no-untyped-def]
     return _unstuff_moving(data, pos, stop, code)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _unstuff_moving(data, pos, stop, code):  # type: ignore[no-untyped-def]
     """The rest of `unstuff` from the group at `pos` on, whose code has been read: data moves down by one per full group."""
     out = pos + _ONE
@@ -180,7 +152,7 @@ def _unstuff_moving(data, pos, stop, code):  # type: ignore[no-untyped-def]
             out += _EIGHT
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _move_down(data, source, end, out):  # type: ignore[no-untyped-def]
     """Copy data[source:end] to data[out:], out < source; return where it ends."""
     while source + _EIGHT <= end:
@@ -253,8 +225,7 @@ def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-unty
     """
     waiting, held = tally[CONSUMED], tally[HELD]
     if waiting:
-        for i in range(held):
-            buffer[i] = buffer[waiting + i]
+        copy_span(buffer, _U(waiting), _U(waiting + held), buffer, _U(0))
     for i in range(len(data)):
         buffer[held + i] = data[i]
     used = held + len(data)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from .bare import as_float32
-from .kernels import load4, load8
+from .bare import as_float32, load4, load8
+from .inner import inner
 from .schema import BLOCK_HEADER_BYTES, HEADER, STRUCTS, MessageType
 from .tracker import MAX_GAP_EXPOSURES
 
@@ -40,7 +40,7 @@ def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     return count, width
 
 
-@njit(cache=True, nogil=True)
+@inner
 def next_clicks(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     """Exposures of the CLICKS payload from `payload` to `stop`; 0 where `next_block` would say so."""
     if stop - payload <= _U(BLOCK_HEADER):
@@ -52,7 +52,7 @@ def next_clicks(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def unpack_clicks(buffer, payload, count, stamps, bits):  # type: ignore[no-untyped-def]
     """Put the patterns shown and the clicks of a CLICKS payload of `count` exposures into uint16 and uint8 (count or more,)."""
     at = payload + _U(BLOCK_HEADER)
@@ -62,7 +62,7 @@ def unpack_clicks(buffer, payload, count, stamps, bits):  # type: ignore[no-unty
         bits[i] = buffer[first_byte + _U(i >> 3)] >> np.uint8(i & 7) & np.uint8(1)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _follows(buffer, payload, count, place):  # type: ignore[no-untyped-def]
     """Whether a block of `count` exposures is the next one, without loss, within the plan and the range of its fields."""
     return not (
@@ -92,7 +92,7 @@ def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def]
     """Whether a MARK's truth is one of `n_classes` or unknown, and its exposure near the stream's place, as core/plausible.py asks."""
     away = np.int64(load8(buffer, payload + _U(12))) - place[NEXT_EXPOSURE]
@@ -100,7 +100,7 @@ def mark_fits(buffer, payload, place, n_classes):  # type: ignore[no-untyped-def
     return near and -1 <= mark_truth(buffer, payload) < n_classes
 
 
-@njit(cache=True, nogil=True)
+@inner
 def go_on(place, count):  # type: ignore[no-untyped-def]
     """Account for the next message, with `count` exposures."""
     place[NEXT_SEQ] = (place[NEXT_SEQ] + 1) & 0xFFFFFFFF
@@ -109,19 +109,19 @@ def go_on(place, count):  # type: ignore[no-untyped-def]
     place[EXPOSURES] += count
 
 
-@njit(cache=True, nogil=True)
+@inner
 def block_times(buffer, payload):  # type: ignore[no-untyped-def]
     """The tick at which a block's first exposure began, and the ticks from one to the next; int64."""
     return np.int64(load8(buffer, payload + _U(8))), np.int64(load4(buffer, payload + _U(24)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def mark_photons(buffer, payload, photons, place):  # type: ignore[no-untyped-def]
     """Put a MARK's photons into `photons` float32 at `place`, bit for bit."""
     photons[place] = as_float32(load4(buffer, payload + _U(28)))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def mark_truth(buffer, payload):  # type: ignore[no-untyped-def]
     """A MARK's truth, int64; -1: unknown."""
     return np.int64(np.int16(np.uint16(load4(buffer, payload + _U(8)) & _U(0xFFFF))))
