@@ -38,6 +38,7 @@ COMMANDS = {  # words, what is there already, what else is read
     "reproduce json": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.json", None),
     "reproduce md": ("reproduce alpha --collect --cache C -o DIR", "DIR/alpha.md", None),
     "refit": ("refit b.pans r.pansrec -o OUT", "OUT", "b.pans"),
+    "order": ("order b.pans -o OUT", "OUT", "b.pans"),
     "tune": (f"tune b.pans --device {DEVICE} -o OUT", "OUT", "b.pans"),
     "trials": ("trials flow --bundle b.pans --json OUT", "OUT", None),
 }

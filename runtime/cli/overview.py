@@ -19,7 +19,7 @@ from .finding import load_command
 GROUPS = {
     "Run and look": ("demo", "run", "replay", "verify", "info", "report", "compare", "export", "runs", "service"),
     "Instruments": ("profile", "calibrate", "refit", "tune", "simulate", "devices", "doctor"),
-    "Train and compare": ("train", "evaluate", "baseline", "reproduce", "sweep", "batch", "data", "bundle"),
+    "Train and compare": ("train", "evaluate", "order", "baseline", "reproduce", "sweep", "batch", "data", "bundle"),
     "Measure and test": ("bench", "conform", "trials", "fuzz"),
     "Shell": ("completion",),
 }

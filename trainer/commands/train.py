@@ -179,6 +179,11 @@ def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head", choices=HEADS, help="digital back end (default mlp; picture where the task asks for it)"
     )
+    parser.add_argument(
+        "--order",
+        choices=("information", "dose"),
+        help="show the patterns in the order that tells most first, per pattern or per light that it sends",
+    )
     light = parser.add_mutually_exclusive_group()
     light.add_argument(
         "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
@@ -189,6 +194,12 @@ def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
         choices=tuple(BUDGETS),
         help="how strictly --photons and --clicks hold during training (default firm)",
     )
+
+
+def _check_order(order: str | None, options: Options) -> None:
+    """Refuse --order where there is none, before anything is trained."""
+    if order and (options.encoder != "active" or options.head != "mlp"):
+        raise UsageError("--order is for patterns that are sent and the head mlp", remedy="leave --order out")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -219,6 +230,7 @@ def _train(args: argparse.Namespace) -> int:
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args, task, profile)
+    _check_order(args.order, options)
     check_options(options, profile)
     started = time.perf_counter()
     history = _history(args, options, checkpoint, chosen.task)
@@ -343,8 +355,9 @@ def _export(
         "training_seconds": round(seconds, 1),
         **chosen,
     }
+    name = args.name or args.out.stem
     return export_trained(
-        args.out, trained, task, profile, name=args.name or args.out.stem, provenance=provenance, force=args.force
+        args.out, trained, task, profile, name=name, provenance=provenance, force=args.force, order=args.order
     )
 
 

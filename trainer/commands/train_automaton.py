@@ -50,7 +50,7 @@ TAKEN = (
     "optics",
 )
 FOREIGN = (
-    *("features", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
+    *("features", "order", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
     *(
         "polish",
         "similarity",

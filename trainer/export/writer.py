@@ -7,7 +7,7 @@ decision of the file differs from the torch model.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from pans.trainer.train.loop import Trained
 
 from .int8_onnx import int8_onnx
 from .onnx_heads import DEAD_VARIANCE, head_onnx
+from .ordering import information_order
+from .reorder import order_facts, reordered
 from .tolerance import with_tolerance
 
 ALL_WORDS_MAX = 12  # 4096 words; a bundle holds a table up to here too
@@ -40,6 +42,9 @@ RANDOM_WORDS = 10_000  # beyond it
 COMPARED_OBJECTS = 200
 
 F64 = NDArray[np.float64]
+
+
+Ordering = Callable[[Bundle], tuple[list[int], Mapping[str, Any]]]  # patterns in order, and facts of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +79,14 @@ def export(
     *,
     force: bool = False,
     finish: Callable[[Bundle], Bundle] = lambda bundle: bundle,
+    ordering: Ordering | None = None,
 ) -> Exported:
     """Write the bundle to `path`, read it back and compare its back ends with `head`; PansError if they differ.
 
     UsageError if `path` exists, unless `force`. A wrong bundle never stands there.
 
     A head that returns pictures decides among no classes. `check` may refuse what was read, by PansError; `finish` may add facts to
-    the bundle before it is written.
+    the bundle before it is written; `ordering` says in which order its patterns are shown, where not as they were trained.
     """
     graph, dead = head_onnx(head, click_mean)
     picture_shape = head.image_shape if isinstance(head, Decoders) else None
@@ -97,12 +103,17 @@ def export(
         back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
         provenance={**about.provenance, "trained_with": programs()},
     )
+    places = list(range(bundle.n_features))
+    with as_usage_error():
+        if ordering is not None:
+            places, facts = ordering(bundle)
+            bundle = reordered(bundle, places, facts)
     with whole_file(path, force=force) as unchecked:
         write_bundle(finish(bundle), unchecked)
         bundle, digest = load_bundle(unchecked)
-        words, difference = compare(bundle, head, click_mean)
+        words, difference = compare(bundle, head, click_mean, places)
         check(bundle)
-    return Exported(bundle, digest, words, difference, dead)
+    return Exported(bundle, digest, words, difference, tuple(places.index(old) for old in dead))
 
 
 def origin(task: Task, profile: Profile) -> dict[str, Any]:
@@ -132,10 +143,12 @@ def export_trained(
     name: str,
     provenance: Mapping[str, Any],
     force: bool = False,
+    order: str | None = None,
 ) -> Exported:
     """Write what `train` returned to `path`; UsageError if it exists, unless `force`.
 
-    `provenance` is added to what the task, profile and training say of themselves.
+    `provenance` is added to what the task, profile and training say of themselves. With an `order` of `ordering.WAYS` the patterns are
+    shown so, as the training objects tell.
     """
     quantised = trained.quantised
     optics: Shown | Analyser
@@ -152,7 +165,21 @@ def export_trained(
     def finish(bundle: Bundle) -> Bundle:
         return with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
 
-    return export(path, trained.head, trained.click_mean.numpy(), optics, about, check, force=force, finish=finish)
+    def ordering(bundle: Bundle) -> tuple[list[int], Mapping[str, Any]]:
+        found = information_order(bundle, profile, task.train, by=order or "")
+        return list(found.patterns), order_facts(found, bundle)
+
+    return export(
+        path,
+        trained.head,
+        trained.click_mean.numpy(),
+        optics,
+        about,
+        check,
+        force=force,
+        finish=finish,
+        ordering=None if order is None else ordering,
+    )
 
 
 def analyser_of(trained: Trained, task: Task, profile: Profile) -> Analyser:
@@ -185,17 +212,20 @@ def compare_optics(bundle: Bundle, trained: Trained, task: Task, profile: Profil
         )
 
 
-def compare(bundle: Bundle, head: Heads, click_mean: F64) -> tuple[int, float]:
+def compare(bundle: Bundle, head: Heads, click_mean: F64, places: Sequence[int] | None = None) -> tuple[int, float]:
     """Hold every back end of `bundle` against the torch head: all click words up to d_f = 12, else 10 000 random ones.
 
-    Returns the number of words and the largest score difference over max(1, |score|). PansError where it exceeds 1e-5
-    or a decision differs whose margin is clear of that (pictures have only scores, their pixels).
+    Pattern i of the bundle is pattern `places[i]` of the head (None: i). Returns the number of words and the largest score difference
+    over max(1, |score|). PansError where it exceeds 1e-5 or a decision differs whose margin is clear of that (pictures have only
+    scores, their pixels).
     """
     if bundle.n_features <= ALL_WORDS_MAX:
         means = word_means(np.arange(1 << bundle.n_features), bundle.n_features)
     else:
         means = np.random.default_rng(0).integers(0, 2, (RANDOM_WORDS, bundle.n_features)).astype(np.float32)
-    wanted = reference_scores(head, click_mean, means)
+    as_trained = np.empty_like(means)
+    as_trained[:, list(places or range(bundle.n_features))] = means
+    wanted = reference_scores(head, click_mean, as_trained)
     scale = np.maximum(1.0, np.abs(wanted))
     ranked = np.sort(wanted, axis=1)
     clear = ranked[:, -1] - ranked[:, -2] > 2 * GOLDEN_TOLERANCE * scale.max(axis=1)

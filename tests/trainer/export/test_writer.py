@@ -93,6 +93,24 @@ def test_beyond_twelve_patterns_random_words_are_compared(tmp_path):
     assert done.bundle.table is None
 
 
+def test_patterns_in_another_order_are_held_against_the_model(tmp_path):
+    head, mean, order = trained_head(5, seed=3), np.array([0.2, 0.0, 0.5, 0.7, 0.4]), [4, 2, 0, 1, 3]
+    about = Description("small", "own", tuple("abcd"), (2, 3), {"seed": 0})
+    levels = RNG.integers(0, 124, (5, 6)).astype(np.uint16)
+
+    def ordering(_):
+        return order, {"order": {"patterns": order}}
+
+    shown = Shown(124, levels, 0.01)
+    done = export(tmp_path / "small.pans", head, mean, shown, about, ordering=ordering)
+    assert done.words_compared == 32
+    np.testing.assert_array_equal(done.bundle.pattern_levels, levels[order])
+    assert done.dead_patterns == (3,)  # pattern 1, where it is now
+    assert done.bundle.provenance["order"] == {"patterns": order}
+    with pytest.raises(PansError, match="differs from the trained model"):
+        compare(done.bundle, head, mean)
+
+
 def test_another_model_is_noticed(tmp_path):
     mean = np.full(6, 0.4)
     done = written(tmp_path / "small.pans", trained_head(6, seed=1), mean, 6)

@@ -1,0 +1,33 @@
+"""Draws dose.png: accuracy of the shipped bundles against dose, patterns in three orders, exact over the test images, SIMULATED.
+
+Usage: python docs/pictures/dose.py [OBJECTS] (needs the extra plot and PANS_DATA; a minute for all 10 000 images).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.imaging import NO_BLEACHING
+from pans.trainer.commands.evaluate_dose import curve_words
+from pans.trainer.evaluate.dose import dose_curve
+from pans.trainer.evaluate.dose_picture import draw_dose
+from pans.trainer.evaluate.held_out import Conditions, held_out_of
+from pans.trainer.export.ordering import information_order
+from pans.trainer.export.reorder import reordered
+
+if __name__ == "__main__":
+    objects = int(sys.argv[1]) if len(sys.argv) > 1 else None
+    fixed, walks = load_bundle("fashion10")[0], load_bundle("fashion-adaptive")[0]
+    held_out = held_out_of(fixed, None, objects, None, Conditions())
+    bundles = {"fashion10, as trained": (fixed, held_out)}
+    for by in ("information", "dose"):
+        order = information_order(fixed, held_out.profile, held_out.task.train, by=by)
+        bundles[f"fashion10, by {by}"] = (reordered(fixed, order.patterns, {}), held_out)
+    bundles["fashion-adaptive"] = (walks, held_out_of(walks, None, objects, None, Conditions()))
+    drawn = {}
+    for name, (bundle, judged_on) in bundles.items():
+        drawn[name] = dose_curve(bundle, judged_on, Conditions())
+        print(curve_words(name, len(judged_on.objects), NO_BLEACHING, drawn[name]))
+    print(draw_dose(Path(__file__).parent, drawn, force=True))

@@ -1,0 +1,163 @@
+"""The order of patterns: information held against sums over all words written out, and bundles that decide as before."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bundles import made_bundle
+from commands import json_of
+
+from pans.runtime.bundle.layers import Layer, int8_reference, quantise_head
+from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.imaging import Bleaching
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.trainer.evaluate.accuracy import light_of
+from pans.trainer.export.ordering import _Samples, information_order
+from pans.trainer.export.reorder import reordered
+from pans.trainer.tasks.registry import Objects
+
+IDEAL = load_profile("ideal")
+RNG = np.random.default_rng(21)
+IMAGES = RNG.integers(0, 256, (24, 2, 3), dtype=np.uint8)
+LABELS = RNG.integers(0, 3, 24)
+OBJECTS = Objects(IMAGES, LABELS)
+
+
+def bundle_of(d_f: int, levels: np.ndarray | None = None) -> Bundle:
+    layers = (
+        Layer(RNG.normal(size=(d_f, 6)).astype(np.float32), RNG.normal(size=6).astype(np.float32), True),
+        Layer(RNG.normal(size=(6, 3)).astype(np.float32), RNG.normal(size=3).astype(np.float32), False),
+    )
+    shown = RNG.integers(1, 16, (d_f, 6)) if levels is None else levels
+    facts = {"levels": 16, "pattern_levels": shown, "photons_per_level": 0.1, "image_shape": (2, 3)}
+    return made_bundle(d_f, 3, head_onnx=chain_onnx(layers), int8_head=quantise_head(layers), **facts)
+
+
+def bits_of(probability: np.ndarray) -> float:
+    """I(class; clicks) in bits, by the definition: all words, all classes, all objects."""
+    n, d_f = probability.shape
+    total = 0.0
+    of_class = np.bincount(LABELS, minlength=3) / n
+    for word in itertools.product((0, 1), repeat=d_f):
+        chance = [math.prod(p if bit else 1 - p for p, bit in zip(row, word)) / n for row in probability]
+        for label in range(3):
+            joint = sum(c for c, own in zip(chance, LABELS) if own == label)
+            if joint > 0:
+                total += joint * math.log2(joint / (sum(chance) * of_class[label]))
+    return total
+
+
+@pytest.mark.parametrize("by", ["information", "dose"])
+def test_the_order_takes_what_tells_most_next(by: str) -> None:
+    bundle = bundle_of(4)
+    probability, light = light_of(bundle, IDEAL, IMAGES).probability, bundle.patterns().sum(axis=1)
+    chosen: list[int] = []
+    bits: list[float] = []
+    while len(chosen) < 4:
+        rest = [j for j in range(4) if j not in chosen]
+        after = {j: bits_of(probability[:, [*chosen, j]]) for j in rest}
+        before = bits[-1] if bits else 0.0
+        best = max(rest, key=lambda j: (after[j] - before) / (light[j] if by == "dose" else 1.0))
+        chosen.append(best)
+        bits.append(after[best])
+    found = information_order(bundle, IDEAL, OBJECTS, by=by)
+    assert found.patterns == tuple(chosen)
+    assert found.exact
+    assert found.bits == pytest.approx(bits, abs=1e-12)
+
+
+def test_sampled_words_estimate_the_same_information() -> None:
+    probability = RNG.random((24, 4)) ** 2
+    known = _Samples(np.tile(LABELS, 60), 3, 0)
+    many = np.tile(probability, (60, 1))
+    for number in range(3):
+        wanted = [bits_of(probability[:, [*range(number), j]]) for j in range(number, 4)]
+        assert known.bits_with(many[:, number:]) == pytest.approx(wanted, abs=0.03)
+        known.take(many[:, number])
+
+
+def test_a_sample_that_bleaches_changes_the_order() -> None:
+    # pattern 0 tells most and, where it bleaches, leaves nothing for its twin, pattern 1: the dim pattern 2 then comes before it
+    images = np.zeros((24, 2, 3), np.uint8)
+    images[LABELS == 0, 0, 0] = 255
+    images[LABELS == 1, 1, 2] = 90
+    levels = np.zeros((3, 6), np.int64)
+    levels[0, 0], levels[1, 0], levels[2, 5] = 12, 11, 4
+    bundle, objects = bundle_of(3, levels), Objects(images, LABELS)
+    steady = information_order(bundle, IDEAL, objects)
+    bleaching = information_order(bundle, IDEAL, objects, bleaching=Bleaching(0.1))
+    assert steady.patterns == (0, 1, 2)
+    assert bleaching.patterns == (0, 2, 1) or bleaching.patterns == (1, 2, 0)
+    light = light_of(reordered(bundle, bleaching.patterns, {}), IDEAL, images, bleaching=Bleaching(0.1))
+    shown = bits_of(light.probability)
+    assert bleaching.bits[-1] == pytest.approx(shown, abs=1e-12)
+
+
+def test_a_reordered_bundle_decides_as_before(tmp_path: Path) -> None:
+    bundle, order = bundle_of(5), [3, 0, 4, 1, 2]
+    new = parse_bundle(bundle_bytes(reordered(bundle, order, {"order": "told"})), "new")
+    words = np.array(list(itertools.product((0, 1), repeat=5)))
+    np.testing.assert_array_equal(new.pattern_levels, bundle.pattern_levels[order])
+    for backend in ("table", "onnx"):
+        old, moved = make_decider(bundle, backend=backend), make_decider(new, backend=backend)
+        np.testing.assert_allclose(moved.scores_batch(words[:, order], 1), old.scores_batch(words, 1), atol=1e-5)
+    assert bundle.int8_head is not None
+    assert new.int8_head is not None
+    np.testing.assert_array_equal(
+        int8_reference(new.int8_head, words[:, order], 1), int8_reference(bundle.int8_head, words, 1)
+    )
+    assert new.provenance["order"] == "told"
+    back = reordered(new, np.argsort(order).tolist(), {})
+    np.testing.assert_array_equal(back.table, bundle.table)
+    with pytest.raises(ValueError, match="is no order of 5 patterns"):
+        reordered(bundle, [0, 1, 2, 3, 3], {})
+
+
+def test_a_table_alone_is_reordered_and_found_in_the_file() -> None:
+    table = RNG.normal(size=(8, 3))
+    levels = RNG.integers(1, 16, (3, 6))
+    bundle = made_bundle(3, 3, image_shape=(2, 3), levels=16, pattern_levels=levels, photons_per_level=0.1, table=table)
+    new = reordered(bundle, [2, 0, 1], {})
+    assert new.table is not None
+    assert bundle.table is not None
+    for word in itertools.product((0, 1), repeat=3):
+        own = np.array(word) @ (1, 2, 4)
+        moved = np.array([word[2], word[0], word[1]]) @ (1, 2, 4)
+        np.testing.assert_array_equal(new.table[moved], bundle.table[own])
+
+
+def test_the_command_orders_and_caps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    labels = np.arange(60) % 3
+    images = RNG.integers(0, 256, (60, 2, 3), dtype=np.uint8)
+    np.savez(tmp_path / "toy.npz", images=images, labels=labels, classes=np.array(["c0", "c1", "c2"]))
+    bundle = bundle_of(4)
+    (tmp_path / "old.pans").write_bytes(bundle_bytes(bundle))
+    given = ("order", tmp_path / "old.pans", "--task", tmp_path / "toy.npz", "--profile", "ideal")
+    found = json_of(capsys, *given, "-o", tmp_path / "new.pans")
+    order = [row["pattern"] for row in found["patterns"]]
+    new = load_bundle(tmp_path / "new.pans")[0]
+    np.testing.assert_array_equal(new.pattern_levels, bundle.pattern_levels[order])
+    assert new.provenance["order"]["patterns"] == order
+    cap = found["patterns"][1]["illumination"]
+    within = json_of(capsys, *given, "--dose-cap", cap, "--by", "information", "-o", tmp_path / "dim.pans")
+    assert within["illumination"] == pytest.approx(cap)
+    dim = load_bundle(tmp_path / "dim.pans")[0]
+    np.testing.assert_array_equal(dim.pattern_levels, bundle.pattern_levels[order[:2]])
+    words = ("--task", tmp_path / "toy.npz", "--profile", "ideal")
+    judged = json_of(capsys, "evaluate", tmp_path / "dim.pans", *words, "--exact")
+    capped = json_of(capsys, "evaluate", tmp_path / "new.pans", *words, "--dose-cap", cap)
+    assert capped["accuracy_mean"] == pytest.approx(judged["accuracy_mean"], abs=1e-12)
+    assert capped["illumination"] == pytest.approx(cap)
+    refused = json_of(capsys, "order", bundle_file(tmp_path), "--by", "none", "-o", tmp_path / "no.pans", code=2)
+    assert "changes nothing" in refused["error"]["message"]
+    assert not (tmp_path / "no.pans").exists()
+
+
+def bundle_file(folder: Path) -> Path:
+    return folder / "old.pans"
