@@ -17,7 +17,7 @@ from pans.firmware_sim.scene.light import Table
 from pans.firmware_sim.scene.moving import SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.imaging import IDENTITY
+from pans.runtime.imaging import IDENTITY, NO_BLEACHING
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.scene_fit import scene_facts
 from pans.runtime.wire import messages as wire
@@ -98,7 +98,7 @@ class Instrument:
         turn_ticks = math.ceil(self.profile.timing.device_turn_us * self._tick_hz / 1e6)
         self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks)
         self._shows: ShowList | None = None  # of a run that the host drives
-        self._light: tuple[tuple[int, int, int, bool], Table | PatternLight] | None = None
+        self._light: tuple[tuple[int, int, int, bool, bytes], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
         self._run: Measurement | FrameRun | None = None
         self._lease_tick: int | None = None
@@ -379,7 +379,8 @@ class Instrument:
 
     def _light_table(self, program: Program) -> Table | PatternLight:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
-        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks, program.adaptive)
+        stay = self.view.stay(program)
+        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks, program.adaptive, stay)
         if self._light is None or self._light[0] != key:
             patterns = self._patterns.stack(program.n_patterns) if self.view.optics is None else None
             self._light = (key, self.view.tabulate(program, patterns))
@@ -393,9 +394,11 @@ class Instrument:
 
 
 def _table_facts(scene: SceneFile) -> dict[str, Any]:
-    """Return what WELCOME says of optics that are not perfect: a run against a hidden truth must not pass for another one."""
+    """Return what WELCOME says of imperfect optics and of bleaching: a run against a hidden truth must not pass for another one."""
     imaging = scene.what.imaging if isinstance(scene.what, Scene) else IDENTITY
-    return {} if imaging.is_identity else {"simulated_optics": imaging.words()[:200]}
+    optics = {} if imaging.is_identity else {"simulated_optics": imaging.words()[:200]}
+    bleaching = scene.what.bleaching if isinstance(scene.what, Scene) else NO_BLEACHING
+    return optics if bleaching.is_none else optics | {"simulated_bleaching": bleaching.words()}
 
 
 def _scene_facts(scene: SceneFile) -> dict[str, Any]:

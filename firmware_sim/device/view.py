@@ -28,6 +28,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.commands import PARALLEL, Arm
 from pans.runtime.wire.messages import AckStatus
 
+from .bleached import bleached_photoelectrons
 from .sequential import Measurement
 from .states import ShowList
 from .upload import Refused
@@ -46,6 +47,11 @@ class View:
     optics: Analyser | None = None
     seed: int = 0
 
+    @property
+    def bleaches(self) -> bool:
+        """Whether light changes the objects."""
+        return isinstance(self.scene.what, Scene) and not self.scene.what.bleaching.is_none
+
     def check_and_warm_up(self) -> None:
         """Refuse what the simulator cannot do with a scene that moves, and compile the kernels: later nothing may wait for that."""
         if self.scene.moves and self.profile.mode != "parallel":
@@ -57,6 +63,11 @@ class View:
         if self.scene.moves and self.optics is not None:
             raise ConfigError(
                 f"scene {self.scene.name!r} moves: not yet possible behind passive optics", remedy="leave optics= out"
+            )
+        if self.bleaches and (self.profile.mode != "sequential" or self.optics is not None):
+            raise ConfigError(
+                "bleaching is simulated where pattern follows pattern: not in parallel mode, not behind passive optics",
+                remedy="leave bleach= out, or choose a sequential profile and no optics=",
             )
         warm_up(self.scene)
         if self.profile.mode == "parallel":
@@ -71,6 +82,12 @@ class View:
         """The exposure time of `program` on this instrument's clock."""
         return program.exposure_ticks * 1e6 / self.profile.clock.tick_hz
 
+    def stay(self, program: Program) -> bytes:
+        """What the light of an object's stay depends on beside the patterns: where it bleaches, their order; else nothing."""
+        if not self.bleaches:
+            return b""
+        return program.cycles_per_object.to_bytes(8, "little") + program.patterns.tobytes()
+
     def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None) -> Table | PatternLight:
         """Return the light of the scene through `patterns`, uint16 (n, pixels), or through the optics; `Refused` if they do not fit."""
         exposure_us = self.exposure_us(program)
@@ -78,6 +95,10 @@ class View:
             if patterns is not None and program.adaptive:
                 assert isinstance(self.scene.what, Scene)  # see check_and_warm_up
                 return PatternLight(self.profile, self.scene.what, patterns, exposure_us)
+            if patterns is not None and self.bleaches:
+                assert isinstance(self.scene.what, Scene)
+                photons = bleached_photoelectrons(self.profile, self.scene.what, patterns, program, exposure_us)
+                return tabulate(self.profile, photons, exposure_us)
             if patterns is not None:
                 return prepare(self.profile, self.scene, patterns, exposure_us)
             assert self.optics is not None
@@ -129,7 +150,8 @@ class View:
         exposures = Exposures(program, arm.n_cycles or None, self.profile.clock.tick_hz)
         changes = Changes(self.scene.changes, program.channels)
         model = detector_model(self.profile, self.exposure_us(program))
-        walked = Walked(program, light, scene.n_objects, exposures, changes, model, self.seed, first_draw)
+        facts = (scene.n_objects, exposures, changes, model, self.seed, first_draw)
+        walked = Walked(program, light, *facts, light.fresh_sample())
         source = ShownSource(walked, drive) if isinstance(drive, ShowList) else WalkSource(walked, drive)
         return Measurement(
             program, arm, StillMarks(scene, program, exposures, changes, source.expected_photoelectrons), source

@@ -25,6 +25,7 @@ from pans.firmware_sim.scene.still import Scene
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, NO_OBJECT
 
+from .bleached import Sample
 from .states import ShowList
 
 F64 = NDArray[np.float64]
@@ -85,6 +86,12 @@ class PatternLight:
         block, row = divmod(number, self._at_a_time)
         return np.asarray(self._block(block)[row])
 
+    def fresh_sample(self) -> Sample | None:
+        """Return the sample that one run's walks bleach; None where nothing bleaches."""
+        if self._scene.bleaching.is_none:
+            return None
+        return Sample(self._profile, self._scene, self._levels, self._exposure_us)
+
     def _block(self, number: int) -> F64:
         found = self._blocks.get(number)
         if found is None:
@@ -109,6 +116,19 @@ class Walked:
     model: DetectorModel
     seed: int
     first_draw: int
+    sample: Sample | None = None  # that the walks bleach
+
+    @property
+    def changing(self) -> bool:
+        """Whether a state's light is not always the same, so that exposures are gone through one by one."""
+        return bool(self.changes) or self.sample is not None
+
+    def photoelectrons(self, exposure: int, pattern: int, share: float) -> float:
+        """Show `pattern` for `share` of `exposure`: the photoelectrons expected, without what changes with time."""
+        if self.sample is None:
+            return float(self.light.of(self.object_of(exposure))[pattern]) * share
+        visit = exposure // self.program.n_slots // self.program.cycles_per_object
+        return self.sample.photoelectrons(visit, pattern, share)
 
     def object_of(self, exposure: int) -> int:
         """The number in the scene of the object before the detector."""
@@ -151,7 +171,7 @@ class ShownSource:
             shown, light = self._shows.take(exposure), 0.0
             if shown is not None:
                 stamps[place] = shown.state
-                light = float(self._walked.light.of(self._walked.object_of(exposure))[shown.pattern]) * shown.light
+                light = self._walked.photoelectrons(exposure, shown.pattern, shown.light)
             clicks[place] = before = self._walked.click(exposure, light, before)
         return stamps, clicks
 
@@ -176,7 +196,7 @@ class WalkSource:
             if slot == 0:
                 self._state = 0
             part = slice(at, at + min(n_slots - slot, count - at))
-            follow = self._one_by_one if self._walked.changes else self._at_once
+            follow = self._one_by_one if self._walked.changing else self._at_once
             follow(first + at, stamps[part], clicks[part], before)
             before, at = clicks[part.stop - 1], part.stop
         return stamps, clicks
@@ -184,7 +204,7 @@ class WalkSource:
     def prepare(self, exposure: int) -> bool:
         """See `SlotSource`: the thresholds of one of the objects to come."""
         walked = self._walked
-        if walked.changes:
+        if walked.changing:
             return False
         visit = walked.program.n_slots * walked.program.cycles_per_object
         for ahead in range(OBJECTS_AHEAD):
@@ -196,7 +216,12 @@ class WalkSource:
         return False
 
     def expected_photoelectrons(self, number: int) -> float:
-        """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes."""
+        """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes.
+
+        NaN of one that bleaches: that depends on the walk.
+        """
+        if self._walked.sample is not None:
+            return math.nan
         found = self._expected.get(number)
         if found is None:
             from . import walk_kernels
@@ -224,12 +249,15 @@ class WalkSource:
         )  # fmt: skip
 
     def _one_by_one(self, first: int, stamps: U16, clicks: U8, before: U8) -> None:
-        """Follow the walk where the detector changes with time."""
+        """Follow the walk where the detector changes with time, or the object with its dose."""
         walked, states = self._walked, self._states
-        light = self._light(walked.object_of(first))
         for place, exposure in enumerate(range(first, first + len(stamps))):
             lit = self._adaptive[exposure % walked.program.n_slots] and self._state < len(states.pattern)
-            clicks[place] = before = walked.click(exposure, float(light[self._state]) if lit else 0.0, before)
+            light = 0.0
+            if lit:
+                pattern, share = int(states.pattern[self._state]), float(states.light[self._state])
+                light = walked.photoelectrons(exposure, pattern, share)
+            clicks[place] = before = walked.click(exposure, light, before)
             if lit:
                 stamps[place] = self._state
                 self._state = int(states.successors[self._state, before[0]])

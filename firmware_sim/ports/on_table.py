@@ -12,16 +12,16 @@ from pans.firmware_sim.scene.moving import ALL_CHANNELS, Change, SceneFile
 from pans.firmware_sim.scene.scene_file import open_scene
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.errors import ConfigError
-from pans.runtime.imaging import imaging_of, is_spec
+from pans.runtime.imaging import bleaching_of, imaging_of, is_spec
 from pans.runtime.instrument.profile import Profile
 
 
-def scene_on_table(name: str, changes: str, optics: str, profile: Profile) -> SceneFile:
+def scene_on_table(name: str, changes: str, optics: str, profile: Profile, bleach: str = "") -> SceneFile:
     """Open the scene `name` with `changes` where `profile` says, or where `optics` does; ConfigError for one that moves.
 
-    `optics` is as of `--optics`; keys that it does not name are as the profile states them.
+    `optics` is as of `--optics`; keys that it does not name are as the profile states them. `bleach` is as of `--bleach`.
     """
-    scene = open_scene(name, changes)
+    scene = _bleaching(open_scene(name, changes), bleach)
     imaging = profile.imaging()
     if is_spec(optics):
         imaging = imaging_of(optics, imaging)
@@ -34,6 +34,17 @@ def scene_on_table(name: str, changes: str, optics: str, profile: Profile) -> Sc
             remedy="leave the optics out, or choose a scene of still objects",
         )
     return replace(scene, what=replace(scene.what, imaging=imaging))
+
+
+def _bleaching(scene: SceneFile, bleach: str) -> SceneFile:
+    if not bleach:
+        return scene
+    if not isinstance(scene.what, Scene):
+        raise ConfigError(
+            f"scene {scene.name!r} moves: bleaching is simulated for still objects",
+            remedy="leave bleach= out, or choose a scene of still objects",
+        )
+    return replace(scene, what=replace(scene.what, bleaching=bleaching_of(bleach)))
 
 
 def _drifting(scene: SceneFile, profile: Profile) -> SceneFile:

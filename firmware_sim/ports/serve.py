@@ -20,7 +20,7 @@ from pans.firmware_sim.options import option, words_of
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import ConfigError, LinkError, UsageError, as_usage_error
-from pans.runtime.imaging import imaging_of, is_spec
+from pans.runtime.imaging import bleaching_of, imaging_of, is_spec
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link, descriptor_of, open_link
 
@@ -53,6 +53,11 @@ class SimOptions:
         "hidden truth of the optics, like shift=0.7,0.3:rotate=1.5:psf=0.7:gain=5%%:black=0.002; or a bundle, whose passive optics"
         " take the place of a projector",
         metavar="SPEC|BUNDLE",
+    )
+    bleach: str = option(
+        "",
+        "objects bleach: 1/e of a pixel's light is left after D0 photoelectrons on it; like 40 or 40:mixed",
+        metavar="D0[:mixed]",
     )
     changes: str = option("", "like dark:at_s=30:factor=2,dead:at_s=40:channel=3 (docs/reference/simulator.md)")
     engine: str = option("python", "python, or c: the reference firmware, built with the system's compiler")
@@ -96,6 +101,9 @@ def check_options(options: SimOptions) -> SimOptions:
     if is_spec(options.optics):
         with as_usage_error():
             imaging_of(options.optics)
+    if options.bleach:
+        with as_usage_error():
+            bleaching_of(options.bleach)
     _check_engine(options)
     if not abs(options.drift_ppm) <= MAX_DRIFT_PPM:
         raise UsageError(f"drift_ppm={options.drift_ppm}: allowed are -{MAX_DRIFT_PPM:g}..{MAX_DRIFT_PPM:g}")
@@ -109,7 +117,7 @@ def _check_engine(options: SimOptions) -> None:
         return
     if options.pace == "fast":
         raise UsageError("engine=c runs at real pace only", remedy="leave pace=fast out, or engine=c")
-    for name in ("faults", "changes", "optics"):
+    for name in ("faults", "changes", "optics", "bleach"):
         if getattr(options, name) and not is_spec(options.optics if name == "optics" else ""):
             raise UsageError(f"engine=c has no {name}", remedy=f"leave {name} out, or engine=c")
 
@@ -123,7 +131,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
         raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
-    scene = scene_on_table(options.scene, options.changes, options.optics, profile)
+    scene = scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach)
     faults = parse_faults(options.faults)
     optics = _optics(options.optics)
 
@@ -158,7 +166,7 @@ def open_sim(url: str) -> Link:
     options = parse_sim_url(url)
     if options.pace == "real":
         profile = load_profile(options.profile)  # a mistake in either is better told here than by the child
-        scene_on_table(options.scene, options.changes, options.optics, profile)
+        scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach)
         _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)

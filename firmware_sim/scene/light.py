@@ -112,7 +112,8 @@ def begin(
     what = scene.what
     if isinstance(table, LightTable):
         assert isinstance(what, Scene)
-        return StillObjects(what, table, program, exposures, changes)
+        kind = StillObjects if what.bleaching.is_none else BleachedObjects
+        return kind(what, table, program, exposures, changes)
     if isinstance(what, Cells):
         from .cells import CellFlow
 
@@ -191,6 +192,23 @@ class StillObjects(StillMarks):
         if program.mode != PARALLEL:
             return self._light, row * (program.n_patterns + 1) + column
         return self._light, np.where(column == program.n_patterns, len(self._light) - 1, row)
+
+
+class BleachedObjects(StillObjects):
+    """Still objects that the plan bleaches: the table has a column for each exposure of an object's stay (bleached.py)."""
+
+    def __init__(
+        self, scene: Scene, table: LightTable, program: Program, exposures: Exposures, changes: Changes
+    ) -> None:
+        super().__init__(scene, table, program, exposures, changes)
+        self._photons = self._photons / program.cycles_per_object  # a mark tells of one shot: the mean of all
+        self._columns = table.photoelectrons.shape[1]
+
+    def rows(self, first: int, count: int) -> tuple[F64, I64]:
+        """See `RunLight`: a row is an exposure of an object's stay."""
+        stay = self._program.cycles_per_object * self._program.n_slots
+        visit, place = np.divmod(np.arange(first, first + count), stay)
+        return self._light, visit % NO_OBJECT % self._scene.n_objects * self._columns + place
 
 
 def _by_row(table: F64, mode: int) -> F64:

@@ -61,6 +61,34 @@ def expected_photoelectrons(
     return light
 
 
+def patterns_met(
+    profile: Profile, scene: Scene, pattern_levels: NDArray[np.uint16], exposure_us: float
+) -> NDArray[np.float64]:
+    """Return what each object pixel receives of each pattern, float64 (patterns, pixels), in photoelectrons per unit transmission.
+
+    ValueError for patterns that do not fit the scene.
+    """
+    n_pixels, imaging = pattern_levels.shape[1], scene.imaging
+    if not scene.any_shape and n_pixels != scene.n_pixels:
+        raise ValueError(f"patterns have {n_pixels} pixels, scene {scene.name!r} has {scene.n_pixels}")
+    levels, full = pattern_levels.astype(np.float64), profile.projector.levels - 1.0
+    if scene.any_shape:  # a target fills the field: neither shift nor blur change it
+        shape = (1, n_pixels) if imaging.flat is None else imaging.flat.shape
+        light = levelled(imaging, levels, (shape[0], shape[1]), full)
+    else:
+        height, width = scene.images.shape[1:]
+        light = met(imaging, levels, (height, width), full)
+    return light * photons_per_level(profile, exposure_us)
+
+
+def transmissions(profile: Profile, scene: Scene, numbers: NDArray[np.int64], n_pixels: int) -> NDArray[np.float64]:
+    """Return the transmission of the objects `numbers` (n,) of the scene, float64 (n, pixels); a target has any number of pixels."""
+    grey, white = grey_steps(profile)
+    clear = profile.min_transmission + (1.0 - profile.min_transmission) * grey / white
+    found = clear[scene.images[numbers].reshape(len(numbers), -1)]
+    return np.ascontiguousarray(np.broadcast_to(found, (len(numbers), n_pixels)))
+
+
 def _imaged(profile: Profile, scene: Scene, pattern_levels: NDArray[np.uint16]) -> NDArray[np.float64]:
     """Level times transmission, float64 (n_objects, n_patterns), where the scene's images stand as `scene.imaging` says.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.images import read_class_folder
-from pans.runtime.imaging import IDENTITY, Imaging
+from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging
 from pans.runtime.npz_file import read_arrays
 from pans.runtime.registration.target import built_in_target
 
@@ -36,7 +36,8 @@ class Scene:
     """Objects in the order in which they pass: images uint8 (n, height, width), labels int16 (n,) with -1 for unknown.
 
     A target has one image of one pixel that stands for any shape; `lit` is False when no light reaches the detector. `imaging` is
-    where the images stand on the grid of the patterns, and how sharply.
+    where the images stand on the grid of the patterns, and how sharply; `bleaching` what light does to each object, which is fresh when
+    it comes.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Scene:
     classes: tuple[str, ...]
     lit: bool = True
     imaging: Imaging = IDENTITY
+    bleaching: Bleaching = NO_BLEACHING
 
     @property
     def n_objects(self) -> int:
