@@ -148,7 +148,7 @@ def _not_toml(error: tomllib.TOMLDecodeError, text: str, where: str) -> ConfigEr
 class Key:
     """One key: its kind, its range (for numbers) and whether it must be there."""
 
-    kind: str  # "text", "whole", "number", or "names" (a list of texts)
+    kind: str  # "text", "whole", "number", "names" (a list of texts), or "numbers"
     low: float = 0.0
     high: float = 0.0
     above: bool = False  # low itself is not allowed
@@ -162,7 +162,9 @@ class Key:
             return isinstance(value, str)
         if self.kind == "names":
             return isinstance(value, list) and all(isinstance(one, str) for one in value)
-        return isinstance(value, int if self.kind == "whole" else (int, float)) and not isinstance(value, bool)
+        if self.kind == "numbers":
+            return isinstance(value, list) and all(_is_number(one) for one in value)
+        return isinstance(value, int) and not isinstance(value, bool) if self.kind == "whole" else _is_number(value)
 
     def within(self, value: Any) -> bool:
         """Whether a value of the right type is an allowed one; nan is in no range."""
@@ -170,6 +172,8 @@ class Key:
             return value in self.choices if self.choices else bool(value.strip())
         if self.kind == "names":
             return all(one.strip() for one in value)
+        if self.kind == "numbers":
+            return all(self.low <= one <= self.high for one in value)
         if value == math.inf:
             return self.infinite
         return bool(self.low < value <= self.high or (value == self.low and not self.above))
@@ -181,10 +185,16 @@ class Key:
             return " or ".join(f'"{choice}"' for choice in self.choices) or "text in quotes, not empty"
         if self.kind == "names":
             return "a list of texts in quotes"
+        if self.kind == "numbers":
+            return f"a list of numbers from {self.low:.12g} to {self.high:.12g}"
         noun = "a whole number" if self.kind == "whole" else "a number"
         low, high = f"{self.low:.12g}", f"{self.high:.12g}"
         limits = f"above {low} and at most {high}" if self.above else f"from {low} to {high}"
         return f"{noun} {limits}{', or inf' if self.infinite else ''}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def found(value: Any) -> str:
@@ -206,6 +216,8 @@ def type_remedy(value: Any, kind: str) -> str:
         return "write the value in double quotes"
     if kind == "names":
         return 'for example ["null"]'
+    if kind == "numbers":
+        return "write plain numbers in brackets, for example [0.01, 0.002]"
     if isinstance(value, str):
         return "write the number without quotes"
     if kind == "whole" and isinstance(value, float) and value.is_integer():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -104,7 +105,10 @@ def _about(value: float, off: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Detector:
-    """What clicks; effects left at 0 are absent. `photon_number_max`: the largest number that a reading can state, 1 of clicks alone."""
+    """What clicks; effects left at 0 are absent. `photon_number_max`: the largest number that a reading can state, 1 of clicks alone.
+
+    `afterpulse_time_us` None: all afterpulses come in the next exposure. `crosstalk_further`: of the second neighbour, the third, ...
+    """
 
     kind: str
     channels: int
@@ -116,7 +120,14 @@ class Detector:
     dead_time_kind: str = NON_PARALYSABLE
     between_exposures: str = GATED
     afterpulse_probability: float = 0.0
+    afterpulse_time_us: float | None = None
     crosstalk_probability: float = 0.0
+    crosstalk_further: tuple[float, ...] = ()
+    telegraph_share: float = 0.0
+    telegraph_offset_e: float = 0.0
+    telegraph_time_s: float = math.inf
+    threshold_drift_e_per_hour: float = 0.0
+    timing_jitter_ns: float = 0.0
     photon_number_max: int = 1
 
 

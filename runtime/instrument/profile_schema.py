@@ -20,6 +20,8 @@ MODES = ("sequential", "parallel")
 NON_PARALYSABLE, PARALYSABLE = "non-paralysable", "paralysable"
 GATED, FREE_RUNNING = "gated", "free-running"
 MAX_FLUCTUATION = 0.3  # of the light from exposure to exposure: beyond it a Gaussian factor would often be below 0
+MOST_AFTERPULSES = 0.6  # of those that come at any time: beyond 1 - 1/e every one would cause another
+FARTHEST_CROSSTALK = 8  # channels
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
 
 
@@ -75,7 +77,14 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "dead_time_kind": Key("text", required=False, choices=(NON_PARALYSABLE, PARALYSABLE)),
         "between_exposures": Key("text", required=False, choices=(GATED, FREE_RUNNING)),
         "afterpulse_probability": _PROBABILITY,
+        "afterpulse_time_us": Key("number", 0, 1e9, above=True, required=False),
         "crosstalk_probability": _PROBABILITY,
+        "crosstalk_further": Key("numbers", 0, 1, required=False),
+        "telegraph_share": Key("number", 0, 1, required=False),
+        "telegraph_offset_e": Key("number", -10, 10, required=False),
+        "telegraph_time_s": Key("number", 1e-4, 1e9, required=False),
+        "threshold_drift_e_per_hour": Key("number", -100, 100, required=False),
+        "timing_jitter_ns": Key("number", 0, 1e9, required=False),
         "photon_number_max": Key("whole", 1, 15, required=False),
     },
     "exposure": {
@@ -109,7 +118,7 @@ class ProfileCheck:
         self._sections()
         values = {name: self._section(name) for name in SCHEMA if name in self.tables}
         sources, measure = self._sources(values), self._measure(values)
-        for check in (_check_channels, _check_exposure, _check_dead_time, _check_ticks, _check_lease, _check_optics):
+        for check in _CHECKS:
             check(values, self.fault)
         return {**values, "profile": {**values["profile"], "measure": measure}, "sources": sources}
 
@@ -145,10 +154,12 @@ class ProfileCheck:
                 )
         return {key: self._value(section, key, value, rules[key]) for key, value in table.items()}
 
-    def _value(self, section: str, key: str, value: Any, rule: Key) -> str | int | float:
+    def _value(self, section: str, key: str, value: Any, rule: Key) -> str | int | float | tuple[float, ...]:
         if rule.fits(value) and rule.within(value):
             if (section, key) == ("profile", "name"):
                 return self._checked_name(value)
+            if rule.kind == "numbers":
+                return tuple(float(one) for one in value)
             return float(value) if rule.kind == "number" else value
         remedy = "" if rule.fits(value) else type_remedy(value, rule.kind)
         raise self.fault((section, key), f"{section}.{key} must be {rule.allowed}, found {found(value)}", remedy)
@@ -261,6 +272,56 @@ def _check_dead_time(values: _Values, fault: _Fault) -> None:
         )
 
 
+def _check_afterpulses(values: _Values, fault: _Fault) -> None:
+    stated = values["detector"]
+    probability = stated.get("afterpulse_probability", 0.0)
+    if "afterpulse_time_us" in stated and not 0 < probability <= MOST_AFTERPULSES:
+        raise fault(
+            ("detector", "afterpulse_probability" if probability else "afterpulse_time_us"),
+            "detector.afterpulse_probability must be above 0 and at most "
+            f"{MOST_AFTERPULSES:g} with afterpulse_time_us, found {probability:g}",
+            "it is the chance that a click causes at least one more, at any later time",
+        )
+
+
+def _check_crosstalk(values: _Values, fault: _Fault) -> None:
+    channels, path = values["detector"]["channels"], ("detector", "crosstalk_further")
+    further, most = values["detector"].get("crosstalk_further", ()), max(0, min(FARTHEST_CROSSTALK, channels - 1) - 1)
+    if len(further) > most:
+        raise fault(
+            path,
+            f"detector.crosstalk_further must hold at most {most} numbers "
+            f"(of the second neighbour and those after it) with {channels} channels, found {len(further)}",
+            "leave out what is hardly there",
+        )
+
+
+def _check_telegraph(values: _Values, fault: _Fault) -> None:
+    stated, names = values["detector"], ("telegraph_share", "telegraph_offset_e", "telegraph_time_s")
+    missing = [name for name in names if name not in stated]
+    if 0 < len(missing) < len(names):
+        there = next(name for name in names if name in stated)
+        raise fault(("detector", there), f"detector.{there} needs {' and '.join(missing)}", "state all three or none")
+    jitter_us, period_us = (
+        stated.get("timing_jitter_ns", 0.0) / 1000,
+        sum(values["exposure"][name] for name in ("min_us", "readout_us")),
+    )
+    if jitter_us and (values["profile"]["mode"] != "parallel" or jitter_us > period_us):
+        raise fault(
+            ("detector", "timing_jitter_ns"),
+            f"detector.timing_jitter_ns must be 0 in sequential mode, and at most exposure.min_us + exposure.readout_us = "
+            f"{1000 * period_us:g} ns in parallel mode, found {1000 * jitter_us:g}",
+            "a click would say nothing of its exposure",
+        )
+    for name in (there for there in ("telegraph_share", "threshold_drift_e_per_hour") if stated.get(there)):
+        if not stated.get("read_noise_e"):
+            raise fault(
+                ("detector", name),
+                f"detector.{name} needs read_noise_e above 0: a detector that counts events has no reading that could shift",
+                "remove the line",
+            )
+
+
 def _check_ticks(values: _Values, fault: _Fault) -> None:
     tick_hz, min_us = values["clock"]["tick_hz"], values["exposure"]["min_us"]
     least_us = MIN_EXPOSURE_TICKS * 1e6 / tick_hz
@@ -295,6 +356,12 @@ def _check_optics(values: _Values, fault: _Fault) -> None:
                 f"optics.{off} must be at most optics.{key} - {least:g} = {value - least:g}, found {tolerance:g}",
                 "state the tolerance to either side of the value",
             )
+
+
+_CHECKS: tuple[Callable[[_Values, _Fault], None], ...] = (
+    _check_channels, _check_exposure, _check_dead_time, _check_afterpulses, _check_crosstalk, _check_telegraph, _check_ticks,
+    _check_lease, _check_optics,
+)  # fmt: skip
 
 
 def _listed(names: list[str]) -> str:
