@@ -61,10 +61,13 @@ def expected_light(probability, light, successors):  # type: ignore[no-untyped-d
 
 
 def chances(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the chances of a click, float64 (2, n), after an exposure without and with a click; light float64 (n,): photoelectrons."""
+    """Return the chances of a click, float64 (2, n), after an exposure without and with a click; light float64 (n,): photoelectrons.
+
+    Without what traps remember: see `Walked.at_once`.
+    """
     probability = first_click_probability(model, light)
     primed = probability
-    if model.afterpulse_probability:
+    if model.afterpulse_probability and not model.trap_time:
         primed = 1.0 - (1.0 - probability) * (1.0 - model.afterpulse_probability)
     return np.stack([probability, primed])
 

@@ -8,7 +8,7 @@ exposure alone: both ways of driving give the same clicks for the same patterns.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -117,11 +117,12 @@ class Walked:
     seed: int
     first_draw: int
     sample: Sample | None = None  # that the walks bleach
+    carriers: F64 = field(default_factory=lambda: np.zeros(1))  # in the detector's traps, in the order of exposures
 
     @property
     def changing(self) -> bool:
-        """Whether a state's light is not always the same, so that exposures are gone through one by one."""
-        return bool(self.changes) or self.sample is not None
+        """Whether a state's chance of a click is not always the same, so that exposures are gone through one by one."""
+        return bool(self.changes) or self.sample is not None or self.model.remembers
 
     def photoelectrons(self, exposure: int, pattern: int, share: float) -> float:
         """Show `pattern` for `share` of `exposure`: the photoelectrons expected, without what changes with time."""
@@ -145,7 +146,7 @@ class Walked:
             )
         else:
             probability = first_click_probability(self.model, light)
-        return sample_clicks(self.model, probability, self.seed, self.first_draw + exposure, before)[0]
+        return sample_clicks(self.model, probability, self.seed, self.first_draw + exposure, before, self.carriers)[0]
 
 
 class ShownSource:
@@ -185,7 +186,7 @@ class WalkSource:
         self._state = 0
         self._kept: dict[int, U64] = {}
         self._expected: dict[int, float] = {}  # by object of the scene
-        self.ahead = 0 if walked.changes else walked.program.n_slots
+        self.ahead = 0 if walked.changing else walked.program.n_slots
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""

@@ -94,10 +94,15 @@ def _check(profile: Profile, scene: SceneFile) -> None:
         )
     if scene.changes:
         raise ConfigError(
-            f"{scene.name!r} changes, or the source of {profile.name} drifts: not on the C engine",
+            f"{scene.name!r} changes, or the source or the readings of {profile.name} do: not on the C engine",
             remedy="leave --engine out",
         )
     detector = profile.detector
+    if detector.afterpulse_time_us or detector.crosstalk_further:
+        raise ConfigError(
+            f"{profile.name} states afterpulse_time_us or crosstalk_further: the C engine looks one exposure and one channel back",
+            remedy="leave --engine out",
+        )
     if profile.projector.dwell_steps > 1 and (detector.read_noise_e or detector.threshold_e > 1):
         raise ConfigError(
             f"{profile.name} has read noise and dwell steps: the C engine knows the click law of short light without noise only",

@@ -131,7 +131,7 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
         raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
-    scene = scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach)
+    scene = scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
     faults = parse_faults(options.faults)
     optics = _optics(options.optics)
 
@@ -166,7 +166,7 @@ def open_sim(url: str) -> Link:
     options = parse_sim_url(url)
     if options.pace == "real":
         profile = load_profile(options.profile)  # a mistake in either is better told here than by the child
-        scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach)
+        scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
         _optics(options.optics)
         return ChildLink(url, options)
     instrument, clock = build_instrument(options, START_NS)

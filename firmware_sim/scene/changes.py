@@ -1,4 +1,4 @@
-"""What changes while a scene is watched: dark rates, light leaks, hot and dead channels, drifting efficiency.
+"""What changes while a scene is watched: dark rates, light leaks, hot and dead channels, drifting efficiency, readings that shift.
 
 Owns how declared changes add up at a given time; never draws a click and never reads a file (scene_file.py). A scene without changes
 never comes here: nothing declared costs nothing. Times are seconds after the run's first exposure may begin.
@@ -11,10 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .detector_model import DetectorModel, first_click_probability
+from .detector import uniform_numbers
+from .detector_model import SWITCH_STREAM, DetectorModel, first_click_probability
 from .moving import ALL_CHANNELS, Change
 
 F64 = NDArray[np.float64]
+LEAST_THRESHOLD_E, MOST_THRESHOLD_E = 1e-6, 10.0  # as a click law takes it: a threshold that sinks farther stays there
+SHIFT_STEP_E = 1e-3  # readings shift in whole steps of this, so that one law serves many exposures
+SWITCHES = 256  # drawn at a time
 
 
 class Changes:
@@ -23,6 +27,8 @@ class Changes:
     def __init__(self, changes: tuple[Change, ...], n_channels: int) -> None:
         self._changes = tuple(change for change in changes if change.channel < n_channels)
         self._n_channels = n_channels
+        self._telegraphs = [Telegraph(change) for change in self._changes if change.kind == "telegraph"]
+        self._readings_shift = bool(self._telegraphs) or any(change.kind == "threshold" for change in self._changes)
 
     def __bool__(self) -> bool:
         return bool(self._changes)
@@ -61,10 +67,57 @@ class Changes:
                 extra[_during(change, times_s), channel] += change.amount * exposure_s
         mean = photoelectrons * self.efficiency(times_s)[:, None] + extra + dark
         without_dark = replace(model, law=replace(model.law, dark_per_exposure=0.0))
-        probability = first_click_probability(without_dark, mean)
+        if self._readings_shift:
+            probability = self._shifted(without_dark, mean, times_s)
+        else:
+            probability = first_click_probability(without_dark, mean)
         if self.any_dead:
             probability[~self.alive(times_s)] = 0.0
         return probability
+
+    def shifts_e(self, times_s: F64) -> F64:
+        """By how much readings are lower than at the start, electrons, float64 (n, channels); asked for in the order of time."""
+        shift = np.zeros((len(times_s), self._n_channels))
+        for change in self._changes:
+            if change.kind == "threshold":
+                shift += change.amount * times_s[:, None]
+        for one in self._telegraphs:
+            shift[:, one.channel] -= one.offset_e * one.raised(times_s)
+        return np.asarray(np.rint(shift / SHIFT_STEP_E) * SHIFT_STEP_E)
+
+    def _shifted(self, model: DetectorModel, mean: F64, times_s: F64) -> F64:
+        shift, probability = self.shifts_e(times_s), np.empty_like(mean)
+        for value in np.unique(shift).tolist():
+            threshold = min(MOST_THRESHOLD_E, max(LEAST_THRESHOLD_E, model.law.threshold_e + value))
+            here = shift == value
+            law = replace(model.law, threshold_e=threshold)
+            probability[here] = first_click_probability(replace(model, law=law), mean[here])
+        return probability
+
+
+class Telegraph:
+    """One pixel whose reading jumps between two levels, each held for an exponential time; asked in the order of time."""
+
+    def __init__(self, change: Change) -> None:
+        self.channel, self.offset_e = change.channel, change.amount
+        self._seed, self._time_s = int(change.at_s), change.for_s
+        self._drawn = 0
+        self._switches = np.zeros(0)  # seconds; those that are over are forgotten
+        self._raised = bool(uniform_numbers(self._seed, self.channel, 1, 1, SWITCH_STREAM)[0, 0] < 0.5)
+
+    def raised(self, times_s: F64) -> NDArray[np.bool_]:
+        """Whether the reading is on the higher level, bool (n,)."""
+        while not len(self._switches) or self._switches[-1] <= times_s[-1]:
+            first = (self.channel << 40) + (self._drawn + 1)
+            waits = -np.log1p(-uniform_numbers(self._seed, first, SWITCHES, 1, SWITCH_STREAM)[:, 0]) * self._time_s
+            last = self._switches[-1] if len(self._switches) else 0.0
+            self._switches = np.append(self._switches, last + np.cumsum(waits))
+            self._drawn += SWITCHES
+        over = int(np.searchsorted(self._switches, times_s[0], "right"))
+        if over:
+            self._raised ^= bool(over % 2)
+            self._switches = self._switches[over:]
+        return np.asarray((np.searchsorted(self._switches, times_s, "right") % 2 == 1) ^ self._raised)
 
 
 def _during(change: Change, times_s: F64) -> NDArray[np.bool_]:

@@ -48,12 +48,22 @@ def sample_clicks(
     seed: int,
     first_exposure: int,
     previous: NDArray[np.uint8],
+    memory: NDArray[np.float64] | None = None,
 ) -> NDArray[np.uint8]:
     """Draw clicks, uint8 (n_exposures, n_channels) of 0 or 1; `probability` has the same shape.
 
     `first_exposure` counts over the detector's whole life. `previous` is uint8 (n_channels,): the clicks of the exposure
-    before, which only afterpulsing looks at.
+    before, which only afterpulsing looks at. Where the model remembers more, `memory` float64 (n_channels,) takes its place: the carriers
+    in traps before the first exposure, which become those after the last one.
     """
+    if model.remembers:
+        from .detector_kernels import remembered_words
+
+        n_exposures, n_channels = probability.shape
+        words = np.zeros((n_exposures, -(-n_channels // 8)), np.uint8)
+        traps = np.zeros(n_channels) if memory is None else memory
+        remembered_words(model, probability, np.arange(n_exposures), seed, first_exposure, traps, words)
+        return np.unpackbits(words, axis=1, bitorder="little", count=n_channels)
     if model.afterpulse_probability and model.crosstalk_probability and len(probability) >= KERNEL_EXPOSURES:
         # The two effects feed each other: only a loop over exposures draws them, here a compiled one with the same bits.
         from .detector_kernels import sample_words  # numba is loaded only for profiles that declare both

@@ -7,6 +7,8 @@ looks one exposure back, crosstalk draws two more numbers for neighbours of a cl
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -16,10 +18,12 @@ from pans.runtime.instrument.click_law import ClickLaw
 from .detector_model import (
     CHANNEL_STEP,
     CLICK_STREAM,
+    FURTHER_STREAM,
     GOLDEN,
     LOWER_CROSSTALK_STREAM,
     MIX_1,
     MIX_2,
+    TRAP_STREAM,
     UPPER_CROSSTALK_STREAM,
     DetectorModel,
     stream_key,
@@ -115,6 +119,112 @@ def register_words(thresholds, primed, row_of, keys, first, crosstalk, previous,
             words[t, p] = last >> _U(8 * p) & _U(0xFF)
     for c in range(n_channels):
         previous[0, c] = last >> _U(c) & _U(1)
+
+
+@njit(cache=True, nogil=True)
+def _next_detection(light, traps, tau, begin, end, needed):  # type: ignore[no-untyped-def]
+    """When the hazard light + traps/tau exp(-(t - begin)/tau), integrated from `begin`, reaches `needed`; `end` or later: not before it."""
+    if light * (end - begin) + traps * -np.expm1(-(end - begin) / tau) <= needed:
+        return end
+    low, high = begin, end
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if light * (middle - begin) + traps * -np.expm1(-(middle - begin) / tau) < needed:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@njit(cache=True, nogil=True)
+def _filled(light, traps, carriers, tau, duration, word, needed):  # type: ignore[no-untyped-def]
+    """Carriers in traps after `duration` in which the detector is on, detection by detection.
+
+    `needed` is the integrated hazard of the first detection; those of the others are drawn from `word`.
+    """
+    now = 0.0
+    while True:
+        then = _next_detection(light, traps, tau, now, duration, needed)
+        traps *= np.exp(-(then - now) / tau)
+        if then >= duration:
+            return traps
+        now, traps = then, traps + carriers
+        word += GOLDEN_WORD
+        needed = -np.log1p(-np.float64(mix(word) >> SHIFT_11) * 2.0**-53)
+
+
+@njit(cache=True, nogil=True)
+def trap_words(light, row_of, keys, first, traps, crosstalk, carriers, words):  # type: ignore[no-untyped-def]
+    """Draw clicks of a detector that remembers: light float64 (rows, channels) is -log of the chance of silence without traps.
+
+    keys uint64 (2 + 2 * reach,): of clicks, of traps, and of crosstalk from below and above by 1, 2, ...; crosstalk uint64 (reach,) their
+    thresholds; traps (a of a detection, tau, pause, on in the pause: 1); carriers float64 (channels,) in traps, before and afterwards.
+    """
+    each, tau, pause = traps[0], traps[1], traps[2]
+    n_channels, reach = light.shape[1], crosstalk.size
+    own, clicks = np.zeros(n_channels, np.bool_), np.zeros(n_channels, np.bool_)
+    seen = -np.expm1(-1.0 / tau) if tau > 0.0 else 1.0
+    for t in range(row_of.size):
+        row, exposure = row_of[t], _U(t + first)
+        state, of_traps = mix(exposure * GOLDEN_WORD + keys[0]), mix(exposure * GOLDEN_WORD + keys[1])
+        for c in range(n_channels):
+            step = _U(c + 1) * STEP_WORD
+            needed = -np.log1p(-np.float64(mix(state + step) >> SHIFT_11) * 2.0**-53)
+            own[c] = clicks[c] = needed < light[row, c] + seen * carriers[c]
+            if tau <= 0.0:
+                carriers[c] = each if own[c] else 0.0
+            elif own[c]:
+                carriers[c] = _filled(light[row, c], carriers[c], each, tau, 1.0, mix(of_traps + step), needed)
+            else:
+                carriers[c] *= np.exp(-1.0 / tau)
+        for c in range(n_channels):
+            if own[c]:
+                for d in range(1, reach + 1):
+                    for up in range(2):
+                        other = c - d if up else c + d
+                        if 0 <= other < n_channels and not clicks[other]:
+                            number = mix(mix(exposure * GOLDEN_WORD + keys[2 * d + up]) + _U(other + 1) * STEP_WORD)
+                            if number >> SHIFT_11 < crosstalk[d - 1]:
+                                clicks[other] = True  # in the middle of the exposure, for the traps
+                                carriers[other] += each * (np.exp(-0.5 / tau) if tau > 0.0 else 1.0)
+        if tau > 0.0 and pause > 0.0:
+            for c in range(n_channels):
+                if traps[3] > 0.0:
+                    word = mix(of_traps + _U(c + 1) * STEP_WORD) ^ keys[0]
+                    needed = -np.log1p(-np.float64(mix(word) >> SHIFT_11) * 2.0**-53)
+                    carriers[c] = _filled(light[row, c], carriers[c], each, tau, pause, word, needed)
+                else:
+                    carriers[c] *= np.exp(-pause / tau)
+        for p in range(words.shape[1]):
+            byte = 0
+            for c in range(8 * p, min(8 * p + 8, n_channels)):
+                byte |= int(clicks[c]) << (c & 7)
+            words[t, p] = byte
+
+
+def remembered_words(
+    model: DetectorModel,
+    probability: NDArray[np.float64],
+    row_of: NDArray[np.int64],
+    seed: int,
+    first_exposure: int,
+    carriers: NDArray[np.float64],
+    words: NDArray[np.uint8],
+) -> None:
+    """As `sample_words`, of a model that remembers; `carriers` float64 (channels,) in traps are set to those after the last exposure."""
+    light = -np.log1p(-np.minimum(probability, 1.0 - 2.0**-53))
+    kernel = (model.crosstalk_probability, *model.crosstalk_further)
+    streams = (CLICK_STREAM, TRAP_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM)
+    further = range(FURTHER_STREAM, FURTHER_STREAM + 2 * max(0, len(kernel) - 1))
+    keys = np.array([stream_key(seed, stream) for stream in (*streams, *further)], np.uint64)
+    traps = np.array(
+        [-math.log1p(-model.afterpulse_probability), model.trap_time, model.pause, float(model.on_in_pause)]
+    )
+    n_bytes = -(-probability.shape[1] // 8)
+    words[:, n_bytes:] = 0
+    trap_words(
+        light, row_of, keys, first_exposure, traps, click_thresholds(np.array(kernel)), carriers, words[:, :n_bytes]
+    )
 
 
 def click_thresholds(probability: NDArray[np.float64]) -> NDArray[np.uint64]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.instrument.profile_schema import FREE_RUNNING
 
 GOLDEN = 0x9E3779B97F4A7C15  # the increment of splitmix64: 2^64 over the golden ratio, odd
 CHANNEL_STEP = (
@@ -24,6 +25,8 @@ CHANNEL_STEP = (
 MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # of the splitmix64 finaliser
 MASK = (1 << 64) - 1
 CLICK_STREAM, LOWER_CROSSTALK_STREAM, UPPER_CROSSTALK_STREAM = 0, 1, 2
+FURTHER_STREAM = 3  # of crosstalk from below by two channels, from above by two, from below by three, ...: up to 16
+TRAP_STREAM, TELEGRAPH_STREAM, SWITCH_STREAM = 32, 33, 34
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # of a standard normal factor; 9 nodes are exact to degree 17
 _GAUSSIAN = _NODES.tolist(), (_WEIGHTS / _WEIGHTS.sum()).tolist()
 
@@ -36,16 +39,34 @@ class DetectorModel:
     afterpulse_probability: float = 0.0
     crosstalk_probability: float = 0.0
     fluctuation: float = 0.0  # relative standard deviation of the light from exposure to exposure
+    trap_time: float = 0.0  # mean delay of a carrier, in exposures; 0: afterpulses come in the next exposure alone
+    pause: float = (
+        0.0  # between exposures, in exposures, and whether the detector is on in it: what traps release there
+    )
+    on_in_pause: bool = False
+    crosstalk_further: tuple[float, ...] = ()  # of the second neighbour, the third, ...
+    jitter: float = 0.0  # standard deviation of the time at which an event is seen, in exposures; `pause` is known then
+
+    @property
+    def remembers(self) -> bool:
+        """Whether more than the clicks of the exposure before and of the next channels must be known."""
+        return self.trap_time > 0 or bool(self.crosstalk_further)
 
 
 def detector_model(profile: Profile, exposure_us: float) -> DetectorModel:
     """Collect the profile's effects for this exposure: crosstalk only where there are neighbours."""
-    detector = profile.detector
+    detector, parallel = profile.detector, profile.mode == "parallel"
+    pause = profile.exposure.readout_us / exposure_us
     return DetectorModel(
         law=click_law(profile, exposure_us),
         afterpulse_probability=detector.afterpulse_probability,
-        crosstalk_probability=detector.crosstalk_probability if profile.mode == "parallel" else 0.0,
+        crosstalk_probability=detector.crosstalk_probability if parallel else 0.0,
         fluctuation=0.0 if profile.optics is None else profile.optics.source_fluctuation,
+        trap_time=(detector.afterpulse_time_us or 0.0) / exposure_us,
+        pause=pause if detector.afterpulse_time_us or detector.timing_jitter_ns else 0.0,
+        on_in_pause=detector.between_exposures == FREE_RUNNING and detector.afterpulse_time_us is not None,
+        crosstalk_further=detector.crosstalk_further if parallel else (),
+        jitter=detector.timing_jitter_ns * 1e-3 / exposure_us,
     )
 
 

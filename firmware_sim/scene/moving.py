@@ -35,6 +35,9 @@ class Change(NamedTuple):
 
     dark: dark rate times `amount`; burst and hot: `amount` more photoelectrons per second; dead: no clicks; drift: the efficiency
     changes by `amount` percent of its first value per second, and stays where it is when the time is over.
+
+    Of a profile alone: threshold rises by `amount` electrons per second; telegraph: the reading is `amount` electrons higher now and then,
+    at random (`at_s` is the seed), `for_s` seconds at a time in the mean.
     """
 
     kind: str

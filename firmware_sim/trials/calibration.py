@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.options import option
-from pans.firmware_sim.scene.detector_kernels import sample_words
+from pans.firmware_sim.scene.detector_kernels import remembered_words, sample_words
 from pans.firmware_sim.scene.detector_model import detector_model, first_click_probability
 from pans.runtime.core.calibration import (
     TELLING,
@@ -92,12 +92,15 @@ def simulate(truth: Profile, design: Design, seed: int, light: NDArray[np.float6
     rows = lit_and_dark if core.parallel else probability[:, None]
     dark_row = 1 if core.parallel else plan.n_patterns
     row_of_slot = np.where(plan.slot_pattern == DARK_PATTERN, dark_row, plan.slot_pattern).astype(np.int64)
-    previous = np.zeros(core.channels, np.uint8)
+    previous, carriers = np.zeros(core.channels, np.uint8), np.zeros(core.channels)
     total = design.n_cycles * plan.slots_per_cycle
     for first in range(0, total, BLOCK):
         slots = np.arange(first, min(first + BLOCK, total)) % plan.slots_per_cycle
         words = np.zeros((len(slots), -(-core.channels // 8)), np.uint8)
-        sample_words(model, rows, row_of_slot[slots], seed, first, previous, words)
+        if model.remembers:
+            remembered_words(model, rows, row_of_slot[slots], seed, first, carriers, words)
+        else:
+            sample_words(model, rows, row_of_slot[slots], seed, first, previous, words)
         core.take_block(_block(core, first, plan.slot_pattern[slots], words))
     return core
 

@@ -11,7 +11,7 @@ import pytest
 from tree import ROOT
 
 HERE = Path(__file__).parent
-PROGRAMS = sorted(HERE.glob("lab_*.py"))
+PROGRAMS = sorted(HERE.rglob("lab_*.py"))
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)
