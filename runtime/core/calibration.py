@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.facts import Bundle
+from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
 from pans.runtime.instrument.click_law import click_law
@@ -201,7 +202,7 @@ class CalibrationCore(Follower):
 def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[Counts]:
     """Return each channel's counts, with what the exposure before and the neighbours add to a click's probability."""
     detector = profile.detector
-    after = np.log1p(-detector.afterpulse_probability)
+    afterpulses = afterpulses_of(profile, design.plan.exposure_us)
     pooled = core.sums.sum(axis=2)  # channel, pattern, (exposures, clicks)
     rate = pooled[..., 1] / np.maximum(pooled[..., 0], 1)
     result = []
@@ -214,7 +215,7 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
         n_lit = core.sums.shape[1] - 1
         drive = np.append(design.drives[[channel]] if core.parallel else design.drives, 0.0)
         pattern = np.append(np.arange(n_lit) + (channel if core.parallel else 0), -1)
-        primed = np.tile([0.0, after], (n_lit + 1, 1))
+        primed = -_memory_of_patterns(afterpulses, rate[channel], design.plan, core.parallel)
         result.append(
             Counts(
                 np.repeat(drive, 2),
@@ -227,6 +228,16 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
     if not any(int(counts.exposures.sum()) for counts in result):
         raise UsageError("the device sent no exposures that could be counted")
     return result
+
+
+def _memory_of_patterns(afterpulses: Afterpulses, rate: F64, plan: Plan, parallel: bool) -> F64:
+    """Return the afterpulses that an exposure of each pattern (the last: dark) sees after silence and after a click, (patterns, 2)."""
+    dark = len(rate) - 1
+    shown = np.where(plan.slot_pattern == DARK_PATTERN, dark, 0 if parallel else plan.slot_pattern).astype(np.int64)
+    before = afterpulses.memory_by_last(rate[shown])
+    sums, counts = np.zeros((len(rate), 2)), np.bincount(shown, minlength=len(rate))
+    np.add.at(sums, shown, before)
+    return np.asarray(sums / np.maximum(counts, 1)[:, None])
 
 
 def joined_counts(parts: Sequence[Counts]) -> Counts:

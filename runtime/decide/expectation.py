@@ -3,7 +3,7 @@
 Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
 edges into s', in float64, whether the outcomes are clicks or photon numbers: every state is at one depth, so that alpha is whole when its
 slot comes. Where the detector has afterpulses, a click depends on the click before: alpha is then carried for both outcomes of the last
-exposure. Never draws anything.
+exposure; where they have a time constant, with the mean memory of each (remembering.py). Never draws anything.
 """
 
 from __future__ import annotations
@@ -16,9 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
-from pans.runtime.instrument.click_law import ClickLaw, both_chances
+from pans.runtime.detector import Afterpulses
+from pans.runtime.instrument.click_law import ClickLaw, both_chances, log_no_click
 from pans.runtime.instrument.count_law import CountLaw, count_chances, outcomes_of
 
+from .remembering import Remembered
+
+NO_AFTERPULSES = Afterpulses(0.0)
 LEAF_NUMBERS_MAX = 1 << 27  # objects times leaves that are returned at once: 1 GiB
 _NUMBERS_AT_ONCE = 1 << 22
 _PATTERNS_AT_ONCE = 2048
@@ -39,6 +43,7 @@ class ExpectedWalk:
     illumination: F64
     exposures: F64
     leaves: F64
+    ends: F64 | None = None  # mean memory of the detector behind a walk, where afterpulses have a time constant
 
 
 def expected_walk(
@@ -49,33 +54,45 @@ def expected_walk(
     photons_per_level: float = 1.0,
     *,
     afterpulse: float = 0.0,
+    afterpulses: Afterpulses = NO_AFTERPULSES,
+    begins: float = 0.0,
 ) -> ExpectedWalk:
     """Return what `automaton` does on each of n objects, exactly.
 
     `patterns` (n_patterns, pixels) times `photons_per_level` are photoelectrons per exposure and unit transmission, lit all the
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
     `afterpulse` is the chance that a click makes the next exposure click as well; the exposure before a walk is taken to have none (that
-    of the last object's end is forgotten, at most `afterpulse` clicks per walk). ValueError for shapes that do not fit, more than one
+    of the last object's end is forgotten, at most `afterpulse` clicks per walk). `afterpulses` with a time constant take its place, and
+    `begins` is the memory with which a walk begins; then remembering.py says what is exact.
+    ValueError for shapes that do not fit, more than one
     channel, a law of other outcomes than the automaton's, and afterpulses of a detector that counts.
     """
     _check_arguments(automaton, patterns, transmission)
+    if not afterpulses.time:
+        afterpulse = afterpulse or afterpulses.probability
     if not 0 <= afterpulse < 1:
         raise ValueError(f"afterpulse is {afterpulse:g}, allowed: from 0 to below 1")
     outcomes = outcomes_of(law)
-    if outcomes != automaton.n_outcomes or (automaton.counts and afterpulse):
+    any_afterpulse = afterpulse or afterpulses.probability
+    if outcomes != automaton.n_outcomes or (automaton.counts and any_afterpulse):
         raise ValueError(
-            f"an automaton of {automaton.n_outcomes} outcomes under a law of {outcomes}, afterpulse {afterpulse:g}, allowed: "
+            f"an automaton of {automaton.n_outcomes} outcomes under a law of {outcomes}, afterpulse {any_afterpulse:g}, allowed: "
             "the same outcomes, and no afterpulses where photons are counted"
         )
     n, n_leaves = len(transmission), automaton.n_leaves
-    found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)))
+    ends = np.empty(n) if afterpulses.time else None
+    found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)), ends)
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
     slots = _states_by_slot(automaton)
     shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level
     for start in range(0, n, step):
         here = slice(start, min(start + step, n))
         light = pattern_light(patterns, transmission[here], photons_per_level)
-        _walk_block(automaton, slots, light, shown, (law, afterpulse), found, here)
+        if afterpulses.time and isinstance(law, ClickLaw):
+            walked = Remembered(automaton, afterpulses, len(light), begins)
+            _remembered_block(automaton, slots, light, shown, (law, walked), found, here)
+        else:
+            _walk_block(automaton, slots, light, shown, (law, afterpulse), found, here)
     return found
 
 
@@ -145,6 +162,33 @@ def _walk_block(
     for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
         total[here] = row
     found.leaves[here] = alpha[:, :, automaton.n_states :].sum(axis=0)
+
+
+def _remembered_block(
+    automaton: Automaton,
+    slots: list[NDArray[np.int64]],
+    light: F64,
+    shown: F64,
+    detector: tuple[ClickLaw, Remembered],
+    found: ExpectedWalk,
+    here: slice,
+) -> None:
+    law, walked = detector
+    sums = np.zeros((4, len(light)))
+    for states in slots:
+        pattern = automaton.pattern[states]
+        share = automaton.dwell[states] / automaton.dwell_steps
+        photoelectrons = light[:, pattern] * share
+        reached, clicks = walked.go_on(states, -log_no_click(law, photoelectrons))
+        sums[0] += clicks
+        sums[1] += (reached * photoelectrons).sum(axis=1)
+        sums[2] += reached @ (shown[pattern] * share)
+        sums[3] += reached.sum(axis=1)
+    for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
+        total[here] = row
+    assert found.ends is not None
+    found.ends[here] = walked.ends
+    found.leaves[here] = walked.chance[:, :, automaton.n_states :].sum(axis=0)
 
 
 @njit(cache=True, nogil=True)

@@ -86,7 +86,15 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle
-    from pans.trainer.evaluate.held_out import Conditions, default_trials, held_out_of, imaging_on, measure, walks_on
+    from pans.trainer.evaluate.held_out import (
+        Conditions,
+        afterpulses_in,
+        default_trials,
+        held_out_of,
+        imaging_on,
+        measure,
+        walks_on,
+    )
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
     from pans.trainer.tasks.remembered import remembered_task
 
@@ -143,6 +151,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         "profile": held_out.profile.name,
         "profile_assumed": assumed,
         "optics": imaging_on(held_out, conditions).numbers(),
+        "afterpulses": afterpulses_in(bundle, held_out, args.shots, measured.trials),
         "sha256": digest,
         "seconds": time.perf_counter() - started,
         "simulated": True,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
+from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
@@ -24,6 +25,8 @@ from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probabi
 from pans.runtime.instrument.count_law import CountLaw, cannot_count, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
+
+from .chain import Chain
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
 _CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small
@@ -48,12 +51,22 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks."""
+    """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks.
+
+    `probability` holds afterpulses in the mean, where the profile states them; word by word they are in chain.py.
+    """
 
     photoelectrons: F64
     probability: F64
     law: ClickLaw
     illumination: float  # of one shot
+    chain: Chain | None = None  # what links exposures: None without afterpulses
+
+    def counts(self, shots: int, rng: np.random.Generator, rows: slice = slice(None)) -> NDArray[np.int64]:
+        """Draw the clicks of `shots` exposures of every pattern, int64 (objects, d_f), for the objects in `rows`."""
+        if self.chain is None:
+            return rng.binomial(shots, self.probability[rows])
+        return self.chain.counts(shots, rng, rows)
 
 
 def light_of(
@@ -82,7 +95,7 @@ def light_of(
             raise ValueError(f"{bundle.name} is passive: it shows no patterns that could miss or bleach the object")
         with as_usage_error():
             light = bundle.analyser.photoelectrons(images) * eta
-        return Light(light, click_probability(law, light), law, 0.0)
+        return _lit(light, law, 0.0, profile, bundle)
     patterns, illumination = bundle.patterns() * eta, bundle.illumination() * eta
     if not imaging.is_identity:
         full = bundle.photons_per_level * (bundle.levels - 1) * eta
@@ -96,7 +109,17 @@ def light_of(
     for start in range(0, len(images), step):
         part = images[start : start + step]
         light[start : start + step] = object_transmission(profile, part.reshape(len(part), -1)) @ patterns.T
-    return Light(light, click_probability(law, light), law, illumination)
+    return _lit(light, law, illumination, profile, bundle)
+
+
+def _lit(light: F64, law: ClickLaw, illumination: float, profile: Profile, bundle: Bundle) -> Light:
+    """Passive detectors click at once, each with traps of its own, which objects pass one after the other: as without afterpulses."""
+    first = click_probability(law, light)
+    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
+    if not afterpulses or profile.mode == "parallel":
+        return Light(light, first, law, illumination)
+    chain = Chain.of(first, afterpulses)
+    return Light(light, chain.mean_chances(), law, illumination, chain)
 
 
 def demand_sequence(profile: Profile) -> None:
@@ -114,12 +137,15 @@ def law_of(bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | Non
     """
     if not (0 <= eta < math.inf and (dark is None or 0 <= dark < math.inf)):
         raise ValueError(f"eta is {eta:g}, dark is {dark}, allowed: finite and at least 0")
-    if bundle.analyser is None:
-        exposure_us = exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
-    else:
-        exposure_us = bundle.analyser.exposure_us
-    law = click_law(profile, exposure_us)
+    law = click_law(profile, exposure_of(bundle, profile))
     return law if dark is None else replace(law, dark_per_exposure=dark)
+
+
+def exposure_of(bundle: Bundle, profile: Profile) -> float:
+    """Return the exposure time of `bundle` on `profile`, microseconds."""
+    if bundle.analyser is not None:
+        return bundle.analyser.exposure_us
+    return exposure_us_of(profile, bundle.photons_per_level * (bundle.levels - 1))
 
 
 def outcome_law_of(
@@ -164,7 +190,11 @@ def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
     shares = np.empty((len(light.probability), bundle.n_classes))
     step = max(1, _CHUNK_NUMBERS // outcomes)
     for start in range(0, len(shares), step):
-        shares[start : start + step] = outcome_probabilities(light.probability[start : start + step], shots) @ of_class
+        part = slice(start, start + step)
+        if light.chain is not None and shots == 1:
+            shares[part] = light.chain.word_chances(part) @ of_class
+        else:  # of several shots, afterpulses are in the mean
+            shares[part] = outcome_probabilities(light.probability[part], shots) @ of_class
     return np.clip(shares, 0.0, 1.0)
 
 
@@ -174,7 +204,7 @@ def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int,
     objects = np.arange(len(light.probability))
     decided = np.zeros((len(objects), bundle.n_classes), np.int64)
     for _ in range(trials):
-        decided[objects, decider.decide_batch(rng.binomial(shots, light.probability), shots)] += 1
+        decided[objects, decider.decide_batch(light.counts(shots, rng), shots)] += 1
     return decided / trials
 
 
@@ -203,7 +233,7 @@ def evaluate_sampled(
     of_trial = np.empty(trials)
     clicks = 0
     for trial in range(trials):
-        counts = rng.binomial(shots, light.probability)
+        counts = light.counts(shots, rng)
         clicks += int(counts.sum())
         hit = decider.decide_batch(counts, shots) == labels
         right += hit
@@ -241,7 +271,7 @@ def evaluate_pictures(
     for trial in range(trials):
         found = np.empty(len(images))
         for start in range(0, len(images), step):
-            counts = rng.binomial(shots, light.probability[start : start + step])
+            counts = light.counts(shots, rng, slice(start, start + step))
             clicks += int(counts.sum())
             alike = likeness(decider.pictures(counts, shots), images[start : start + step])
             found[start : start + step] = alike.ssim

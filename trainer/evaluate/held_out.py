@@ -177,6 +177,17 @@ def walks_on(
     )
 
 
+def afterpulses_in(bundle: Bundle, held_out: HeldOut, shots: int = 1, trials: int | None = None) -> str:
+    """Return how the figures of `measure` hold afterpulses: none, exact, mean memory or sampled."""
+    detector = held_out.profile.detector
+    if not detector.afterpulse_probability or (bundle.automaton is None and held_out.profile.mode == "parallel"):
+        return "none"
+    if trials:
+        return "sampled"
+    merged = bundle.automaton is not None and detector.afterpulse_time_us is not None
+    return "mean memory" if merged or shots > 1 else "exact"
+
+
 def trials_needed(bundle: Bundle, shots: int = 1) -> int | None:
     """Return None where the exact expectation can be had, else a number of trials: 30, of pictures one."""
     if bundle.picture_shape is not None:

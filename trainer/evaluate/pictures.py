@@ -40,7 +40,7 @@ def write_pictures(
     drawn = page_figures.patterns(matrix.reshape(-1, *bundle.image_shape).astype(np.float64), unit)
     write_file(written[0], drawn, force=force)
     rng = np.random.default_rng(seed)
-    counts = rng.binomial(shots, light.probability)
+    counts = light.counts(shots, rng)
     if bundle.picture_shape is not None:
         return [*written, _given_back(folder / "pictures.png", bundle, counts, objects.images, shots, force)]
     written.append(_confusion(folder / "confusion.png", bundle, counts, objects.labels, shots, force))

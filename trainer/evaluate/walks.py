@@ -20,17 +20,19 @@ from pans.runtime.bundle.walks import EXPECTED_KEYS
 from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
+from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, met
-from pans.runtime.instrument.click_law import ClickLaw, click_probability, object_transmission
+from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
-from .accuracy import demand_sequence, outcome_law_of
+from .accuracy import demand_sequence, exposure_of, outcome_law_of
 from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
 EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
+BEGIN_OBJECTS, BEGIN_ROUNDS = 500, 4  # by which the memory is found with which an object comes
 _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
@@ -126,26 +128,52 @@ def walks_of(
     step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
     step = step if bleaching.is_none else min(step, BLEACHED_AT_ONCE)
     rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
-    afterpulse = profile.detector.afterpulse_probability
+    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
     patterns: NDArray[Any] = bundle.pattern_levels
     if not imaging.is_identity:
         patterns = met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
+    begins = 0.0
+    if trials is None and afterpulses.time:
+        few = object_transmission(profile, _spread(images, min(step, BEGIN_OBJECTS)).reshape(-1, bundle.n_pixels))
+        begins = _begins(automaton, patterns, few, law, scale, afterpulses)
     for start in range(0, len(images), step):
         part = images[start : start + step]
         seen = object_transmission(profile, part.reshape(len(part), -1))
         sums: _Sums
         if trials is None:
-            found = expected_walk(automaton, patterns, seen, law, scale, afterpulse=afterpulse)
+            found = expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
             sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
         else:
             lit: _Lit = _Steady(automaton, patterns, seen, scale)
             if not bleaching.is_none:
                 lit = BleachedObjects(automaton, patterns, seen, scale, bleaching)
             sums = _sampled(
-                automaton, lit, patterns.sum(axis=1, dtype=np.float64) * scale, (law, afterpulse), trials, rng
+                automaton, lit, patterns.sum(axis=1, dtype=np.float64) * scale, (law, afterpulses), trials, rng
             )
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
     return _together(parts, trials or 0)
+
+
+def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+    """Some of the images, from first to last."""
+    return images[np.linspace(0, len(images) - 1, min(count, len(images))).astype(np.int64)]
+
+
+def _begins(
+    automaton: Automaton,
+    patterns: NDArray[Any],
+    seen: NDArray[Any],
+    law: ClickLaw | CountLaw,
+    scale: float,
+    afterpulses: Afterpulses,
+) -> float:
+    """The detector's memory when an object comes: the mean of what the objects before leave, which begin with it themselves."""
+    begins = 0.0
+    for _ in range(BEGIN_ROUNDS):
+        found = expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
+        assert found.ends is not None
+        begins = float(found.ends.mean())
+    return begins
 
 
 _Sums = tuple[F64, F64, F64, F64, F64]  # clicks, photons, illumination, exposures (n,), leaves (n, leaves)
@@ -201,23 +229,37 @@ def _sampled(
     automaton: Automaton,
     lit: _Lit,
     whole: F64,
-    detector: tuple[ClickLaw | CountLaw, float],
+    detector: tuple[ClickLaw | CountLaw, Afterpulses],
     trials: int,
     rng: np.random.Generator,
 ) -> _Sums:
-    """Draw `trials` walks of every object; means per walk, and the share of each leaf. `whole` is the illumination of each pattern."""
-    law, afterpulse = detector
+    """Draw `trials` walks of every object; means per walk, and the share of each leaf. `whole` is the illumination of each pattern.
+
+    With a time constant a walk begins with the memory that another object's left, and every walk has its own clicks for memory.
+    """
+    law, afterpulses = detector
     n, rows = lit.n, np.arange(lit.n)
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
-    for _ in range(trials):
-        node, going, before = np.zeros(n, np.int64), rows, np.zeros(n, np.bool_)
+    memory = np.zeros(n)
+    warming = BEGIN_ROUNDS if afterpulses.time else 0
+    for trial in range(-warming, trials):
+        if trial == 0:
+            sums[:], leaves[:] = 0.0, 0.0
+        node, going = np.zeros(n, np.int64), rows
+        memory = rng.permutation(memory) if afterpulses.time else np.zeros(n)
         lit.fresh()
-        while going.size:
+        for _ in range(automaton.n_slots):
+            if not going.size:
+                memory *= afterpulses.decay
+                continue
             state = node[going]
             shown = whole[automaton.pattern[state]] * (automaton.dwell[state] / automaton.dwell_steps)
             photoelectrons = lit.photoelectrons(going, state)
-            outcome = _drawn(law, photoelectrons, afterpulse * before[going], rng)
-            before[going] = outcome > 0
+            outcome = _drawn(law, photoelectrons, memory[going], rng)
+            if afterpulses and isinstance(law, ClickLaw):
+                known = afterpulses.after(-log_no_click(law, photoelectrons), memory[going], outcome)
+                memory *= afterpulses.decay
+                memory[going] = known
             each: tuple[Any, ...] = (outcome, photoelectrons, shown, 1.0)
             for total, values in zip(sums, each):
                 total[going] += values
@@ -228,15 +270,13 @@ def _sampled(
     return sums[0], sums[1], sums[2], sums[3], leaves / trials
 
 
-def _drawn(
-    law: ClickLaw | CountLaw, light: F64, again: NDArray[np.floating[Any]], rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Draw the outcome of each exposure (n,); `again` is the chance of a click that only the one before it causes."""
+def _drawn(law: ClickLaw | CountLaw, light: F64, memory: F64, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Draw the outcome of each exposure (n,); `memory` is the mean number of afterpulses in it."""
     if isinstance(law, CountLaw):
         passed = rng.random(light.size) >= np.cumsum(count_chances(law, light)[:-1], axis=0)
         return np.asarray(passed.sum(axis=0), np.int64)
     probability = click_probability(law, light)
-    probability += (1 - probability) * again
+    probability -= (1 - probability) * np.expm1(-memory)
     return np.asarray(rng.random(light.size) < probability, np.int64)
 
 

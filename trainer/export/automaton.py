@@ -136,7 +136,7 @@ def walk_figures(found: MeasuredWalks) -> WalkFigures:
 def compare_walks(bundle: Bundle, trained: TrainedAutomaton, task: Task, profile: Profile) -> float:
     """Hold the file's chances of every class and its light against the model's, on held-out objects; PansError where they differ.
 
-    Both without afterpulses, which no training knows.
+    Both without afterpulses: a training has the mean memory of a state, the expectation that of a state and the click before it.
     """
     objects = task.test.first(COMPARED_OBJECTS)
     assert bundle.automaton is not None
