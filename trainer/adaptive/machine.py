@@ -18,10 +18,13 @@ a gradient all the same, as it is the probability of the leaves that changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from pans.runtime.detector import Afterpulses
+from pans.trainer.model.afterpulses import MeanMemory
 
 from .light import Light
 from .outcomes import Law, mean_reading, readings
@@ -67,6 +70,7 @@ class Machine:
 class Sight:
     """How light meets objects: transmission = floor + gain * grey; the law of one exposure; the type of the matrix products.
 
+    With `afterpulses` a state clicks with the mean memory of the walks that reach it.
     With `dark_pixels` grey values have one more column, the light that dark pixels bring where a full one has 1 (model/imaging.py).
     """
 
@@ -75,6 +79,11 @@ class Sight:
     floor: float = 0.0
     products: torch.dtype = torch.float32
     dark_pixels: bool = False
+    afterpulses: Afterpulses | None = None
+
+    def exact(self) -> Sight:
+        """Return the same in float64 and without memory."""
+        return replace(self, products=torch.float64, afterpulses=None)
 
     @property
     def sums(self) -> torch.dtype:
@@ -170,12 +179,15 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
     """Return the pass of the objects `grey` (objects, pixels) through `machine`."""
     result = Pass()
     nodes = torch.ones(1, len(grey), dtype=sight.sums)
+    memory = None if sight.afterpulses is None else MeanMemory(sight.afterpulses, nodes)
     for number, level in enumerate(machine.levels):
         alpha = nodes[: level.n_states]
         if number:
             result.leaves.append(nodes[level.n_states :])
         light = brought(level.light, sight, grey)
         chances, falls = readings(light, sight.law)
+        if memory is not None:
+            chances, falls = memory.go_on(alpha, chances, falls, level.successors, machine.n_nodes(number))
         result.steps.append(Step(alpha, light, chances, falls))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)

@@ -24,6 +24,7 @@ from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.count_law import count_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
+from pans.trainer.model.afterpulses import trained_through
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
@@ -94,9 +95,9 @@ class TrainedAutomaton:
     options: AutomatonOptions
 
     def chances(self, objects: Objects) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the chance of every class by the leaves' posteriors, (objects, classes), and the photons (objects,), in float64."""
+        """Return the chance of every class by the leaves' posteriors, (objects, classes), and photons (objects,), without afterpulses."""
         with torch.no_grad():
-            passed = forward(self.machine, replace(self.sight, products=torch.float64), self.grey(objects))
+            passed = forward(self.machine, self.sight.exact(), self.grey(objects))
         total = np.zeros((len(objects), self.posteriors.levels[0].shape[1]))
         for number, leaves in enumerate(passed.leaves):
             posterior = self.posteriors.levels[number + 1]
@@ -180,8 +181,8 @@ class _Run:
         law = count_law(self.profile, exposure_us, self.options.outcomes)
         if self.options.dark is not None:
             law = replace(law, dark_per_exposure=self.options.dark)
-        through = self.options.optics is not None
-        return Sight(law, self.objects.gain, self.objects.floor, products, through)
+        links = trained_through(self.profile, exposure_us)
+        return Sight(law, self.objects.gain, self.objects.floor, products, self.options.optics is not None, links)
 
     # ---- the stages ----
 

@@ -23,10 +23,12 @@ import torch
 from torch import Tensor
 
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
+from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import as_usage_error
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
+from pans.trainer.model.afterpulses import trained_through, with_mean_memory
 from pans.trainer.model.detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
 from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
@@ -163,7 +165,7 @@ class Run:
         if self.epoch == schedule.whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
         loss_of_clicks = ESTIMATORS[schedule.estimator(options, self.epoch)]
-        law = self.law()
+        law, traps = self.law(), self.afterpulses()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
         sums = torch.zeros(4, dtype=torch.float64)
@@ -174,7 +176,7 @@ class Run:
             light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
             slope, clamp = schedule.slope_and_clamp(options, now)
-            p = click_probability(light.clamp(max=clamp), law, slope)
+            p = with_mean_memory(click_probability(light.clamp(max=clamp), law, slope), traps)
             loss_of = schedule.loss_at(options, now, data.picture_shape)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
             if options.mix > 0 and self.epoch >= schedule.second_stage(options):
@@ -207,12 +209,18 @@ class Run:
         """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
         if self.own_law is not None:
             return self.own_law
-        exposure_us = self.profile.exposure.min_us
-        if isinstance(self.encoder, ActiveIllumination):
-            low, high = self.encoder.top_limits
-            exposure_us = exposure_us_of(self.profile, min(max(self.encoder.brightest(), low), high))
-        law = click_law(self.profile, exposure_us)
+        law = click_law(self.profile, self._exposure_us())
         return law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
+
+    def afterpulses(self) -> Afterpulses | None:
+        """What the clicks before add to a click at the same exposure, where that is trained through."""
+        return None if self.own_law is not None else trained_through(self.profile, self._exposure_us())
+
+    def _exposure_us(self) -> float:
+        if not isinstance(self.encoder, ActiveIllumination):
+            return self.profile.exposure.min_us
+        low, high = self.encoder.top_limits
+        return exposure_us_of(self.profile, min(max(self.encoder.brightest(), low), high))
 
     def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
         """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
@@ -238,13 +246,13 @@ class Run:
 
         `draw` counts draws of optics that no epoch has seen.
         """
-        law, parts = self.law(), []
+        law, traps, parts = self.law(), self.afterpulses(), []
         shown, floor = self.data.drawn(FINAL_DRAWS + draw, self.data.floor)
         with torch.no_grad():
             for first in range(start, stop, CHUNK):
                 which = torch.arange(first, min(first + CHUNK, stop))
                 parts.append(click_probability(self.encoder(shown[which], floor).double(), law))
-        return torch.cat(parts)
+        return with_mean_memory(torch.cat(parts), traps)
 
     def validation_loss(self) -> float:
         """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples.
