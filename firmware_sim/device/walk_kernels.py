@@ -63,7 +63,7 @@ def expected_light(probability, light, successors):  # type: ignore[no-untyped-d
 def chances(model: DetectorModel, light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the chances of a click, float64 (2, n), after an exposure without and with a click; light float64 (n,): photoelectrons.
 
-    Without what traps remember: see `Walked.at_once`.
+    Without what traps remember: see `Walked.changing`.
     """
     probability = first_click_probability(model, light)
     primed = probability
