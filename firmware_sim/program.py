@@ -16,10 +16,10 @@ from pans.runtime.wire.messages import ADAPTIVE_PATTERN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """An automaton that the device follows: pattern int64 and light float64 (states,), successors int64 (states, 2).
+    """An automaton that the device follows: pattern int64 and light float64 (states,), successors int64 (states, outcomes).
 
-    `light` is the part of the exposure that the light is on. The successors are those after no click and after one; from
-    `len(pattern)` on they are leaves.
+    `light` is the part of the exposure that the light is on. The successors are those after no click and after one, or after each photon
+    number; from `len(pattern)` on they are leaves.
     """
 
     pattern: NDArray[np.int64]

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import reachable_automaton
+from pans.runtime.bundle.automaton import Automaton, reachable_automaton
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle, with_expected
 from pans.runtime.core.plan import Plan, build_plan
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -34,12 +34,13 @@ def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
     """Return an instrument, a bundle and a plan that put many small frames on the wire.
 
     `mode` is sequential or parallel; or an automaton with binary patterns that the device follows (device-driven) or the host names
-    (host-driven).
+    (host-driven), over photon numbers with -counts behind it.
     """
-    if mode in ("device-driven", "host-driven"):
+    driven, _, counts = mode.partition("-driven")
+    if driven in ("device", "host"):
         profile = following_profile(levels=2)
-        bundle = small_automaton_bundle()
-        plan = build_plan(profile, bundle, shots_per_object=4, drive=mode.partition("-")[0])
+        bundle = small_counting_bundle() if counts else small_automaton_bundle()
+        plan = build_plan(profile, bundle, shots_per_object=4, drive=driven)
         return profile, bundle, replace(plan, block_exposures=min(2, plan.block_exposures))
     profile = load_profile("ideal")
     if mode == "parallel":
@@ -80,11 +81,31 @@ def small_automaton_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) ->
         successors=[[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]],
         posteriors=rng.dirichlet(np.full(3, 0.6), 10),
     )
+    return _automaton_bundle("small automaton", automaton, rng, levels, exposure_us)
+
+
+def small_counting_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
+    """Return the like of `small_automaton_bundle` over photon numbers 0, 1 and 2 or more."""
+    rng = np.random.default_rng(3)
+    automaton = reachable_automaton(
+        pattern=[0, 1, 2, 1, 3, 0],
+        dwell=[4, 2, 1, 4, 3, 2],
+        dwell_steps=4,
+        successors=[[1, 2, 2], [3, 4, 4], [4, 3, 6], [5, 5, 7], [5, 7, 10], [8, 9, 10]],
+        posteriors=rng.dirichlet(np.full(3, 0.6), 11),
+        counts=True,
+    )
+    return _automaton_bundle("small counting automaton", automaton, rng, levels, exposure_us)
+
+
+def _automaton_bundle(
+    name: str, automaton: Automaton, rng: np.random.Generator, levels: int, exposure_us: float
+) -> Bundle:
     patterns = rng.integers(0, levels, (4, 4))
     patterns[:, 0] = levels - 1
     top_hz = load_profile("ideal").projector.peak_photoelectrons_hz
     bundle = make_bundle(
-        name="small automaton",
+        name=name,
         task="small",
         classes=("a", "b", "c"),
         image_shape=(2, 2),

@@ -26,12 +26,11 @@ from pans.runtime.live import RunResult
 from pans.runtime.record import Recording, replay
 from pans.runtime.wire import DeviceState, FrameDecoder, MessageType, Opcode, Status, decode_status
 from pans.runtime.wire.messages import decode_command, pack_body, unpack_body
-from pans.runtime.wire.session import ANSWER_TYPES
+from pans.runtime.wire.session import ANSWER_TYPES, STREAM_TYPES
 
 from .books import DeviceBooks
 
-STREAM = frozenset((MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK))
-RECORDED = STREAM | {MessageType.STATUS}
+RECORDED = STREAM_TYPES | {MessageType.STATUS}
 DECODED = ("frames", "crc_errors", "cobs_errors", "short_frames", "oversized_frames")
 
 
@@ -166,7 +165,7 @@ def _answers_and_recording(wire: ObservedLink, recording: Recording) -> Iterator
 
 def _recording_and_host(recording: Recording, result: RunResult) -> Iterator[str]:
     kinds = Counter(unpack_body(body).type for _, body in recording.messages())
-    recorded, stream = sum(kinds[kind] for kind in STREAM), result.stream
+    recorded, stream = sum(kinds[kind] for kind in STREAM_TYPES), result.stream
     counted = stream["messages"] + stream["repeated"] + stream["malformed"]
     if recorded != counted:
         yield f"{recorded} stream messages are recorded, the host counted {counted} taken, repeated or malformed"

@@ -15,6 +15,7 @@ from pans.firmware_sim.device.instrument import Instrument
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.automata import MaskChunk, Show, StateChunk, pack_masks, pack_show, pack_states
 from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
+from pans.runtime.wire.counts import CountStateChunk, pack_count_states, pack_read_counts, state_dtype
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 
@@ -69,6 +70,10 @@ class StrangeCommands:
             return self._masks()
         if opcode == Opcode.LOAD_STATES:
             return self._states()
+        if opcode == Opcode.READ_COUNTS:
+            return pack_read_counts(2 if dice.random() < 0.8 else self.number(16))
+        if opcode == Opcode.LOAD_COUNT_STATES:
+            return self._count_states()
         if opcode == Opcode.SHOW:
             near = dice.randrange(12) if dice.random() < 0.8 else self.number(64)
             state, pattern = (self.number(16) if dice.random() < 0.1 else dice.randrange(3) for _ in range(2))
@@ -103,6 +108,21 @@ class StrangeCommands:
             name, bits = dice.choice((("pattern", 16), ("dwell", 16), ("next_dark", 32), ("next_click", 32)))
             rows[name][dice.randrange(n)] = self.number(bits)
         return pack_states(chunk)
+
+    def _count_states(self) -> bytes:
+        """As `_states`, of photon numbers."""
+        dice = self._dice
+        n, outcomes = dice.choice((1, 2, 3)), dice.choice((3, 3, 3, 4, 16))
+        rows = np.zeros(n, state_dtype(outcomes))
+        rows["dwell"], rows["next"] = 4, np.arange(n)[:, None] + 1 + np.arange(outcomes) % 2
+        chunk = CountStateChunk(n, 0, 4, outcomes, 2, rows)
+        if dice.random() < 0.3:
+            name, bits = dice.choice((("n_states", 16), ("first_state", 16), ("dwell_steps", 16), ("n_leaves", 32)))
+            changes: dict[str, Any] = {name: self.number(bits)}
+            chunk = chunk._replace(**changes)
+        if dice.random() < 0.3:
+            rows["next"][dice.randrange(n), dice.randrange(outcomes)] = self.number(32)
+        return pack_count_states(chunk)
 
     def _plan(self) -> bytes:
         dice = self._dice

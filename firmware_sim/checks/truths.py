@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
+from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.messages import (
     DARK_PATTERN,
     ClickBlock,
@@ -37,11 +38,13 @@ def decoded(frame: Frame) -> ClickBlock | FrameBlock | Mark:
     """Return the stream message of a frame."""
     if frame.type == MessageType.CLICKS:
         return decode_clicks(frame.payload)
+    if frame.type == MessageType.COUNTS:
+        return decode_counts(frame.payload)
     return decode_frames(frame.payload) if frame.type == MessageType.FRAMES else decode_mark(frame.payload)
 
 
 def walk_truth(automaton: Automaton, stamps: list[int], clicks: list[int]) -> WalkTruth:
-    """Follow the walk through the adaptive slots of one cycle: what was stamped in each, and whether it clicked.
+    """Follow the walk through the adaptive slots of one cycle: each with its stamp and its click or photon number.
 
     A walk has not ended where a stamp is not its state: it is then taken to be as long as the cycle.
     """

@@ -13,7 +13,9 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, pack_arm
+from pans.runtime.wire.counts import announced_counts, decode_counts
 from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode
+from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for
 from .rules import Broken, need
@@ -24,7 +26,6 @@ STEP_S = 0.02
 LEASE_MS = 4000
 KEPT_PIECES = 60  # of a rule's bytes, the first and the last of them
 WINDOW = 1 << 20
-STREAM = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 
 
 def _decode_pong(payload: bytes) -> wire.Pong:
@@ -42,6 +43,7 @@ DECODE: Mapping[int, Callable[[bytes], Any]] = {
     MessageType.CLICKS: wire.decode_clicks,
     MessageType.FRAMES: wire.decode_frames,
     MessageType.MARK: wire.decode_mark,
+    MessageType.COUNTS: decode_counts,
 }
 
 
@@ -99,6 +101,8 @@ class Bench:
             message = DECODE[frame.type](frame.payload)
         except MalformedMessage as error:
             raise Broken(f"{MessageType(frame.type).name} cannot be meant: {error.message}") from None
+        if frame.type == MessageType.COUNTS and announced_counts(self.facts) < 2:
+            raise Broken("COUNTS came from a device that announces no photon numbers")
         if frame.type == MessageType.CLICKS:
             self._raw = [*self._raw[-KEPT_PIECES:], frame.payload]
         self.inbox.append(Heard(frame.type, message, self.link.now_ns()))
@@ -139,8 +143,8 @@ class Bench:
 
     def stream(self) -> list[Any]:
         """The stream's messages so far, in order; forgets them."""
-        found = [heard.message for heard in self.inbox if heard.kind in STREAM]
-        self.inbox = [heard for heard in self.inbox if heard.kind not in STREAM]
+        found = [heard.message for heard in self.inbox if heard.kind in STREAM_TYPES]
+        self.inbox = [heard for heard in self.inbox if heard.kind not in STREAM_TYPES]
         return found
 
     def raw_clicks(self) -> list[bytes]:

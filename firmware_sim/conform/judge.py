@@ -14,7 +14,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire.messages import Opcode
 
-from . import frames, orders, runs, sessions, walks  # noqa: F401  (they register the rules)
+from . import counts, frames, orders, runs, sessions, walks  # noqa: F401  (they register the rules)
 from .bench import Bench, Piece
 from .rules import RULES, Broken, NotTried, Rule, in_order
 

@@ -65,7 +65,7 @@ def refused_mask(bench: Bench) -> None:
 
 @rule("4.5", "An unknown opcode is refused with 1.")
 def unknown_opcode(bench: Bench) -> None:
-    for opcode in (0, 0x0A, 0x80, 0xFF):
+    for opcode in (0, 0x3F, 0x80, 0xFF):
         bench.refused(AckStatus.UNKNOWN_OPCODE, opcode, b"", f"opcode {opcode:#04x}")
 
 

@@ -14,29 +14,28 @@ from typing import TYPE_CHECKING, Any
 
 from pans.firmware_sim.program import Program
 from pans.firmware_sim.scene.light import Table
-from pans.firmware_sim.scene.moving import SceneFile, Tape
+from pans.firmware_sim.scene.moving import SceneFile
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.bundle.optics import Analyser
-from pans.runtime.imaging import IDENTITY, NO_BLEACHING
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.link.scene_fit import scene_facts
 from pans.runtime.wire import messages as wire
-from pans.runtime.wire.automata import Extension, announcement, unpack_masks, unpack_show, unpack_states
+from pans.runtime.wire.automata import Extension, unpack_masks, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
+from pans.runtime.wire.counts import unpack_count_states, unpack_read_counts
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
-from .gates import GATE_CHANNELS, Gates
+from .facts import largest_number, standing_facts
+from .gates import Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
-from .states import ShowList, StateMemory
+from .states import ShowList, StateMemory, piece_of
 from .stream_buffer import U32, StreamBuffer
-from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS, PatternMemory, PlanMemory, Refused
+from .upload import MAX_PATTERN_PIXELS, PatternMemory, PlanMemory, Refused
 from .view import View
 from .walking import PatternLight
 
 if TYPE_CHECKING:
     from .parallel import FrameRun
 
-FIRMWARE = "pans-sim 1"
 BUFFER_MESSAGES = 256
 NEVER = 1 << 64
 
@@ -86,6 +85,7 @@ class Instrument:
             profile.mode == "sequential" and optics is None
         )  # what the clicks choose must be shown one after another
         self.extension = Extension(projector.automaton_states, projector.dwell_steps) if automata else None
+        self.number_max = largest_number(profile) if automata else 1  # of a detector that counts photons
         self.stream = StreamBuffer(buffer_messages)
         self._out: list[bytes | memoryview] = []
         self._forget_session()
@@ -96,7 +96,7 @@ class Instrument:
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
         self._plan = PlanMemory(self.profile, adaptive=self.extension is not None)
         turn_ticks = math.ceil(self.profile.timing.device_turn_us * self._tick_hz / 1e6)
-        self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks)
+        self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks, self.number_max)
         self._shows: ShowList | None = None  # of a run that the host drives
         self._light: tuple[tuple[int, int, int, bool, bytes], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
@@ -246,36 +246,8 @@ class Instrument:
         self._send_status()
 
     def _facts(self) -> dict[str, Any]:
-        profile = self.profile
-        optics, scene = self.view.optics, self.view.scene
-        passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
-        automata = {} if self.extension is None else announcement(self.extension)
-        return (
-            passive
-            | _table_facts(scene)
-            | automata
-            | _scene_facts(scene)
-            | {
-                "firmware": FIRMWARE,
-                "serial": f"SIM-{self.view.seed & U32:08X}",
-                "epoch": self._epoch,
-                "tick_hz": self._tick_hz,
-                "tick": self._tick,
-                "mode": profile.mode,
-                "channels": profile.detector.channels,
-                "levels": profile.projector.levels,
-                "pattern_memory": profile.projector.pattern_memory,
-                "pattern_pixels": min(profile.projector.width_px * profile.projector.height_px, MAX_PATTERN_PIXELS),
-                "slot_memory": MAX_SLOTS,
-                "buffer_messages": self.stream.capacity,
-                "simulated": True,
-                "profile": profile.name,
-                "gate_channels": GATE_CHANNELS,
-                "scene": scene.name[:60],  # a receiver takes at most 256 bytes of text
-                "objects": scene.n_objects,
-                "seed": self.view.seed,
-            }
-        )
+        now = {"epoch": self._epoch, "tick": self._tick, "buffer_messages": self.stream.capacity}
+        return standing_facts(self.view, self.extension, self.number_max) | now
 
     def _grant(self, grant: wire.Grant) -> None:
         if self._run is not None and grant.lease_ms:
@@ -315,6 +287,8 @@ class Instrument:
             self._patterns.load(unpack_pattern(body))
         elif opcode in (Opcode.LOAD_MASKS, Opcode.LOAD_STATES, Opcode.SHOW) and self.extension is not None:
             self._automaton(Opcode(opcode), body)
+        elif opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES) and self.number_max > 1:
+            self._counts(Opcode(opcode), body)
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
             chunk = unpack_plan(body)
@@ -350,11 +324,26 @@ class Instrument:
         if opcode == Opcode.LOAD_MASKS:
             self._patterns.load_masks(unpack_masks(body))
             return
-        self._states.load(unpack_states(body), self._plan.program)
+        self._states.load(piece_of(unpack_states(body)), self._plan.program)
         if self._states.states is not None:
             from . import walk_kernels
 
             walk_kernels.warm_up()  # ARM must not wait for a compiler
+
+    def _counts(self, opcode: Opcode, body: bytes) -> None:
+        """The commands of protocol.md, section 13."""
+        from . import counting
+
+        self._require_idle(opcode.name)
+        program = self._plan.program
+        if opcode == Opcode.LOAD_COUNT_STATES:
+            self._states.load(piece_of(unpack_count_states(body)), program)
+            return
+        self._states.read_counts(unpack_read_counts(body), program)
+        counting.warm_up()
+        if program is not None:
+            with suppress(Refused):  # ARM says what is wrong
+                self._light_table(program)
 
     def _require_idle(self, what: str) -> None:
         if self.state is not DeviceState.IDLE:
@@ -370,7 +359,8 @@ class Instrument:
             raise Refused(AckStatus.WRONG_STATE, "some states of the automaton have not come")
         shows = ShowList(self._states.extension) if program.adaptive and self._states.states is None else None
         drive = self._states.states if shows is None else shows
-        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive)
+        largest = self._states.largest
+        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive, largest)
         self._shows = shows
         self.stream.restart()
         self._exposures_ended = 0
@@ -379,11 +369,12 @@ class Instrument:
 
     def _light_table(self, program: Program) -> Table | PatternLight:
         """Return the table of this pattern set at this exposure, computed at most once for each."""
-        stay = self.view.stay(program)
-        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks, program.adaptive, stay)
+        largest, stay = self._states.largest, self.view.stay(program)
+        one_by_one = program.adaptive or largest > 1
+        key = (self._patterns.revision, program.n_patterns, program.exposure_ticks, one_by_one, stay)
         if self._light is None or self._light[0] != key:
             patterns = self._patterns.stack(program.n_patterns) if self.view.optics is None else None
-            self._light = (key, self.view.tabulate(program, patterns))
+            self._light = (key, self.view.tabulate(program, patterns, largest))
         return self._light[1]
 
     def _gate(self, body: bytes) -> None:
@@ -391,21 +382,3 @@ class Instrument:
         if self.state not in (DeviceState.ARMED, DeviceState.RUNNING):
             raise Refused(AckStatus.WRONG_STATE, f"GATE needs a run, the device is {self.state.name}")
         self.gates.add(gate, self._tick)
-
-
-def _table_facts(scene: SceneFile) -> dict[str, Any]:
-    """Return what WELCOME says of imperfect optics and of bleaching: a run against a hidden truth must not pass for another one."""
-    imaging = scene.what.imaging if isinstance(scene.what, Scene) else IDENTITY
-    optics = {} if imaging.is_identity else {"simulated_optics": imaging.words()[:200]}
-    bleaching = scene.what.bleaching if isinstance(scene.what, Scene) else NO_BLEACHING
-    return optics if bleaching.is_none else optics | {"simulated_bleaching": bleaching.words()}
-
-
-def _scene_facts(scene: SceneFile) -> dict[str, Any]:
-    """Return what WELCOME says of the scene's images; a target has any size, and what moves has its own."""
-    if isinstance(scene.what, Tape):
-        return {}
-    if not isinstance(scene.what, Scene):
-        return scene_facts(None, scene.what.objects.classes)
-    height, width = scene.what.images.shape[1:]
-    return scene_facts(None if (height, width) == (1, 1) else (height, width), scene.what.classes)

@@ -145,7 +145,9 @@ class Measurement(Timetable):
         tick = self._cycle_tick + int(program.offsets[first])
         number = (self._cycle // program.cycles_per_object) % NO_OBJECT
         patterns, clicks = self._drawn(exposure, count)
-        return ClickBlock(0, 0, tick, exposure, program.slot_period_ticks, number, patterns, clicks)
+        return ClickBlock(
+            0, 0, tick, exposure, program.slot_period_ticks, number, patterns, clicks, self._source.largest
+        )
 
     def _drawn(self, first: int, count: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """What was shown, uint16 (count,), and the clicks, uint8 (count,)."""

@@ -1,95 +1,141 @@
 """The automaton that the host has uploaded, and the states that the host names one by one.
 
-Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), with every limit checked before anything is stored; never
-draws a click. A command that makes no sense raises `Refused` and leaves what is stored as it was.
+Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), of READ_COUNTS and LOAD_COUNT_STATES (section 13), with
+every limit checked before anything is stored; never draws a click. A command that makes no sense raises `Refused` and leaves what is
+stored as it was.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
 from pans.runtime.wire.automata import Extension, Show, StateChunk
+from pans.runtime.wire.counts import EXPOSURE_BYTES, CountStateChunk
 from pans.runtime.wire.fields import MAX_LEAVES, MAX_STATES
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, AckStatus
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, BLOCK_HEADER_BYTES, MAX_PAYLOAD_BYTES, AckStatus
 
 from .upload import Refused
 
 MAX_SHOWS = 256  # named and not begun; the protocol asks for 64
 
 
+class StatePiece(NamedTuple):
+    """Some states of an automaton as either command brings them: pattern, dwell int64 (n,), successors int64 (n, outcomes)."""
+
+    n_states: int
+    first_state: int
+    dwell_steps: int
+    n_leaves: int
+    outcomes: int
+    pattern: NDArray[np.int64]
+    dwell: NDArray[np.int64]
+    successors: NDArray[np.int64]
+
+    @property
+    def header(self) -> tuple[int, ...]:
+        """What all pieces of an automaton must say alike."""
+        return self.n_states, self.dwell_steps, self.n_leaves, self.outcomes
+
+
+def piece_of(chunk: StateChunk | CountStateChunk) -> StatePiece:
+    """Return the states of a LOAD_STATES or LOAD_COUNT_STATES."""
+    rows = chunk.states
+    counts = isinstance(chunk, CountStateChunk)
+    after = rows["next"] if counts else np.stack([rows["next_dark"], rows["next_click"]], axis=1)
+    shown = rows["pattern"].astype(np.int64), rows["dwell"].astype(np.int64), after.astype(np.int64)
+    return StatePiece(chunk.n_states, chunk.first_state, chunk.dwell_steps, chunk.n_leaves, after.shape[1], *shown)
+
+
 @dataclass(slots=True)
 class StateMemory:
-    """The states that belong to the plan in memory; `states` is None until the last one has come and all of them can be followed."""
+    """What belongs to the plan in memory: the states, None until the last one has come and all can be followed, and what is read."""
 
     extension: Extension
     turn_ticks: int = 0  # from the end of an exposure until the projector shows what its click chose
+    number_max: int = 1  # the largest photon number that the detector tells
     states: States | None = None
-    _head: StateChunk | None = None
-    _chunks: list[NDArray[Any]] = field(default_factory=list)
+    largest: int = 1  # number that the runs of this plan read; 1: clicks
+    _head: StatePiece | None = None
+    _pieces: list[StatePiece] = field(default_factory=list)
     _filled: int = 0
 
     def forget(self) -> None:
-        """Begin without states: another plan comes."""
-        self.states, self._head, self._chunks, self._filled = None, None, [], 0
+        """Begin without states and with clicks: another plan comes."""
+        self.largest = 1
+        self._forget_states()
+
+    def _forget_states(self) -> None:
+        self.states, self._head, self._pieces, self._filled = None, None, [], 0
 
     @property
     def begun(self) -> bool:
         """Whether some states have come, but not all."""
         return self._head is not None and self.states is None
 
-    def load(self, chunk: StateChunk, program: Program | None) -> None:
-        """Store one chunk, or raise `Refused`; the last one checks the whole."""
+    def read_counts(self, largest: int, program: Program | None) -> None:
+        """Read photon numbers up to `largest` in the runs of the loaded plan, or raise `Refused`; states have to come again."""
+        if program is None:
+            raise Refused(AckStatus.WRONG_STATE, "READ_COUNTS needs a complete plan")
+        _require(2 <= largest <= self.number_max, lambda: f"numbers up to {largest}: allowed 2..{self.number_max}")
+        exposures = max(count for _, count in program.blocks)
+        longest = (MAX_PAYLOAD_BYTES - BLOCK_HEADER_BYTES) // EXPOSURE_BYTES
+        _require(exposures <= longest, lambda: f"blocks of {exposures} exposures: COUNTS holds {longest}")
+        self._forget_states()
+        self.largest = largest
+
+    def load(self, piece: StatePiece, program: Program | None) -> None:
+        """Store one piece, or raise `Refused`; the last one checks the whole."""
         if program is None or not program.adaptive:
             raise Refused(AckStatus.WRONG_STATE, "no plan with adaptive slots is loaded")
-        _check_head(chunk, self.extension)
-        if chunk.first_state and (self._head is None or self.states is not None or _facts(chunk) != _facts(self._head)):
-            raise Refused(AckStatus.OUT_OF_RANGE, f"state {chunk.first_state} continues no states of this header")
-        if chunk.first_state not in (0, self._filled):
-            raise Refused(
-                AckStatus.OUT_OF_RANGE, f"state {chunk.first_state} does not continue the states at {self._filled}"
-            )
-        _check_states(chunk, program.n_patterns)
-        if chunk.first_state == 0:
-            self.forget()
-            self._head = chunk
-        self._chunks.append(chunk.states)
-        self._filled += len(chunk.states)
-        if self._filled == chunk.n_states:
-            self._complete(chunk, program)
+        if piece.outcomes != self.largest + 1:
+            text = f"states of {piece.outcomes} outcomes: the exposures of this plan have {self.largest + 1}"
+            raise Refused(AckStatus.WRONG_STATE, text)
+        _check_head(piece, self.extension)
+        first, head = piece.first_state, self._head
+        if first and (head is None or self.states is not None or piece.header != head.header):
+            raise Refused(AckStatus.OUT_OF_RANGE, f"state {first} continues no states of this header")
+        if first not in (0, self._filled):
+            raise Refused(AckStatus.OUT_OF_RANGE, f"state {first} does not continue the states at {self._filled}")
+        _check_states(piece, program.n_patterns)
+        if first == 0:
+            self._forget_states()
+            self._head = piece
+        self._pieces.append(piece)
+        self._filled += len(piece.pattern)
+        if self._filled == piece.n_states:
+            self._complete(piece, program)
 
-    def _complete(self, head: StateChunk, program: Program) -> None:
-        rows = np.concatenate(self._chunks)
-        successors = np.stack([rows["next_dark"], rows["next_click"]], axis=1).astype(np.int64)
+    def _complete(self, head: StatePiece, program: Program) -> None:
+        pattern, dwell, successors = (
+            np.concatenate([getattr(piece, name) for piece in self._pieces])
+            for name in ("pattern", "dwell", "successors")
+        )
         longest = longest_walk(successors)
         slots = int(np.count_nonzero(program.patterns == ADAPTIVE_PATTERN))
         if longest > slots:
-            self.forget()
+            self._forget_states()
             raise Refused(AckStatus.OUT_OF_RANGE, f"walks of {longest} exposures: a cycle has {slots} adaptive slots")
         closest = (
             int(np.diff(program.offsets, append=program.offsets[0] + program.cycle_ticks).min())
             - program.exposure_ticks
         )
         if closest < self.turn_ticks - 1:  # a tick less is forgiven for rounding
-            self.forget()
+            self._forget_states()
             raise Refused(
                 AckStatus.OUT_OF_RANGE,
                 f"{closest} ticks between exposures: the device needs {self.turn_ticks} to choose",
             )
-        self.states = States(rows["pattern"].astype(np.int64), rows["dwell"] / head.dwell_steps, successors)
-
-
-def _facts(chunk: StateChunk) -> tuple[int, ...]:
-    return chunk.n_states, chunk.dwell_steps, chunk.n_leaves
+        self.states = States(pattern, dwell / head.dwell_steps, successors)
 
 
 def longest_walk(successors: NDArray[np.int64]) -> int:
-    """Exposures of the longest walk from state 0, int64 (states, 2) with successors above their state; those from n on are leaves."""
+    """Exposures of the longest walk from state 0, int64 (states, outcomes): successors are above their state, from n on leaves."""
     n = len(successors)
     steps = [0] * n
     steps[0] = 1
@@ -100,7 +146,7 @@ def longest_walk(successors: NDArray[np.int64]) -> int:
     return max(steps)
 
 
-def _check_head(head: StateChunk, extension: Extension) -> None:
+def _check_head(head: StatePiece, extension: Extension) -> None:
     most, leaves = min(extension.states, MAX_STATES), MAX_LEAVES
     _require(1 <= head.n_states <= most, lambda: f"{head.n_states} states: the device follows {most}")
     _require(1 <= head.n_leaves <= leaves, lambda: f"{head.n_leaves} leaves: allowed 1..{leaves}")
@@ -115,20 +161,18 @@ def _check_steps(steps: int, extension: Extension) -> None:
     )
 
 
-def _check_states(chunk: StateChunk, n_patterns: int) -> None:
-    rows = chunk.states
-    top = int(rows["pattern"].max())
+def _check_states(piece: StatePiece, n_patterns: int) -> None:
+    top = int(piece.pattern.max())
     _require(top < n_patterns, lambda: f"a state shows pattern {top}: the plan has {n_patterns}")
-    low, high = int(rows["dwell"].min()), int(rows["dwell"].max())
-    _require(low >= 1 and high <= chunk.dwell_steps, lambda: f"dwell {low}..{high}: allowed 1..{chunk.dwell_steps}")
-    nodes = chunk.n_states + chunk.n_leaves
-    numbers = np.arange(chunk.first_state, chunk.first_state + len(rows), dtype=np.int64)
-    for name in ("next_dark", "next_click"):
-        after = rows[name].astype(np.int64)
-        wrong = np.flatnonzero((after <= numbers) | (after >= nodes))
-        if len(wrong):
-            state, found = int(numbers[wrong[0]]), int(after[wrong[0]])
-            raise Refused(AckStatus.OUT_OF_RANGE, f"state {state} leads to {found}: allowed {state + 1}..{nodes - 1}")
+    low, high = int(piece.dwell.min()), int(piece.dwell.max())
+    _require(low >= 1 and high <= piece.dwell_steps, lambda: f"dwell {low}..{high}: allowed 1..{piece.dwell_steps}")
+    nodes = piece.n_states + piece.n_leaves
+    numbers = np.arange(piece.first_state, piece.first_state + len(piece.pattern), dtype=np.int64)[:, None]
+    wrong = np.argwhere((piece.successors <= numbers) | (piece.successors >= nodes))
+    if len(wrong):
+        row, outcome = wrong[0].tolist()
+        state, found = piece.first_state + row, int(piece.successors[row, outcome])
+        raise Refused(AckStatus.OUT_OF_RANGE, f"state {state} leads to {found}: allowed {state + 1}..{nodes - 1}")
 
 
 class Shown(NamedTuple):

@@ -35,6 +35,7 @@ from .upload import Refused
 from .walking import PatternLight, PlanSource, ShownSource, Walked, WalkSource
 
 if TYPE_CHECKING:
+    from .counting import CountedPlan, CountedShows, CountedWalk
     from .parallel import FrameRun
 
 
@@ -88,11 +89,14 @@ class View:
             return b""
         return program.cycles_per_object.to_bytes(8, "little") + program.patterns.tobytes()
 
-    def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None) -> Table | PatternLight:
-        """Return the light of the scene through `patterns`, uint16 (n, pixels), or through the optics; `Refused` if they do not fit."""
+    def tabulate(self, program: Program, patterns: NDArray[np.uint16] | None, largest: int = 1) -> Table | PatternLight:
+        """Return the light of the scene through `patterns`, uint16 (n, pixels), or through the optics; `Refused` if they do not fit.
+
+        `largest` is the largest number that is read, 1 of clicks.
+        """
         exposure_us = self.exposure_us(program)
         try:
-            if patterns is not None and program.adaptive:
+            if patterns is not None and (program.adaptive or largest > 1):
                 assert isinstance(self.scene.what, Scene)  # see check_and_warm_up
                 return PatternLight(self.profile, self.scene.what, patterns, exposure_us)
             if patterns is not None and self.bleaches:
@@ -130,11 +134,14 @@ class View:
         table: Table | PatternLight,
         first_draw: int = 0,
         drive: States | ShowList | None = None,
+        largest: int = 1,
     ) -> Measurement | FrameRun:
-        """Return the run that ARM starts: pattern after pattern, or of all channels at once; `drive` chooses patterns by the clicks."""
+        """Return the run that ARM starts: pattern after pattern, or of all channels at once; `drive` chooses patterns by the clicks.
+
+        With `largest` above 1 every exposure is a photon number up to it.
+        """
         if isinstance(table, PatternLight):
-            assert drive is not None
-            return self._walks(program, arm, table, first_draw, drive)
+            return self._one_by_one(program, arm, table, first_draw, drive, largest)
         light, source = self.light_and_clicks(program, arm.n_cycles, table, first_draw)
         if isinstance(light, StillObjects) and program.mode != PARALLEL:
             return Measurement(program, arm, light, PlanSource(program, source))
@@ -142,8 +149,14 @@ class View:
 
         return FrameRun(program, arm, light, source, self.scene.moves)
 
-    def _walks(
-        self, program: Program, arm: Arm, light: PatternLight, first_draw: int, drive: States | ShowList
+    def _one_by_one(
+        self,
+        program: Program,
+        arm: Arm,
+        light: PatternLight,
+        first_draw: int,
+        drive: States | ShowList | None,
+        largest: int,
     ) -> Measurement:
         scene = self.scene.what
         assert isinstance(scene, Scene)
@@ -152,7 +165,22 @@ class View:
         model = detector_model(self.profile, self.exposure_us(program))
         facts = (scene.n_objects, exposures, changes, model, self.seed, first_draw)
         walked = Walked(program, light, *facts, light.fresh_sample())
-        source = ShownSource(walked, drive) if isinstance(drive, ShowList) else WalkSource(walked, drive)
+        source = _counting_source(walked, drive, largest) if largest > 1 else _clicking_source(walked, drive)
         return Measurement(
             program, arm, StillMarks(scene, program, exposures, changes, source.expected_photoelectrons), source
         )
+
+
+def _clicking_source(walked: Walked, drive: States | ShowList | None) -> ShownSource | WalkSource:
+    assert drive is not None
+    return ShownSource(walked, drive) if isinstance(drive, ShowList) else WalkSource(walked, drive)
+
+
+def _counting_source(
+    walked: Walked, drive: States | ShowList | None, largest: int
+) -> CountedPlan | CountedShows | CountedWalk:
+    from .counting import CountedPlan, CountedShows, CountedWalk  # numba is loaded only by who counts
+
+    if drive is None:
+        return CountedPlan(walked, largest)
+    return CountedShows(walked, drive, largest) if isinstance(drive, ShowList) else CountedWalk(walked, drive)

@@ -43,18 +43,22 @@ class SlotSource(Protocol):
     """The exposures of a sequential run, asked for in their order, `ahead` of them at a time where they are known."""
 
     ahead: int
+    largest: int  # number that an exposure can have: 1 of clicks
 
     def prepare(self, exposure: int) -> bool:
         """Do a piece of work of a fraction of a millisecond that `exposure` or those after it will need; whether there was any."""
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
-        """Return what is stamped, uint16 (count,), and the clicks, uint8 (count, 1), of exposures from `first` on; before uint8 (1,)."""
+        """Return what is stamped, uint16 (count,), and clicks or numbers, uint8 (count, 1), of exposures from `first` on.
+
+        before uint8 (1,): the click of the one before.
+        """
 
 
 class PlanSource:
     """The exposures of a plan whose patterns are fixed."""
 
-    ahead = BATCH_EXPOSURES
+    ahead, largest = BATCH_EXPOSURES, 1
 
     def __init__(self, program: Program, source: ClickSource) -> None:
         self._patterns, self._source = program.patterns, source
@@ -152,7 +156,7 @@ class Walked:
 class ShownSource:
     """The exposures that the host names one by one; one without a name is dark."""
 
-    ahead = 0
+    ahead, largest = 0, 1
 
     def __init__(self, walked: Walked, shows: ShowList) -> None:
         self._walked, self._shows = walked, shows
@@ -179,6 +183,8 @@ class ShownSource:
 
 class WalkSource:
     """The exposures of an automaton that the device follows."""
+
+    largest = 1
 
     def __init__(self, walked: Walked, states: States) -> None:
         self._walked, self._states = walked, states

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
-from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.session import STREAM_TYPES
 
 from .faults import Faults, Recurring
 
@@ -21,7 +21,6 @@ MAX_REORDER_FRAMES = 8
 HOLD_NS = 20_000_000  # a frame held back for others leaves by then at the latest
 MAX_LANE_BYTES = 1 << 24
 RESET_TICK = 1000
-STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 
 MakeDevice = Callable[[int, int], SteppedDevice]  # (epoch, tick at power-on) -> a device that has just been switched on
 

@@ -55,8 +55,8 @@ class Changes:
                 alive[_during(change, times_s), change.channel] = False
         return alive
 
-    def probability(self, model: DetectorModel, photoelectrons: F64, times_s: F64, exposure_s: float) -> F64:
-        """Click probabilities, float64 (n, channels), of exposures that begin at `times_s` and would get `photoelectrons` (n, channels)."""
+    def means(self, model: DetectorModel, photoelectrons: F64, times_s: F64, exposure_s: float) -> F64:
+        """Photoelectrons expected, dark ones counted, float64 (n, channels); arguments as in `probability`."""
         dark = np.full(photoelectrons.shape, model.law.dark_per_exposure)
         extra = np.zeros_like(dark)
         for change in self._changes:
@@ -65,7 +65,11 @@ class Changes:
                 dark[_during(change, times_s), channel] *= change.amount
             elif change.kind in ("burst", "hot"):
                 extra[_during(change, times_s), channel] += change.amount * exposure_s
-        mean = photoelectrons * self.efficiency(times_s)[:, None] + extra + dark
+        return np.asarray(photoelectrons * self.efficiency(times_s)[:, None] + extra + dark)
+
+    def probability(self, model: DetectorModel, photoelectrons: F64, times_s: F64, exposure_s: float) -> F64:
+        """Click probabilities, float64 (n, channels), of exposures that begin at `times_s` and would get `photoelectrons` (n, channels)."""
+        mean = self.means(model, photoelectrons, times_s, exposure_s)
         without_dark = replace(model, law=replace(model.law, dark_per_exposure=0.0))
         if self._readings_shift:
             probability = self._shifted(without_dark, mean, times_s)

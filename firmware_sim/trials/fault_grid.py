@@ -43,7 +43,7 @@ from pans.runtime.wire.commands import Gate
 from . import Report, Trial, figures_text
 
 SHOTS = 1
-MODES = ("sequential", "parallel", "device-driven", "host-driven")
+MODES = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts")
 GATE_EVERY = 32  # decisions
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
@@ -123,6 +123,7 @@ def run_case(
 
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
+    reads_again = reads_again and plan.largest == 1  # photon numbers have no compiled turn
     link = (TapedLink if reads_again else ObservedLink)(VirtualLink(device, clock, f"grid:{case}"))
     host = GridHost(checker, plan, frames)
     per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
@@ -141,7 +142,8 @@ def run_case(
         host.start(run)
 
     observers = Observers(host.watch, start)
-    driven = {"drive": plan.drive, "confidence": 0.0}
+    driven: dict[str, Any] = {"drive": plan.drive, "confidence": 0.0}
+    driven |= {"photon_number_max": plan.largest} if plan.largest > 1 else {}
     header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend, **driven}}
 
     def live(recorder: Recorder) -> RunResult:

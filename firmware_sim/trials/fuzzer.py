@@ -26,6 +26,7 @@ from pans.runtime.decide.verdict import Verdicts
 from pans.runtime.errors import LinkError
 from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
+from pans.runtime.wire.counts import encode_counts
 from pans.runtime.wire.messages import MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
@@ -39,7 +40,7 @@ DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
 class CountingInstrument(Instrument):
     """An instrument that counts what it has carried out."""
 
-    executed = armed = automata_armed = 0
+    executed = armed = automata_armed = counting_armed = 0
 
     def _execute(self, command: wire.CommandMessage) -> None:
         super()._execute(command)
@@ -47,6 +48,7 @@ class CountingInstrument(Instrument):
         if command.opcode == Opcode.ARM:
             self.armed += 1
             self.automata_armed += self._plan.program is not None and self._plan.program.adaptive
+            self.counting_armed += self._states.largest > 1
 
 
 class LimitBroken(AssertionError):
@@ -64,7 +66,9 @@ class FuzzCounts:
     commands_refused: int = 0
     runs_armed: int = 0
     automata_armed: int = 0
+    counting_armed: int = 0
     blocks_accepted: int = 0
+    counts_accepted: int = 0  # of these, blocks of photon numbers
     compiled_messages: int = 0  # through the compiled turn, from a socket
     slowest_call_s: float = 0.0
 
@@ -127,14 +131,16 @@ class Fuzzer:
     def _fresh_host(self) -> None:
         self._session = HostSession(NONCE)
         self._session.start(0)
-        _, bundle, plan = small_setup("sequential")
+        self._counting = self._dice.random() < 0.3  # a host whose plan reads photon numbers has no compiled turn
+        _, bundle, plan = small_setup("device-driven-counts" if self._counting else "sequential")
         self._host_plan = plan
         self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
         self._core.begin(0, 0)
         self._host_decoder = wire.FrameDecoder()
         self._host_decoder.use_kernels()
         self._host_ns = 0
-        self._twin = None if offered() else SocketTwin(plan, _AnyDecider(bundle.n_features), NONCE)  # type: ignore[arg-type]
+        without = offered() or self._counting
+        self._twin = None if without else SocketTwin(plan, _AnyDecider(bundle.n_features), NONCE)  # type: ignore[arg-type]
 
     def _device_takes(self, data: bytes) -> None:
         device = self._device
@@ -171,6 +177,7 @@ class Fuzzer:
                 if self._session.on_frame(frame, self._host_ns):
                     output = self._core.step(frame)
                     self.counts.blocks_accepted += output.block_end_tick is not None
+                    self.counts.counts_accepted += self._counting and output.block_end_tick is not None
                 if self._dice.random() < 0.1:
                     self._session.probe(self._host_ns)
                     self._session.submit(Opcode.GATE, b"", may_be_refused=True)
@@ -203,6 +210,7 @@ class Fuzzer:
         self.counts.commands_executed += self._device.executed
         self.counts.runs_armed += self._device.armed
         self.counts.automata_armed += self._device.automata_armed
+        self.counts.counting_armed += self._device.counting_armed
 
     # -- strange input -------------------------------------------------------------------------------------------------
 
@@ -239,10 +247,11 @@ class Fuzzer:
 
     def _frame_for_host(self) -> bytes:
         dice = self._dice
-        kind = dice.choice((*DEVICE_TYPES, MessageType.CLICKS, MessageType.CLICKS, dice.randrange(256)))
+        often = MessageType.COUNTS if self._counting else MessageType.CLICKS
+        kind = dice.choice((*DEVICE_TYPES, often, often, dice.randrange(256)))
         session = NONCE if dice.random() < 0.97 else self._strange.number(32)
         tracker = self._core.tracker
-        if kind in (MessageType.CLICKS, MessageType.FRAMES) and dice.random() < 0.8:
+        if kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.COUNTS) and dice.random() < 0.8:
             count = dice.randrange(1, 6)
             good = dice.random() < 0.7
             seq = tracker.next_seq if good else self._strange.number(32)
@@ -262,10 +271,13 @@ class Fuzzer:
             if kind == MessageType.CLICKS:
                 patterns = np.array([dice.choice((0, 1, 2, 3, 0xFFFF)) for _ in range(count)], np.uint16)
                 return wire.encode_clicks(wire.ClickBlock(*head, patterns, np.ones(count, np.uint8)), session)
+            if kind == MessageType.COUNTS:
+                return encode_counts(wire.ClickBlock(*head, *self._numbers(count)), session)
             return wire.encode_frames(wire.FrameBlock(*head, np.ones((count, dice.choice((1, 8))), np.uint8)), session)
         layouts = {
             MessageType.PONG: "<IQQQ", MessageType.ACK: "<IIIHH", MessageType.STATUS: "<BBHIIQQ", MessageType.MARK: "<IIhHQQf",
             MessageType.WELCOME: "<IHH", MessageType.CLICKS: "<IIQQIHHI", MessageType.FRAMES: "<IIQQIHHI",
+            MessageType.COUNTS: "<IIQQIHHI",
         }  # fmt: skip
         size = struct.calcsize(layouts.get(MessageType(kind), "<I")) if kind in set(MessageType) else dice.randrange(64)
         body = bytearray(dice.randbytes(size)) if dice.random() < 0.7 else bytearray(size)
@@ -276,6 +288,13 @@ class Fuzzer:
             body = bytearray(struct.pack("<IHH", wire.SCHEMA, wire.PROTOCOL_VERSION, 0))
             body += dice.choice((b"\x80", b"\x81\xa1a\x01", b"\xdf\xff\xff\xff\xff", dice.randbytes(20)))
         return wire.encode_frame(kind, bytes(body) + dice.randbytes(dice.choice((0, 0, 0, 1, 9))), session)
+
+    def _numbers(self, count: int) -> tuple[wire.U16, wire.U8, int]:
+        """Stamps of an automaton's plan, photon numbers and the largest one, now and then one that cannot be."""
+        dice = self._dice
+        stamps = np.array([dice.choice((0, 1, 2, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
+        numbers = np.array([dice.choice((0, 0, 1, 2, 2, 3)) for _ in range(count)], np.uint8)
+        return stamps, numbers, 2 if dice.random() < 0.8 else self._strange.number(16)
 
 
 class _AnyDecider:

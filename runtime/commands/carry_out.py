@@ -205,7 +205,7 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     config = RunConfig(
         job.shots, n_cycles, seconds, job.deadline_us, lease_ms, job.realtime, started_ns, job.core, job.turn
     )
-    header = recording_header(job, bundle_sha256, decider, n_objects, plan.drive)
+    header = recording_header(job, bundle_sha256, decider, n_objects, plan)
     header["config"]["dark"] = dark.header()
     header["config"] |= {} if placed is None else {"registration": placed.header()}
     if flow_run is not None:

@@ -17,6 +17,7 @@ from pans.runtime.live.config import DarkSettings
 from pans.runtime.live.continuous import Continuous
 
 if TYPE_CHECKING:
+    from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.report.summary import Summary
 
@@ -96,8 +97,8 @@ def what_was_run(job: Job, name: str, bundle_sha256: str, backend: str, summary:
     }
 
 
-def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int, drive: str) -> dict[str, Any]:
-    """What a recording must say to be understood alone; units are in the keys. `drive` is the plan's, "" of fixed patterns."""
+def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: int, plan: Plan) -> dict[str, Any]:
+    """What a recording must say to be understood alone; units are in the keys."""
     import numba
     import numpy
     import onnxruntime
@@ -122,7 +123,8 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "tick_hz": job.profile.clock.tick_hz,
             "realtime_requested": job.realtime,
             **({"mode": "parallel"} if job.profile.mode == "parallel" else {}),
-            **({"drive": drive, "confidence": job.confidence} if drive else {}),
+            **({"drive": plan.drive, "confidence": job.confidence} if plan.drive else {}),
+            **({"photon_number_max": plan.largest} if plan.largest > 1 else {}),
         },
         "versions": {
             "pans": __version__,

@@ -95,7 +95,7 @@ class DarkGuard:
         With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
         """
         if self.lit is not None:
-            words = block.words if isinstance(block, FrameBlock) else np.asarray(block.bits).reshape(-1, 1)
+            words = block.words if isinstance(block, FrameBlock) else _clicked(block).reshape(-1, 1)
             self.lit.take_exposures(words)
             self.look_for_dead()
         return self.take_rest(block)
@@ -150,7 +150,7 @@ class DarkGuard:
                 return []
             slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
             return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
-        bits, dark = np.asarray(block.bits), np.asarray(block.patterns) == DARK_PATTERN
+        bits, dark = _clicked(block), np.asarray(block.patterns) == DARK_PATTERN
         if not self._afterpulses:
             return self.take_dark_words(bits[dark].reshape(-1, 1))
         known = self._silent_before if block.exposure_index == self._next else False
@@ -288,6 +288,12 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     if "lit" in header:  # recordings made before have none
         lit = DeadChannelTest(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
     return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)
+
+
+def _clicked(block: ClickBlock) -> NDArray[np.uint8]:
+    """Which exposures clicked, uint8 (n,) of 0 or 1; of photon numbers all above 0 have."""
+    bits = np.asarray(block.bits)
+    return bits if block.largest == 1 else (bits != 0).astype(np.uint8)
 
 
 def _silence_words(who: str, has_others: bool, silence: Silence) -> str:

@@ -66,6 +66,11 @@ class Plan:
         return self.shots_per_cycle * self.cycles_per_object
 
     @property
+    def largest(self) -> int:
+        """The largest number that an exposure can have: 1 of clicks, more of an automaton over photon numbers."""
+        return self.automaton.n_outcomes - 1 if self.automaton is not None and self.automaton.counts else 1
+
+    @property
     def tick_us(self) -> float:
         """Length of one device tick in microseconds."""
         return self.exposure_us / self.exposure_ticks

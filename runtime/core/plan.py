@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.errors import PlanError, UsageError
+from pans.runtime.instrument.count_law import cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.fields import U32_MAX
 
@@ -248,11 +249,10 @@ def _walks(
 
 def _checked_drive(profile: Profile, automaton: Automaton, drive: str) -> str:
     """Return "device" or "host", whichever is asked for and possible; PlanError says what is not, in numbers."""
-    if automaton.counts:
+    if automaton.counts and (why := cannot_count(profile, automaton.n_outcomes)):
         raise PlanError(
-            f"the automaton tells {automaton.n_outcomes} photon numbers apart, the protocol's CLICKS say click or none: a run "
-            "cannot take it",
-            remedy="pans evaluate gives its exact expectation; for a run, train with --outcomes 2",
+            f"the automaton has {why}",
+            remedy=f"choose a profile whose detector counts, or retrain: pans train --encoder automaton --profile {profile.name}",
         )
     if profile.mode != "sequential" or automaton.channels != 1:
         raise PlanError(

@@ -1,6 +1,6 @@
-"""A plan as the LOAD_PLAN and LOAD_STATES bodies that a device is sent, and back.
+"""A plan as the commands that a device is sent, and back: LOAD_PLAN, READ_COUNTS, and LOAD_STATES or LOAD_COUNT_STATES.
 
-Owns the conversion; never sends anything. The bodies themselves are laid out in wire/commands.py and wire/automata.py.
+Owns the conversion; never sends anything. The bodies are laid out in wire/commands.py, wire/automata.py and wire/counts.py.
 """
 
 from __future__ import annotations
@@ -11,9 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.wire.automata import STATES_PER_COMMAND, StateChunk
-from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage
+from pans.runtime.wire.automata import STATES_PER_COMMAND, StateChunk, pack_states
+from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk, pack_plan
+from pans.runtime.wire.counts import (
+    CountStateChunk,
+    count_state_chunks,
+    pack_count_states,
+    pack_read_counts,
+    state_dtype,
+)
+from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN, SLOT_DTYPE, MalformedMessage, Opcode
 from pans.runtime.wire.schema import STATE_DTYPE
 
 from .layout import Plan
@@ -50,26 +57,49 @@ def plan_chunks(plan: Plan) -> list[PlanChunk]:
     ]
 
 
-def state_chunks(plan: Plan) -> list[StateChunk]:
-    """Return the automaton that the device is to follow as LOAD_STATES bodies; none of a plan that it does not drive."""
+def plan_commands(plan: Plan) -> list[tuple[Opcode, bytes]]:
+    """Return the commands that bring `plan` to a device: its slots, what is read in an exposure, and the states that the device follows."""
+    commands = [(Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan)]
+    if plan.largest > 1:
+        commands.append((Opcode.READ_COUNTS, pack_read_counts(plan.largest)))
+    for chunk in state_chunks(plan):
+        if isinstance(chunk, CountStateChunk):
+            commands.append((Opcode.LOAD_COUNT_STATES, pack_count_states(chunk)))
+        else:
+            commands.append((Opcode.LOAD_STATES, pack_states(chunk)))
+    return commands
+
+
+def state_chunks(plan: Plan) -> Sequence[StateChunk | CountStateChunk]:
+    """Return the automaton that the device is to follow as bodies of commands; none of a plan that it does not drive."""
     return [] if plan.automaton is None or plan.drive != "device" else _chunks_of(plan.automaton)
 
 
-def _chunks_of(automaton: Automaton) -> list[StateChunk]:
-    states = np.zeros(automaton.n_states, STATE_DTYPE)
+def _chunks_of(automaton: Automaton) -> Sequence[StateChunk | CountStateChunk]:
+    states = np.zeros(automaton.n_states, _dtype_of(automaton))
     states["pattern"], states["dwell"] = automaton.pattern, automaton.dwell
+    if automaton.counts:
+        states["next"] = automaton.successors
+        facts = automaton.n_states, automaton.dwell_steps, automaton.n_outcomes, automaton.n_leaves
+        return count_state_chunks(facts, states)
     states["next_dark"], states["next_click"] = automaton.successors.T
     starts = range(0, len(states), STATES_PER_COMMAND)
     head = automaton.dwell_steps, automaton.n_leaves
     return [StateChunk(len(states), first, *head, states[first : first + STATES_PER_COMMAND]) for first in starts]
 
 
+def _dtype_of(automaton: Automaton) -> np.dtype[Any]:
+    return state_dtype(automaton.n_outcomes) if automaton.counts else STATE_DTYPE
+
+
 def upload_bytes(plan: Plan, bundle: Bundle) -> int:
     """How many bytes the device is sent before it can measure: patterns, slots and states, without the frames around them."""
     n_patterns, n_pixels = bundle.pattern_levels.shape
     pattern = (n_pixels + 7) // 8 if bundle.levels == 2 else 2 * n_pixels
-    n_states = 0 if plan.automaton is None or plan.drive != "device" else plan.automaton.n_states
-    return n_patterns * pattern + plan.slots_per_cycle * SLOT_DTYPE.itemsize + n_states * STATE_DTYPE.itemsize
+    states = 0
+    if plan.automaton is not None and plan.drive == "device":
+        states = plan.automaton.n_states * _dtype_of(plan.automaton).itemsize
+    return n_patterns * pattern + plan.slots_per_cycle * SLOT_DTYPE.itemsize + states
 
 
 def drive_words(profile: Profile, bundle: Bundle, plan: Plan) -> str:
@@ -91,7 +121,10 @@ def drive_words(profile: Profile, bundle: Bundle, plan: Plan) -> str:
 
 
 def plan_from_chunks(
-    chunks: Sequence[PlanChunk], tick_hz: int, automaton: Automaton | None = None, states: Sequence[StateChunk] = ()
+    chunks: Sequence[PlanChunk],
+    tick_hz: int,
+    automaton: Automaton | None = None,
+    states: Sequence[StateChunk | CountStateChunk] = (),
 ) -> Plan:
     """Invert `plan_chunks` and `state_chunks`: the plan that a device was sent, with the `automaton` that it was made for.
 
@@ -140,7 +173,9 @@ def plan_from_chunks(
     )
 
 
-def _check_automaton(adaptive: NDArray[Any], automaton: Automaton | None, states: Sequence[StateChunk]) -> None:
+def _check_automaton(
+    adaptive: NDArray[Any], automaton: Automaton | None, states: Sequence[StateChunk | CountStateChunk]
+) -> None:
     """Raise MalformedMessage unless the adaptive slots and the states that were sent are those of `automaton`."""
     walk = 0 if automaton is None else automaton.n_slots
     if len(adaptive) != walk:
@@ -152,5 +187,5 @@ def _check_automaton(adaptive: NDArray[Any], automaton: Automaton | None, states
     sent = {chunk.first_state: chunk for chunk in states}
     for chunk in _chunks_of(automaton):
         found = sent.get(chunk.first_state)
-        if found is None or found[:4] != chunk[:4] or found.states.tobytes() != chunk.states.tobytes():
+        if found is None or found[:-1] != chunk[:-1] or found.states.tobytes() != chunk.states.tobytes():
             raise MalformedMessage(f"the states from {chunk.first_state} on were not sent as the automaton has them")

@@ -52,7 +52,7 @@ class Core(Follower):
         self.windows.warm_up()
         if self.guard is not None:
             self.guard.warm_up()
-        if self.guard is None or self.guard.policy == "warn":
+        if self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn"):
             rows = rows_needed(self.windows.n_windows)
             steps = self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, rows)
             ordinary = steps.decides and not self.windows.parallel  # others decide one by one, as `step` does
@@ -68,8 +68,13 @@ class Core(Follower):
         self._steps = None
 
     @property
+    def counts_photons(self) -> bool:
+        """Whether exposures are photon numbers."""
+        return self._plan.largest > 1
+
+    @property
     def compiles(self) -> bool:
-        """Whether compiled steps give all that is asked for, once warmed up: no guard, or one that only warns."""
+        """Whether compiled steps give all that is asked for, once warmed up: clicks, and no guard, or one that only warns."""
         return self._bulk is not None
 
     @property

@@ -62,6 +62,7 @@ class DecisionWindows:
         self.shots = shots
         self.n_windows = shots_per_object // shots
         self.parallel = plan.mode == "parallel"
+        self.largest = plan.largest
         self.visit_exposures = plan.slots_per_cycle * plan.cycles_per_object
         if self.visit_exposures > MAX_VISIT_EXPOSURES:
             raise PlanError(f"an object takes {self.visit_exposures} exposures, allowed {MAX_VISIT_EXPOSURES}")
@@ -81,14 +82,17 @@ class DecisionWindows:
         self._object = NO_OBJECT
 
     def fits(self, block: ClickBlock | FrameBlock) -> bool:
-        """Whether `block` is of the plan's kind, lies within one visit and has a bit for every channel: what `push` relies on."""
+        """Whether `block` is of the plan's kind, lies within one visit and has a bit for every channel: what `push` relies on.
+
+        No number of it is above the largest, so that each is a successor of the automaton.
+        """
         if isinstance(block, FrameBlock):
             n_exposures, word_bytes = block.words.shape
             if not self.parallel or 8 * word_bytes < self._counts.shape[1]:
                 return False
         else:
             n_exposures = len(block.patterns)
-            if self.parallel:
+            if self.parallel or block.largest != self.largest:
                 return False
         return block.exposure_index % self.visit_exposures + n_exposures <= self.visit_exposures
 
@@ -229,9 +233,9 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
         none = read_only(np.zeros((0, 2), np.uint32)), np.zeros(0, np.int64)
         return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, np.zeros(0, np.int64))
     slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
-    if shots != 1 or automaton.successors.shape[1] != 2:
+    if shots != 1 or automaton.channels != 1:
         raise PlanError(
-            f"{shots} walks of {automaton.successors.shape[1]} outcomes per exposure make one decision; allowed: 1 of 2",
+            f"{shots} walks that read {automaton.channels} detectors at once make one decision; allowed: 1 of 1",
             remedy="one walk is one decision: --shots 1, and --trials N for more of them",
         )
     if not automaton.n_slots <= slots <= n_features:

@@ -26,9 +26,9 @@ BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong s
 class Walks(NamedTuple):
     """The walks of the visit under way, one per window; arrays of length 0 where the patterns are fixed.
 
-    `successors` uint32 (states, 2). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN. `need` int64
-    (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs to it. `shown`
-    int64 (states,) counts the exposures of each state in the whole run.
+    `successors` uint32 (states, outcomes). `nodes` int64 (windows,) is where each walk stands: a state, `states` + a leaf, or BROKEN.
+    `need` int64 (windows,) is how many right exposures make it whole, `last` int64 (windows,) the last exposure of the visit that belongs
+    to it. `shown` int64 (states,) counts the exposures of each state in the whole run.
     """
 
     successors: npt.NDArray[np.uint32]
@@ -111,10 +111,11 @@ def add_frames(relative, words, window_at, counts, seen, tallies):  # type: igno
 def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # type: ignore[no-untyped-def]
     """Follow the walks of a visit through exposures `relative`...; tests/oracles/naive_window.py has the meaning in plain loops.
 
-    patterns uint16 (n,) are the states that the device says it showed, bits uint8 (n,); maps is int32 (visit,) slots of the walk (-1: dark)
-    and int32 (visit,) windows; walks Walks, counts int64 (windows, slots) the clicks, seen int64 (windows, 2) right and wrong exposures,
-    tallies int64 (N_TALLIES,). What stands in a walk behind its leaf must be dark, and so counts for the dark counts. Behind a lost or
-    a wrong exposure nothing is known of a walk: there, what says that it was dark counts as dark, and all else for nothing.
+    patterns uint16 (n,) are the states that the device says it showed, bits uint8 (n,) clicks, or photon numbers below `outcomes`; maps is
+    int32 (visit,) slots of the walk (-1: dark) and int32 (visit,) windows; walks Walks, counts int64 (windows, slots) the clicks, seen
+    int64 (windows, 2) right and wrong exposures, tallies int64 (N_TALLIES,). What stands in a walk behind its leaf must be dark, and so
+    counts for the dark counts. Behind a lost or a wrong exposure nothing is known of a walk: there, what says that it was dark counts as
+    dark, and all else for nothing.
     """
     slot_at, window_at = maps
     successors, nodes, need, last, shown = walks
@@ -139,7 +140,7 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
             tallies[LATE_SLOTS] += stamp == DARK_PATTERN
         elif stamp == DARK_PATTERN:
             tallies[DARK_EXPOSURES] += 1
-            tallies[DARK_CLICKS] += bits[i]
+            tallies[DARK_CLICKS] += bits[i] != 0
         elif node != BROKEN:
             tallies[WRONG_PATTERNS] += 1
 

@@ -1,7 +1,7 @@
 """What a device must hold for a plan, as commands: patterns, slots and, of an automaton that it follows, states.
 
-Owns the choice of the shortest form that the device knows, and the refusal of a device that knows no automata; never sends anything
-(connection.py does). What the device lacks is a DeviceError with the numbers.
+Owns the choice of the shortest form that the device knows, and the refusal of a device that knows no automata or counts no photons; never
+sends anything (connection.py does). What the device lacks is a DeviceError with the numbers.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from typing import Any
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_chunks, state_chunks
+from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import DeviceError
-from pans.runtime.wire.automata import announced, mask_chunks, pack_masks, pack_states
-from pans.runtime.wire.commands import MAX_PIXELS_PER_CHUNK, PatternChunk, pack_pattern, pack_plan
+from pans.runtime.wire.automata import announced, mask_chunks, pack_masks
+from pans.runtime.wire.commands import MAX_PIXELS_PER_CHUNK, PatternChunk, pack_pattern
+from pans.runtime.wire.counts import announced_counts
 from pans.runtime.wire.messages import Opcode
-from pans.runtime.wire.schema import AUTOMATON_SCHEMA
+from pans.runtime.wire.schema import AUTOMATON_SCHEMA, COUNT_SCHEMA
 
 
 def upload_commands(plan: Plan, bundle: Bundle, facts: Mapping[str, Any]) -> Iterator[tuple[Opcode, bytes]]:
@@ -28,8 +29,7 @@ def upload_commands(plan: Plan, bundle: Bundle, facts: Mapping[str, Any]) -> Ite
             for first in range(0, len(levels), MAX_PIXELS_PER_CHUNK):
                 part = levels[first : first + MAX_PIXELS_PER_CHUNK]
                 yield Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(index, first, len(levels), part))
-    yield from ((Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan))
-    yield from ((Opcode.LOAD_STATES, pack_states(chunk)) for chunk in state_chunks(plan))
+    yield from plan_commands(plan)
 
 
 def check_automaton(facts: Mapping[str, Any], plan: Plan) -> None:
@@ -55,3 +55,23 @@ def check_automaton(facts: Mapping[str, Any], plan: Plan) -> None:
             f"the device divides an exposure into {extension.dwell_steps} dwell steps, needed a multiple of {automaton.dwell_steps}",
             remedy="retrain for the device's profile",
         )
+    _check_counts(facts, plan)
+
+
+def _check_counts(facts: Mapping[str, Any], plan: Plan) -> None:
+    """Raise DeviceError when the device cannot tell the photon numbers that the plan's automaton asks for."""
+    told = announced_counts(facts)
+    if plan.largest <= told:
+        return
+    found = facts.get("count_schema")
+    if told == 1:
+        says = "no photon numbers" if found is None else f"photon numbers of schema {found:#010x}"
+        what = (
+            f"{says}, needed {COUNT_SCHEMA:#010x}: it tells clicks, or its firmware is older or newer than this runtime"
+        )
+    else:
+        what = f"photon numbers up to {told}, needed {plan.largest}"
+    raise DeviceError(
+        f"the device announces {what}",
+        remedy="use a device that counts (docs/reference/protocol.md, section 13), or train with --outcomes 2",
+    )

@@ -41,9 +41,15 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
         "came there, and how often it clicked. Solid ways are those after a click, dashed ones those without; where several "
         "meet, the state is drawn once.",
     )
+    if automaton.counts:
+        last = automaton.n_outcomes - 1
+        page.text(
+            f"An exposure is a photon number from 0 to {last} (or more). Clicks of a walk are the photons counted.",
+            "note",
+        )
     page.table(
         _meanings(automaton, nodes, bundle, rates),
-        ("state", "walks", "clicked", "most probable after a click", "without a click"),
+        ("state", "walks", "clicked", *_after(automaton)),
     )
     page.figure(
         _counted("exposures of a walk", exposures, 1),
@@ -52,6 +58,14 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
     )
     page.figure(_counted("clicks of a walk", np.bincount(whole["clicks"]), 0), "Clicks of the same walks.")
     _add_confidence(page, whole)
+
+
+def _after(automaton: Automaton) -> tuple[str, ...]:
+    """The heads of the classes after each outcome, in the order of `outcomes`."""
+    if not automaton.counts:
+        return "most probable after a click", "without a click"
+    last = automaton.n_outcomes - 1
+    return (f"most probable after {last} photons or more", *(f"after {number}" for number in reversed(range(last))))
 
 
 def _counted(what: str, counts: NDArray[np.int64], first: int) -> Chart:

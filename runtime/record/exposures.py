@@ -14,19 +14,11 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.core.plan import Plan
-from pans.runtime.wire.messages import (
-    DARK_PATTERN,
-    ClickBlock,
-    FrameBlock,
-    Mark,
-    MessageType,
-    unpack_body,
-)
+from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock, Mark, unpack_body
+from pans.runtime.wire.session import STREAM_TYPES
 from pans.runtime.wire.tracker import StreamTracker
 
 from .recording import Recording
-
-STREAM = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK)
 
 
 class Exposures(NamedTuple):
@@ -42,6 +34,7 @@ class Exposures(NamedTuple):
     state: NDArray[
         np.uint16
     ]  # (n,): of the automaton, as the device stamped it, DARK_PATTERN in the dark; the pattern where there is none
+    photons: NDArray[np.uint8]  # (n, channels): the numbers of a detector that counts, else 1 for a click
 
 
 def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mark]:
@@ -49,7 +42,7 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mar
     tracker, session, stream = StreamTracker(), None, -1
     for arrival_ns, body in recording.messages():
         frame = unpack_body(body)
-        if frame.type not in STREAM:
+        if frame.type not in STREAM_TYPES:
             continue
         if frame.session != session:
             session, stream = frame.session, stream + 1
@@ -63,15 +56,16 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mar
 
 def _exposures(block: ClickBlock | FrameBlock, arrival_ns: int, stream: int, plan: Plan) -> Exposures:
     if isinstance(block, ClickBlock):
-        state, clicks = block.patterns, block.bits[:, None].astype(bool)
+        state, photons = block.patterns, block.bits[:, None]
         pattern = state if plan.automaton is None else _patterns_of(state, plan.automaton)
     else:
         bits = np.unpackbits(block.words, axis=1, bitorder="little")
         slot = (block.exposure_index + np.arange(len(bits))) % plan.slots_per_cycle
-        pattern, clicks = plan.slot_pattern[slot], bits[:, : plan.n_patterns].astype(bool)
+        pattern, photons = plan.slot_pattern[slot], bits[:, : plan.n_patterns]
         state = pattern
-    ticks = block.tick + np.arange(len(clicks), dtype=np.int64) * block.period_ticks
-    return Exposures(arrival_ns, stream, block.object_index, block.exposure_index, ticks, pattern, clicks, state)
+    ticks = block.tick + np.arange(len(photons), dtype=np.int64) * block.period_ticks
+    where = block.object_index, block.exposure_index, ticks
+    return Exposures(arrival_ns, stream, *where, pattern, photons.astype(bool), state, photons)
 
 
 def _patterns_of(state: NDArray[np.uint16], automaton: Automaton) -> NDArray[np.uint16]:
@@ -93,11 +87,12 @@ class ClickList(NamedTuple):
     exposures: int
     first_tick: int
     last_tick: int  # end of the last exposure
+    photons: NDArray[np.int64]  # of each click: 1, or the number of a detector that counts
 
 
 def click_list(recording: Recording, plan: Plan) -> ClickList:
     """Return the clicks of `recording` as arrays."""
-    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(7)]
+    columns: list[list[NDArray[np.int64]]] = [[] for _ in range(8)]
     exposures, first_tick, last_tick = 0, 0, 0
     for item in iter_exposures(recording, plan):
         if isinstance(item, Mark):
@@ -106,15 +101,18 @@ def click_list(recording: Recording, plan: Plan) -> ClickList:
         same = np.full(len(row), item.object), np.full(len(row), item.stream)
         shown = item.pattern[row], item.state[row]
         for column, values in zip(
-            columns, (item.start_tick[row], item.first + row, same[0], channels, *shown, same[1])
+            columns,
+            (item.start_tick[row], item.first + row, same[0], channels, *shown, same[1], item.photons[row, channels]),
         ):
             column.append(np.asarray(values, np.int64))
         first_tick = first_tick if exposures else int(item.start_tick[0])
         last_tick = int(item.start_tick[-1]) + plan.exposure_ticks
         exposures += len(item.clicks)
     empty = [np.zeros(0, np.int64)]
-    start, number, thing, channel, pattern, state, stream = (np.concatenate(column or empty) for column in columns)
-    return ClickList(start, number, thing, channel, pattern, state, stream, exposures, first_tick, last_tick)
+    start, number, thing, channel, pattern, state, stream, photons = (
+        np.concatenate(column or empty) for column in columns
+    )
+    return ClickList(start, number, thing, channel, pattern, state, stream, exposures, first_tick, last_tick, photons)
 
 
 def is_dark(pattern: NDArray[np.integer]) -> NDArray[np.bool_]:

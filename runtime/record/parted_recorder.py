@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_chunks, state_chunks
+from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import PansError, RecordingError
-from pans.runtime.wire.automata import pack_states
-from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
+from pans.runtime.wire.commands import Arm, pack_arm
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import Opcode, encode_command
 
@@ -33,9 +32,7 @@ PART_EVENT = "part"
 
 def repeated_setup(plan: Plan, arm: Arm, nonce: int) -> list[bytes]:
     """Return plan, states and ARM as frames of session `nonce`: with them at its beginning a part can be replayed by itself."""
-    bodies = [(Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan)]
-    bodies += [(Opcode.LOAD_STATES, pack_states(chunk)) for chunk in state_chunks(plan)]
-    bodies.append((Opcode.ARM, pack_arm(arm)))
+    bodies = [*plan_commands(plan), (Opcode.ARM, pack_arm(arm))]
     return [encode_command(number, opcode, body, nonce) for number, (opcode, body) in enumerate(bodies, 1)]
 
 

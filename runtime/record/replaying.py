@@ -149,12 +149,11 @@ def _rebuilt(
         if pictures is not None:
             decider = pictures.over(decider)
         core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)
-        in_bulk = pictures is None and isinstance(core, Core) and (core.guard is None or core.guard.policy == "warn")
-        return (
-            core,
-            BulkSteps(core, core.windows, plan, decider, shots) if in_bulk and isinstance(core, Core) else None,
-            sent,
-        )
+        steps = None
+        if pictures is None and isinstance(core, Core) and not core.counts_photons:
+            in_bulk = core.guard is None or core.guard.policy == "warn"
+            steps = BulkSteps(core, core.windows, plan, decider, shots) if in_bulk else None
+        return core, steps, sent
     except _NOT_REBUILT as error:
         raise DamagedFileError(
             f"{recording.path}: the run cannot be rebuilt: {error or type(error).__name__}"

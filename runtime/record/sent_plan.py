@@ -17,6 +17,7 @@ from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range
 from pans.runtime.wire.automata import StateChunk, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
+from pans.runtime.wire.counts import CountStateChunk, unpack_count_states, unpack_read_counts
 from pans.runtime.wire.messages import (
     CommandMessage,
     Frame,
@@ -52,14 +53,19 @@ class Sent:
     """What a device was sent: plan, states of an automaton, what each state named by the host showed, and ARM by session."""
 
     chunks: dict[int, PlanChunk] = field(default_factory=dict)  # by first slot
-    states: dict[int, StateChunk] = field(default_factory=dict)  # by first state
+    states: dict[int, StateChunk | CountStateChunk] = field(default_factory=dict)  # by first state
     shown: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # state: pattern, dwell, dwell steps
     arms: dict[int, Arm] = field(default_factory=dict)
+    read: list[int] = field(default_factory=list)  # the largest photon number of each READ_COUNTS
 
     def plan(self, tick_hz: int, automaton: Automaton | None) -> Plan:
         """Return the plan, which ran `automaton`; MalformedMessage when it is not whole, or another one was sent."""
         chunks = [self.chunks[first] for first in sorted(self.chunks)]
         plan = plan_from_chunks(chunks, tick_hz, automaton, [self.states[first] for first in sorted(self.states)])
+        if set(self.read) != ({plan.largest} if plan.largest > 1 else set()):
+            raise MalformedMessage(
+                f"photon numbers up to {sorted(set(self.read))} were asked for, needed: {plan.largest}"
+            )
         for state, shown in self.shown.items():
             if automaton is None or state >= automaton.n_states:
                 raise MalformedMessage(f"state {state} was shown, which the automaton does not have")
@@ -76,6 +82,11 @@ class Sent:
         elif command.opcode == Opcode.LOAD_STATES:
             states = unpack_states(command.body)
             self.states[states.first_state] = states
+        elif command.opcode == Opcode.LOAD_COUNT_STATES:
+            counting = unpack_count_states(command.body)
+            self.states[counting.first_state] = counting
+        elif command.opcode == Opcode.READ_COUNTS:
+            self.read.append(unpack_read_counts(command.body))
         elif command.opcode == Opcode.SHOW:
             show = unpack_show(command.body)
             seen = (show.pattern, show.dwell, show.dwell_steps)

@@ -44,7 +44,7 @@ def write_csv(folder: Path, recording: Recording, plan: Plan, clicks: ClickList,
             DECISIONS,
             (_decision_row(row, clicks.first_tick, us, classes) for row in recording.decisions()),
         ),
-        "clicks.csv": (CLICKS, _click_rows(clicks, us, walks=plan.automaton is not None)),
+        "clicks.csv": _click_table(clicks, us, plan),
         "timings.csv": (TIMINGS, (_timing_row(row) for row in recording.timings())),
     }
     written = []
@@ -84,6 +84,14 @@ def _decision_row(row: Any, first_tick: int, us: float, classes: tuple[str, ...]
         *(int(flags), "|".join(str(flag.name) for flag in flags)),
         int(row["exposures"]) or "",
     ]
+
+
+def _click_table(clicks: ClickList, us: float, plan: Plan) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
+    """Heads and rows of clicks.csv; those of a detector that counts have their photons too."""
+    rows = _click_rows(clicks, us, walks=plan.automaton is not None)
+    if plan.largest == 1:
+        return CLICKS, rows
+    return (*CLICKS, "photons"), ((*row, number) for row, number in zip(rows, clicks.photons.tolist()))
 
 
 def _click_rows(clicks: ClickList, us: float, *, walks: bool) -> Iterable[Sequence[Any]]:

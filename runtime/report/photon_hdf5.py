@@ -122,6 +122,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
                 "exposure": clicks.exposure,
                 "object": clicks.object,
                 "pattern": clicks.pattern,
+                **({"photons": clicks.photons} if plan.largest > 1 else {}),
                 "decisions": recording.decisions(),
                 "classes": np.array([name.encode() for name in classes], dtype=np.bytes_),
                 "decisions_sha256": recording.decisions_sha256,

@@ -18,6 +18,8 @@ def excluded(core: Any, link: Link, *, drives: bool) -> str:
     """Return why no compiled turn can be taken with `core`, once warmed up, over `link`; "" where it can."""
     if not isinstance(core, Core):
         return "objects in flow have a turn of their own"
+    if core.counts_photons:
+        return "the detector counts photons: COUNTS are taken in Python"
     if not core.compiles:
         return "--on-dark changes decisions while they are made"
     if link.virtual:

@@ -21,11 +21,12 @@ from pans.runtime.decide.verdict import Decider
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.session import STREAM_TYPES
 
 from . import rings as ring
 from .engine import Limits, Turn
 
-_STREAM_TYPES = (MessageType.CLICKS, MessageType.FRAMES, MessageType.MARK, MessageType.STATUS)
+_CORE_TYPES = STREAM_TYPES | {MessageType.STATUS}
 
 U8 = npt.NDArray[np.uint8]
 
@@ -123,7 +124,7 @@ class StreamCore:
         if frame.session != self._session:
             self.wrong_session += 1
             return
-        if frame.type not in _STREAM_TYPES:
+        if frame.type not in _CORE_TYPES:
             yield Batch(none, [], [frame])
             return
         output = self._steps.step(frame)

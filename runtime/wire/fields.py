@@ -25,6 +25,7 @@ MAX_LEASE_MS = 3_600_000
 U16_MAX, U32_MAX = (1 << 16) - 1, (1 << 32) - 1
 MAX_STATES = 0xFFFD  # of an automaton: the two numbers above mean "chosen by the clicks" and "dark"
 MAX_LEAVES = 1 << 20
+MAX_PHOTON_NUMBER = 15  # of one reading: beyond it the bins of a real detector overlap (instrument/count_law.py)
 
 
 class Field(NamedTuple):
@@ -191,7 +192,27 @@ AUTOMATON_MESSAGES: Mapping[str, tuple[Field, ...]] = {
         Field("dwell_steps", "H", "dwell steps", "steps", low=1),
     ),
 }
-ALL_MESSAGES: Mapping[str, tuple[Field, ...]] = {**MESSAGES, **AUTOMATON_MESSAGES}
+# The same for photon numbers (protocol.md, section 13).
+COUNT_MESSAGES: Mapping[str, tuple[Field, ...]] = {
+    "COUNTS": (*_BLOCK, Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER), _OBJECT),
+    "READ_COUNTS": (
+        Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER),
+        _reserved("H"),
+    ),
+    "LOAD_COUNT_STATES": (
+        Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES),
+        Field("first_state", "H", "first state", high=MAX_STATES - 1),
+        Field("dwell_steps", "H", "dwell steps", "steps", low=1),
+        Field("outcomes", "H", "outcomes", "photon numbers", low=3, high=MAX_PHOTON_NUMBER + 1),
+        Field("n_leaves", "I", "leaves", low=1, high=MAX_LEAVES),
+    ),
+    "COUNT_STATE": (
+        Field("pattern", "H", "pattern", high=U16_MAX - 1),
+        Field("dwell", "H", "dwell", "steps", low=1),
+    ),
+    "COUNT_SUCCESSOR": (Field("next", "I", "successor", low=1, high=MAX_STATES + MAX_LEAVES - 1),),
+}
+ALL_MESSAGES: Mapping[str, tuple[Field, ...]] = {**MESSAGES, **AUTOMATON_MESSAGES, **COUNT_MESSAGES}
 FROM_DEVICE = (
     "PONG",
     "ACK",
@@ -199,6 +220,7 @@ FROM_DEVICE = (
     "CLICKS",
     "FRAMES",
     "MARK",
+    "COUNTS",
 )  # the host checks these; a device refuses commands itself
 
 
@@ -242,6 +264,8 @@ FACTS: Mapping[str, Fact] = {
     "automaton_schema": Fact(int, False, 0, U32_MAX),
     "automaton_states": Fact(int, False, 0, MAX_STATES),
     "dwell_steps": Fact(int, False, 1, U16_MAX),
+    "count_schema": Fact(int, False, 0, U32_MAX),
+    "photon_number_max": Fact(int, False, 1, MAX_PHOTON_NUMBER),
 }
 
 

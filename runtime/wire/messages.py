@@ -48,7 +48,7 @@ from .schema import Opcode as Opcode
 from .schema import StateReason as StateReason
 
 # Of a block's fields these can hold more than they mean: two comparisons settle it for the many good ones, the table names a bad one.
-_BLOCKS = ("CLICKS", "FRAMES")
+_BLOCKS = ("CLICKS", "FRAMES")  # COUNTS has a field with a narrow range: it goes through the table
 _CHECKED = {name: narrow_fields(name) for name in FROM_DEVICE}
 _LITTLE_U16 = np.dtype("<u2")
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")  # of each byte value
@@ -134,7 +134,8 @@ class Status(NamedTuple):
 class ClickBlock(NamedTuple):
     """Consecutive, equally spaced exposures of one detector: one bit and one shown pattern index each.
 
-    `patterns` is uint16 (count,); `bits` is uint8 (count,) of 0 or 1.
+    `patterns` is uint16 (count,); `bits` is uint8 (count,) of 0 or 1. With `largest` above 1 it came as COUNTS (counts.py), and `bits` are
+    photon numbers from 0 to `largest`, which stands for that many or more.
     """
 
     seq: int
@@ -145,6 +146,7 @@ class ClickBlock(NamedTuple):
     object_index: int
     patterns: U16
     bits: U8
+    largest: int = 1
 
 
 class FrameBlock(NamedTuple):

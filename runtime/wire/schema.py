@@ -14,7 +14,7 @@ import numpy as np
 
 from pans.runtime.errors import PansError
 
-from .fields import AUTOMATON_MESSAGES, MESSAGES, layout
+from .fields import AUTOMATON_MESSAGES, COUNT_MESSAGES, MESSAGES, layout
 
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 65536
@@ -44,6 +44,7 @@ class MessageType(IntEnum):
     CLICKS = 0x90
     FRAMES = 0x91
     MARK = 0x92
+    COUNTS = 0x93  # of the extension for photon numbers
 
 
 class Opcode(IntEnum):
@@ -58,6 +59,8 @@ class Opcode(IntEnum):
     LOAD_MASKS = 0x07  # this and those below: of the extension for automata
     LOAD_STATES = 0x08
     SHOW = 0x09
+    READ_COUNTS = 0x0A  # this and the one below: of the extension for photon numbers
+    LOAD_COUNT_STATES = 0x0B
 
 
 class DeviceState(IntEnum):
@@ -99,7 +102,10 @@ SCHEMA = zlib.crc32(SCHEMA_TEXT.encode("ascii"))
 AUTOMATON_LAYOUTS: dict[str, str] = {name: layout(name) for name in AUTOMATON_MESSAGES}
 AUTOMATON_SCHEMA_TEXT = "pans-automaton/1;" + ";".join(f"{name}={layout}" for name, layout in AUTOMATON_LAYOUTS.items())
 AUTOMATON_SCHEMA = zlib.crc32(AUTOMATON_SCHEMA_TEXT.encode("ascii"))
-STRUCTS = {name: struct.Struct(layout) for name, layout in {**LAYOUTS, **AUTOMATON_LAYOUTS}.items()}
+COUNT_LAYOUTS: dict[str, str] = {name: layout(name) for name in COUNT_MESSAGES}
+COUNT_SCHEMA_TEXT = "pans-counts/1;" + ";".join(f"{name}={layout}" for name, layout in COUNT_LAYOUTS.items())
+COUNT_SCHEMA = zlib.crc32(COUNT_SCHEMA_TEXT.encode("ascii"))
+STRUCTS = {name: struct.Struct(layout) for name, layout in {**LAYOUTS, **AUTOMATON_LAYOUTS, **COUNT_LAYOUTS}.items()}
 HEADER = STRUCTS["HEADER"]
 UNSEEDED = (MessageType.HELLO, MessageType.WELCOME)  # readable across versions, so that a mismatch can be named
 SLOT_DTYPE = np.dtype([("offset_ticks", "<u8"), ("pattern", "<u2"), ("shot", "<u2")])

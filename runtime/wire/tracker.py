@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from . import messages as wire
+from .counts import decode_counts
 from .messages import ClickBlock, Frame, FrameBlock, Mark, MessageType
 
 SEQUENCE = 1 << 32
@@ -156,4 +157,6 @@ def _decode(frame: Frame) -> ClickBlock | FrameBlock | Mark:
         return wire.decode_frames(frame.payload)
     if frame.type == MessageType.MARK:
         return wire.decode_mark(frame.payload)
+    if frame.type == MessageType.COUNTS:
+        return decode_counts(frame.payload)
     raise wire.MalformedMessage(f"type {frame.type:#04x} is no stream message")

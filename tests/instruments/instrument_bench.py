@@ -11,6 +11,7 @@ from pans.firmware_sim.scene.still import load_scene
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, PatternChunk, PlanChunk, pack_arm, pack_pattern, pack_plan
+from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.messages import DARK_PATTERN, SLOT_DTYPE, MessageType, Opcode
 
 NONCE = 0x11223344
@@ -24,6 +25,7 @@ DECODERS: dict[int, Any] = {
     MessageType.CLICKS: wire.decode_clicks,
     MessageType.FRAMES: wire.decode_frames,
     MessageType.MARK: wire.decode_mark,
+    MessageType.COUNTS: decode_counts,
 }
 
 

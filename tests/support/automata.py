@@ -36,17 +36,20 @@ def diamond() -> Automaton:
 
 
 def random_automaton(
-    seed: int, slots: int = 6, width: int = 5, classes: int = 3, channels: int = 1, patterns: int = 7
+    seed: int, slots: int = 6, width: int = 5, classes: int = 3, channels: int = 1, patterns: int = 7, outcomes: int = 0
 ) -> Automaton:
-    """At most `width` states per slot, edges at random to the next slot or, one in eight, to a leaf."""
+    """At most `width` states per slot, edges at random to the next slot or, one in eight, to a leaf.
+
+    With `outcomes` they follow photon numbers, else clicks.
+    """
     rng = np.random.default_rng(seed)
     of_slot = [1, *(width for _ in range(slots - 1))]
     starts = np.concatenate([[0], np.cumsum(of_slot)])
     n_states, n_leaves = int(starts[-1]), 2 * width
-    successors = np.empty((n_states, 1 << channels), np.int64)
+    successors = np.empty((n_states, outcomes or 1 << channels), np.int64)
     for slot, n in enumerate(of_slot):
         rows = slice(int(starts[slot]), int(starts[slot]) + n)
-        shape = (n, 1 << channels)
+        shape = (n, successors.shape[1])
         successors[rows] = n_states + rng.integers(0, n_leaves, shape)
         if slot + 1 < slots:
             inner = rng.integers(int(starts[slot + 1]), int(starts[slot + 2]), shape)
@@ -55,9 +58,8 @@ def random_automaton(
             inner[0, 0] = starts[slot + 1]
             successors[rows] = np.where(goes_on, inner, successors[rows])
     posteriors = rng.dirichlet(np.full(classes, 0.7), n_states + n_leaves)
-    return reachable_automaton(
-        rng.integers(0, patterns, n_states), rng.integers(1, 9, n_states), 8, successors, posteriors
-    )
+    shown = rng.integers(0, patterns, n_states), rng.integers(1, 9, n_states), 8
+    return reachable_automaton(*shown, successors, posteriors, outcomes > 0)
 
 
 def automaton_bundle(automaton: Automaton | None = None, **facts: Any) -> Bundle:

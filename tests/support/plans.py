@@ -74,7 +74,7 @@ def walked(plan: Plan, n_cycles: int, rng: np.random.Generator) -> list[tuple[in
     for _ in range(n_cycles):
         node = 0
         for planned in plan.slot_pattern.tolist():
-            bit, lit = int(rng.integers(2)), planned == ADAPTIVE_PATTERN and node < automaton.n_states
+            bit, lit = int(rng.integers(plan.largest + 1)), planned == ADAPTIVE_PATTERN and node < automaton.n_states
             found.append((node if lit else DARK_PATTERN, bit))
             node = int(automaton.successors[node][bit]) if lit else node
     return found

@@ -230,14 +230,17 @@ OFTEN = {
 }
 
 
-@pytest.mark.parametrize("seed", range(len(MODES)))
-@pytest.mark.parametrize("case", ["none", "all"])
+@pytest.mark.parametrize(
+    ("case", "seed"),
+    [*((case, seed) for case in ("none", "all") for seed in range(4)), ("none", 4), ("all", 4), ("all", 5)],
+)
 def test_whole_runs_under_all_faults_or_none(case: str, seed: int) -> None:
-    result = run_case(case, seed, 12_000)
+    result = run_case(case, seed, 12_000 if seed < 4 else 5_000)
+    assert result.mode == MODES[seed]
     assert result.violations == [], result.violations
     assert result.ended == "completed"
-    assert result.checked["decisions"] > 1000
-    assert result.checked["gates_executed"] > 10
+    assert result.checked["decisions"] > (1000 if seed < 4 else 400)
+    assert result.checked["gates_executed"] > (10 if seed < 4 else 3)
     assert (result.checked["decisions_flagged"] > 0) == (case == "all")
 
 

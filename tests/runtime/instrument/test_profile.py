@@ -308,7 +308,7 @@ def test_loads_a_path_and_ignores_the_line_ends_of_the_system(tmp_path):
 
 def test_an_unknown_name_lists_the_shipped_profiles():
     with pytest.raises(
-        ConfigError, match="dmd-8bit-spad, dmd-spad, flow-snspd, ideal, microled-spad, oled-qcmos, wdm-snspd"
+        ConfigError, match="dmd-8bit-spad, dmd-qcmos, dmd-spad, flow-snspd, ideal, microled-spad, oled-qcmos, wdm-snspd"
     ) as caught:
         load_profile("oled-qcmso")
     assert "did you mean oled-qcmos?" in caught.value.remedy

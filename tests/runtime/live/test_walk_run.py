@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,11 @@ from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.record import read_recording
+from pans.runtime.record.exposures import click_list
+from pans.runtime.record.format import COUNTS_VERSION
 from pans.runtime.record.parts import parts_in
+from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.wire.messages import DARK_PATTERN
 
 N_OBJECTS = 40
 WALKS = ("object", "shot", "clicks", "label", "truth", "flags", "probability", "counts_crc", "exposures")
@@ -66,6 +71,39 @@ def test_the_host_and_the_device_give_the_same_walks(
     for drive in runs:
         assert replays(tmp_path / drive / "run.pansrec")
         assert main(["verify", str(tmp_path / drive / "run.pansrec")]) == 0
+
+
+def test_photon_numbers_lead_the_same_walks_by_the_device_and_by_the_host(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    automaton = random_automaton(4, slots=5, width=6, patterns=4, outcomes=4)
+    write_bundle(automaton_bundle(automaton, levels=2, photons_per_level=0.29), tmp_path / "counted.pans")
+    found = {}
+    for drive in ("device", "host"):
+        device = f"sim:dmd-qcmos?scene={folder / 'tiny.npz'}&seed=5&pace=fast"
+        words = ("--decisions", 2 * N_OBJECTS, "--trials", 2, "--drive", drive, "--out", tmp_path / drive)
+        summary = json_of(capsys, "", "run", tmp_path / "counted.pans", "--device", device, *words, code=None)
+        assert (summary["verdict"], summary["late_slots"], summary["wrong_patterns"]) == ("PASS", 0, 0)
+        assert "COUNTS are taken in Python" in summary["realtime"]["turn"]
+        path = tmp_path / drive / "run.pansrec"
+        recording = read_recording(path)
+        assert (recording.version, recording.header["config"]["photon_number_max"]) == (COUNTS_VERSION, 3)
+        assert replays(path)
+        assert main(["verify", str(path)]) == 0
+        found[drive] = recording.decisions()
+        plan = recorded_plan(recording)
+        clicks = click_list(recording, plan)
+        lit = clicks.pattern != DARK_PATTERN
+        assert clicks.photons[lit].sum() == found[drive]["clicks"].sum()
+        assert set(clicks.photons.tolist()) == {1, 2, 3}
+    assert found["device"][list(WALKS)].tolist() == found["host"][list(WALKS)].tolist()
+    capsys.readouterr()
+    out = str(tmp_path / "csv")
+    assert main(["export", "--format", "csv", "--out", out, str(tmp_path / "host" / "run.pansrec")]) == 0
+    with (tmp_path / "csv" / "clicks.csv").open() as file:
+        assert [int(row["photons"]) for row in csv.DictReader(file)] == clicks.photons.tolist()
+    assert main(["report", str(tmp_path / "device" / "run.pansrec"), "--out", str(tmp_path / "page.html")]) == 0
+    assert "photon number from 0 to 3" in (tmp_path / "page.html").read_text()
 
 
 def test_a_walk_stops_when_it_is_sure_and_abstains_where_it_is_not(

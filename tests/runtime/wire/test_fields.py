@@ -13,9 +13,19 @@ from tree import ROOT
 
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire import walk
-from pans.runtime.wire.fields import ALL_MESSAGES, FACTS, FROM_DEVICE, LARGEST_TICK, MESSAGES, Fact, Field, wrong_facts
+from pans.runtime.wire.counts import decode_counts
+from pans.runtime.wire.fields import ALL_MESSAGES, FACTS, FROM_DEVICE, LARGEST_TICK, Fact, Field, wrong_facts
 from pans.runtime.wire.messages import MalformedMessage, decode_welcome
-from pans.runtime.wire.schema import AUTOMATON_SCHEMA, AUTOMATON_SCHEMA_TEXT, LAYOUTS, SCHEMA, SCHEMA_TEXT, STRUCTS
+from pans.runtime.wire.schema import (
+    AUTOMATON_SCHEMA,
+    AUTOMATON_SCHEMA_TEXT,
+    COUNT_SCHEMA,
+    COUNT_SCHEMA_TEXT,
+    LAYOUTS,
+    SCHEMA,
+    SCHEMA_TEXT,
+    STRUCTS,
+)
 
 DOCUMENT = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
 RANGES = DOCUMENT.partition("## 8. Ranges")[2].partition("\n## ")[0]
@@ -27,8 +37,9 @@ GOOD: dict[str, tuple[Any, ...]] = {
     "CLICKS": (0, 0, 100, 4, 10, 8, 0, 1),
     "FRAMES": (0, 0, 100, 4, 10, 8, 2, 1),
     "MARK": (0, 1, 2, 0, 4, 100, 1.5),
+    "COUNTS": (0, 0, 100, 4, 10, 8, 2, 1),
 }
-TAILS = {"CLICKS": bytes(8 * 2 + 1), "FRAMES": bytes(8 * 2)}
+TAILS = {"CLICKS": bytes(8 * 2 + 1), "FRAMES": bytes(8 * 2), "COUNTS": bytes(8 * 3)}
 FACTS_OF_A_DEVICE = {
     **{"tick_hz": 1000, "mode": "parallel", "channels": 1, "levels": 2, "pattern_memory": 0, "pattern_pixels": 0},
     **{
@@ -42,6 +53,8 @@ FACTS_OF_A_DEVICE = {
         "automaton_schema": AUTOMATON_SCHEMA,
         "automaton_states": 0,
         "dwell_steps": 1,
+        "count_schema": COUNT_SCHEMA,
+        "photon_number_max": 1,
         "objects": 0,
         "scene_height_px": 1,
         "scene_width_px": 1,
@@ -52,7 +65,7 @@ FACTS_OF_A_DEVICE = {
 
 def decode(name: str, values: tuple[Any, ...]) -> Any:
     payload = STRUCTS[name].pack(*values) + TAILS.get(name, b"")
-    return getattr(wire, f"decode_{name.lower()}")(payload)
+    return decode_counts(payload) if name == "COUNTS" else getattr(wire, f"decode_{name.lower()}")(payload)
 
 
 def with_field(name: str, place: int, value: Any) -> tuple[Any, ...]:
@@ -68,7 +81,7 @@ def edges(field: Field) -> tuple[list[Any], list[Any]]:
     return [low, high], ([low - 1] if low > least else []) + ([high + 1, most] if high < most else [])
 
 
-CASES = [(name, place, field) for name in FROM_DEVICE for place, field in enumerate(MESSAGES[name])]
+CASES = [(name, place, field) for name in FROM_DEVICE for place, field in enumerate(ALL_MESSAGES[name])]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0]}.{case[2].name}")
@@ -122,6 +135,12 @@ def test_the_schema_of_the_extension_for_automata_is_its_own_and_stands_in_the_d
     assert AUTOMATON_SCHEMA == 0xD00A27FF
     assert AUTOMATON_SCHEMA_TEXT in DOCUMENT
     assert f"0x{AUTOMATON_SCHEMA:08X}" in DOCUMENT
+
+
+def test_the_schema_of_the_extension_for_photon_numbers_is_its_own_and_stands_in_the_document() -> None:
+    assert COUNT_SCHEMA == 0xEEF01CE1
+    assert COUNT_SCHEMA_TEXT in DOCUMENT
+    assert f"0x{COUNT_SCHEMA:08X}" in DOCUMENT
 
 
 def test_every_field_with_a_name_in_the_document_has_its_range_there() -> None:

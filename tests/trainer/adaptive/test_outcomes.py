@@ -206,8 +206,9 @@ def test_a_training_ends_in_a_bundle_that_is_evaluated(tmp_path):
     assert made.difference < 1e-5  # of class chances, between the float64 sums of the file and the machine's
     assert made.measured.accuracy_mean > 0.5  # four classes: 0.25 by chance
     assert made.measured.photons_mean == pytest.approx(4.0, rel=0.1)
-    with pytest.raises(PlanError, match=r"tells 3 photon numbers apart.*a run cannot take it"):
-        build_plan(profile, made.bundle)
+    clicks_only = replace(profile, detector=replace(profile.detector, photon_number_max=1))
+    with pytest.raises(PlanError, match=r"3 outcomes per exposure.*tells 2 apart"):
+        build_plan(clicks_only, made.bundle)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,187 @@
+"""Rules of section 13: exposures that are photon numbers, and automata that follow them.
+
+Owns these checks; on a device that announces no photon numbers only its refusals are tried.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pans.runtime.wire.automata import announced, pack_states
+from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
+from pans.runtime.wire.counts import (
+    CountStateChunk,
+    announced_counts,
+    pack_count_states,
+    pack_read_counts,
+    state_dtype,
+)
+from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, Opcode
+from pans.runtime.wire.schema import COUNT_SCHEMA
+
+from .bench import Bench
+from .rules import NotTried, need, rule
+from .walks import CYCLES, SLOTS, following, four_states
+
+LEAVES = 5
+MALFORMED, RANGE, STATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE
+
+
+def counting(bench: Bench) -> int:
+    """The largest number that the device tells; NotTried where it only clicks."""
+    largest = announced_counts(bench.facts)
+    if largest < 2:
+        raise NotTried("the device announces no photon numbers")
+    return largest
+
+
+def four_counted(steps: int, largest: int) -> CountStateChunk:
+    """State 0 leads to 1, 2 or 3, all of them to leaves: walks of two exposures."""
+    rows = np.zeros(4, state_dtype(largest + 1))
+    rows["pattern"], rows["dwell"] = (0, 1, 0, 1), steps
+    numbers = np.arange(largest + 1)
+    rows["next"][0] = 1 + np.minimum(numbers, 2)
+    rows["next"][1:] = 4 + (np.arange(3)[:, None] + numbers) % LEAVES
+    return CountStateChunk(4, 0, steps, largest + 1, LEAVES, rows)
+
+
+def clicks_of(bench: Bench) -> list[ClickBlock]:
+    """The blocks that have come, CLICKS and COUNTS."""
+    return [one for one in bench.stream() if isinstance(one, ClickBlock)]
+
+
+@rule("13.1", "A device without photon numbers refuses their opcodes with 1 and sends no COUNTS.")
+def clicks_only(bench: Bench) -> None:
+    if announced_counts(bench.facts) > 1:
+        raise NotTried("the device announces photon numbers")
+    for opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES):
+        bench.refused(AckStatus.UNKNOWN_OPCODE, opcode, bytes(4), opcode.name)
+    _, stream, _ = bench.run(bench.layout(), CYCLES)
+    counted = [one for one in stream if isinstance(one, ClickBlock) and one.largest > 1]
+    need(not counted, f"{len(counted)} blocks are COUNTS")
+
+
+@rule(
+    "13.2",
+    "A device that announces photon numbers does so with the number of the extension, a largest number of 2 or more, and automata.",
+)
+def says_what_it_knows(bench: Bench) -> None:
+    schema, largest = (bench.facts.get(key) for key in ("count_schema", "photon_number_max"))
+    if schema is None and largest in (None, 1):
+        raise NotTried("the device announces no photon numbers")
+    need(schema == COUNT_SCHEMA, f"count_schema is {schema}, expected {COUNT_SCHEMA:#010x}")
+    need(isinstance(largest, int) and largest >= 2, f"photon_number_max is {largest}, expected 2 to 15")
+    need(bench.facts["mode"] == "sequential", f"mode is {bench.facts['mode']}, expected sequential")
+    need(announced(bench.facts) is not None, "no automata are announced")
+
+
+@rule(
+    "13.3",
+    "READ_COUNTS needs a plan (4) and IDLE (4); outside its range it is refused with 3, with another length with 2.",
+)
+def reading(bench: Bench) -> None:
+    largest = counting(bench)
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(2), "READ_COUNTS without a plan")
+    bench.upload(bench.layout())
+    for wrong in (0, 1, largest + 1, 0xFFFF):
+        bench.refused(RANGE, Opcode.READ_COUNTS, pack_read_counts(wrong), f"READ_COUNTS of {wrong}")
+    for body, what in ((b"", "no body"), (bytes(3), "three bytes"), (bytes(5), "five bytes")):
+        bench.refused(MALFORMED, Opcode.READ_COUNTS, body, f"READ_COUNTS with {what}")
+    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+    bench.arm(0, ahead_s=5.0)
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(2), "READ_COUNTS in ARMED")
+    bench.done(Opcode.STOP)
+
+
+@rule(
+    "13.4", "After READ_COUNTS every block is COUNTS with its largest number; after LOAD_PLAN blocks are CLICKS again."
+)
+def blocks_of_numbers(bench: Bench) -> None:
+    most = counting(bench)
+    layout = bench.layout()
+    for largest in sorted({2, most}):
+        bench.upload(layout)
+        bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+        bench.grant()
+        bench.arm(CYCLES)
+        bench.closing(layout, CYCLES)
+        blocks = clicks_of(bench)
+        found = {block.largest for block in blocks}
+        need(found == {largest}, f"blocks have the largest numbers {sorted(found)}, asked for was {largest}")
+        seen = sum(len(block.bits) for block in blocks)
+        need(seen == CYCLES * layout.n_slots, f"{seen} exposures, the run has {CYCLES * layout.n_slots}")
+    _, stream, _ = bench.run(layout, CYCLES)
+    again = {block.largest for block in stream if isinstance(block, ClickBlock)}
+    need(again == {1}, f"after LOAD_PLAN blocks have the largest numbers {sorted(again)}, expected CLICKS")
+
+
+@rule(
+    "13.5",
+    "LOAD_COUNT_STATES before READ_COUNTS or of other outcomes is refused with 4, as LOAD_STATES after it; outside its ranges with 3, "
+    "a part of a state with 2.",
+)
+def count_state_ranges(bench: Bench) -> None:
+    largest, found = min(counting(bench), 3), following(bench)
+    bench.upload(bench.layout(adaptive=SLOTS))
+    good = four_counted(found.dwell_steps, largest)
+    body = pack_count_states(good)
+    bench.refused(STATE, Opcode.LOAD_COUNT_STATES, body, "LOAD_COUNT_STATES before READ_COUNTS")
+    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+    bench.refused(
+        STATE, Opcode.LOAD_STATES, pack_states(four_states(found.dwell_steps)), "LOAD_STATES after READ_COUNTS"
+    )
+    other = four_counted(found.dwell_steps, largest + 1)
+    bench.refused(STATE, Opcode.LOAD_COUNT_STATES, pack_count_states(other), "LOAD_COUNT_STATES of other outcomes")
+    bench.refused(MALFORMED, Opcode.LOAD_COUNT_STATES, body[:-3], "a part of a state")
+
+    def refuse(what: str, successor: int | None = None, **fields: Any) -> None:
+        rows = good.states.copy()
+        for name in ("pattern", "dwell"):
+            if name in fields:
+                rows[name][1] = fields.pop(name)
+        if successor is not None:
+            rows["next"][1, largest] = successor
+        bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_count_states(good._replace(states=rows, **fields)), what)
+
+    refuse("a pattern that the plan does not have", pattern=2)
+    refuse("a dwell of 0", dwell=0)
+    refuse("a successor that is its own state", successor=1)
+    refuse("a successor that is no node", successor=4 + LEAVES)
+    refuse("no leaves", n_leaves=0)
+    refuse("states that continue nothing", n_states=8, first_state=4)
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(good._replace(states=good.states[:2])))
+    start = bench.ping().tx_tick + bench.facts["tick_hz"]
+    bench.refused(STATE, Opcode.ARM, pack_arm(Arm(start, 1, 1000)), "ARM with two of four states")
+    bench.done(Opcode.LOAD_PLAN, pack_plan(bench.layout(adaptive=SLOTS).chunk()))
+    bench.refused(STATE, Opcode.LOAD_COUNT_STATES, body, "LOAD_COUNT_STATES after another LOAD_PLAN")
+
+
+@rule(
+    "13.6",
+    "The device follows states of photon numbers: each number leads to the stamped successor, a leaf ends the walk in the dark.",
+)
+def follows_numbers(bench: Bench) -> None:
+    largest, found = min(counting(bench), 3), following(bench)
+    layout, automaton = bench.layout(adaptive=SLOTS), four_counted(found.dwell_steps, largest)
+    bench.upload(layout)
+    bench.done(Opcode.READ_COUNTS, pack_read_counts(largest))
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(automaton))
+    bench.grant()
+    bench.arm(CYCLES)
+    bench.closing(layout, CYCLES)
+    node, seen = 0, 0
+    for block in clicks_of(bench):
+        need(block.largest == largest, f"a block has the largest number {block.largest}, asked for was {largest}")
+        for place, (stamp, number) in enumerate(zip(block.patterns.tolist(), block.bits.tolist())):
+            exposure = block.exposure_index + place
+            slot = exposure % layout.n_slots
+            node = 0 if slot == 0 else node
+            lit = slot < SLOTS and node < 4
+            wanted = node if lit else DARK_PATTERN
+            need(stamp == wanted, f"exposure {exposure} is stamped {stamp}, the walk stands in {wanted}")
+            if lit:
+                node = int(automaton.states["next"][node, number])
+            seen += 1
+    need(seen == CYCLES * layout.n_slots, f"{seen} exposures, the run has {CYCLES * layout.n_slots}")

@@ -1,0 +1,80 @@
+"""What WELCOME says of a simulated instrument, its scene and its optics, but for what changes while it runs.
+
+Owns these keys and their values; never sends them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pans.firmware_sim.scene.moving import SceneFile, Tape
+from pans.firmware_sim.scene.still import Scene
+from pans.runtime.imaging import IDENTITY, NO_BLEACHING
+from pans.runtime.instrument.count_law import cannot_count
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.link.scene_fit import scene_facts
+from pans.runtime.wire.automata import Extension, announcement
+from pans.runtime.wire.counts import count_announcement
+
+from .gates import GATE_CHANNELS
+from .upload import MAX_PATTERN_PIXELS, MAX_SLOTS
+from .view import View
+
+FIRMWARE = "pans-sim 1"
+
+
+def largest_number(profile: Profile) -> int:
+    """Return the largest photon number that the detector of `profile` tells; 1 of one that only clicks."""
+    largest = profile.detector.photon_number_max
+    return largest if largest > 1 and not cannot_count(profile, largest + 1) else 1
+
+
+def standing_facts(view: View, extension: Extension | None, number_max: int) -> dict[str, Any]:
+    """Return WELCOME's map without the present tick, the epoch and the buffer; `extension` None: no automata; `number_max` 1: clicks."""
+    profile, optics, scene = view.profile, view.optics, view.scene
+    projector = profile.projector
+    passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
+    automata = {} if extension is None else announcement(extension)
+    counts = count_announcement(number_max) if number_max > 1 else {}
+    return (
+        passive
+        | _table_facts(scene)
+        | automata
+        | counts
+        | _image_facts(scene)
+        | {
+            "firmware": FIRMWARE,
+            "serial": f"SIM-{view.seed & 0xFFFFFFFF:08X}",
+            "tick_hz": profile.clock.tick_hz,
+            "mode": profile.mode,
+            "channels": profile.detector.channels,
+            "levels": projector.levels,
+            "pattern_memory": projector.pattern_memory,
+            "pattern_pixels": min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS),
+            "slot_memory": MAX_SLOTS,
+            "simulated": True,
+            "profile": profile.name,
+            "gate_channels": GATE_CHANNELS,
+            "scene": scene.name[:60],  # a receiver takes at most 256 bytes of text
+            "objects": scene.n_objects,
+            "seed": view.seed,
+        }
+    )
+
+
+def _table_facts(scene: SceneFile) -> dict[str, Any]:
+    """Return what WELCOME says of imperfect optics and of bleaching: a run against a hidden truth must not pass for another one."""
+    imaging = scene.what.imaging if isinstance(scene.what, Scene) else IDENTITY
+    optics = {} if imaging.is_identity else {"simulated_optics": imaging.words()[:200]}
+    bleaching = scene.what.bleaching if isinstance(scene.what, Scene) else NO_BLEACHING
+    return optics if bleaching.is_none else optics | {"simulated_bleaching": bleaching.words()}
+
+
+def _image_facts(scene: SceneFile) -> dict[str, Any]:
+    """Return what WELCOME says of the scene's images; a target has any size, and what moves has its own."""
+    if isinstance(scene.what, Tape):
+        return {}
+    if not isinstance(scene.what, Scene):
+        return scene_facts(None, scene.what.objects.classes)
+    height, width = scene.what.images.shape[1:]
+    return scene_facts(None if (height, width) == (1, 1) else (height, width), scene.what.classes)

@@ -1,0 +1,159 @@
+"""Photon numbers on the wire: golden bytes of the document, bounds, and what a device announces."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tree import ROOT
+
+from pans.runtime.wire import FrameDecoder, MalformedMessage, MessageType, StreamTracker
+from pans.runtime.wire.counts import (
+    CountStateChunk,
+    announced_counts,
+    count_announcement,
+    count_state_chunks,
+    decode_counts,
+    encode_counts,
+    pack_count_states,
+    pack_read_counts,
+    state_dtype,
+    unpack_count_states,
+    unpack_read_counts,
+)
+from pans.runtime.wire.messages import ClickBlock, unpack_body
+from pans.runtime.wire.session import STREAM_TYPES
+
+PROTOCOL = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
+SECTION = PROTOCOL.partition("## 13. Photon numbers")[2]
+SCHEMA_1 = 0x2E64AFC4
+BLOCK = ClickBlock(
+    0, 0, 1000, 0, 100, 0, np.array([0, 2, 0xFFFF], np.uint16), np.array([0, 2, 1], np.uint8), 2
+)  # the document's
+
+
+def by_hand(numbers: list[int], largest: int, stamps: list[int]) -> bytes:
+    """The payload as the document's table has it."""
+    head = struct.pack("<IIQQIHHI", 7, 1, 5000, 40, 100, len(numbers), largest, 3)
+    return head + struct.pack(f"<{len(stamps)}H", *stamps) + bytes(numbers)
+
+
+def test_the_worked_example_of_the_document() -> None:
+    golden = bytes.fromhex(re.search(r"`(02 93 01[^`]+)`", SECTION)[1])  # type: ignore[index]
+    assert encode_counts(BLOCK, 0x11223344) == golden
+    (frame,) = FrameDecoder().feed(golden)
+    assert (frame.type, frame.session) == (MessageType.COUNTS, 0x11223344)
+    found = decode_counts(frame.payload)
+    assert (found.patterns.tolist(), found.bits.tolist(), found.largest) == ([0, 2, 0xFFFF], [0, 2, 1], 2)
+    assert found[:6] == BLOCK[:6]
+
+
+def test_the_frame_is_that_of_version_1() -> None:
+    """Header, payload and a CRC from the schema of version 1, undone by hand."""
+    sent = encode_counts(BLOCK, 0x11223344)
+    body, at = bytearray(), 0
+    while at < len(sent) - 1:
+        code = sent[at]
+        body += sent[at + 1 : at + code] + (b"\0" if code < 255 else b"")
+        at += code
+    body = body[:-1]
+    assert body[:8] == struct.pack("<BBHI", 0x93, 0, 0, 0x11223344)
+    assert struct.unpack("<I", body[-4:])[0] == zlib.crc32(body[:-4], SCHEMA_1)
+
+
+@given(
+    st.integers(2, 15).flatmap(
+        lambda largest: st.tuples(
+            st.just(largest), st.lists(st.tuples(st.integers(0, largest), st.integers(0, 65535)), min_size=1)
+        )
+    )
+)
+def test_what_is_packed_by_hand_is_decoded(drawn: tuple[int, list[tuple[int, int]]]) -> None:
+    largest, pairs = drawn
+    numbers, stamps = [number for number, _ in pairs], [stamp for _, stamp in pairs]
+    found = decode_counts(by_hand(numbers, largest, stamps))
+    assert (found.seq, found.drops, found.tick, found.exposure_index, found.period_ticks) == (7, 1, 5000, 40, 100)
+    assert (found.object_index, found.largest) == (3, largest)
+    assert (found.bits.tolist(), found.patterns.tolist()) == (numbers, stamps)
+    assert (found.bits.dtype, found.patterns.dtype) == (np.uint8, np.uint16)
+    assert found.bits.flags.writeable
+    (frame,) = FrameDecoder().feed(encode_counts(found, 5))
+    assert frame.payload == by_hand(numbers, largest, stamps)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        by_hand([0, 3], 2, [0, 0]),  # above the block's largest
+        by_hand([0, 255], 15, [0, 0]),
+        by_hand([0, 1], 1, [0, 0]),  # clicks are CLICKS
+        by_hand([0, 1], 16, [0, 0]),
+        by_hand([], 2, []),
+        by_hand([0, 1], 2, [0, 0])[:-1],
+        by_hand([0, 1], 2, [0, 0]) + b"\0",
+        by_hand([0, 1], 2, [0, 0])[:20],
+        b"",
+    ],
+)
+def test_what_cannot_be_meant_is_malformed_and_counted(payload: bytes) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_counts(payload)
+    tracker = StreamTracker()
+    assert tracker.accept(unpack_body(struct.pack("<BBHI", 0x93, 0, 0, 1) + payload)) == (None, None)
+    assert tracker.counters.malformed == 1
+
+
+def test_the_stream_accounts_for_numbers_as_for_clicks() -> None:
+    tracker = StreamTracker()
+
+    def frame(seq: int, first: int, drops: int) -> bytes:
+        return encode_counts(BLOCK._replace(seq=seq, exposure_index=first, drops=drops), 1)
+
+    sent = FrameDecoder().feed(frame(0, 0, 0) + frame(2, 8, 2) + frame(2, 8, 2))
+    _, none = tracker.accept(sent[0])
+    assert none is None
+    _, gap = tracker.accept(sent[1])
+    assert gap is not None
+    assert gap == (3, 5, 1, 2)
+    assert tracker.accept(sent[2]) == (None, None)
+    counters = tracker.counters
+    assert (counters.exposures, counters.lost_exposures, counters.repeated, counters.device_drops) == (6, 5, 1, 2)
+    assert int(MessageType.COUNTS) in STREAM_TYPES
+
+
+def test_commands_by_hand() -> None:
+    assert pack_read_counts(5) == b"\5\0\0\0"
+    assert unpack_read_counts(b"\5\0\0\0") == 5
+    with pytest.raises(MalformedMessage):
+        unpack_read_counts(b"\5\0\0")
+    rows = np.zeros(2, state_dtype(3))
+    rows["pattern"], rows["dwell"], rows["next"] = (0, 7), (4, 1), ((1, 2, 3), (2, 3, 4))
+    body = pack_count_states(CountStateChunk(2, 0, 4, 3, 3, rows))
+    wanted = struct.pack("<HHHHI", 2, 0, 4, 3, 3) + struct.pack("<HHIII", 0, 4, 1, 2, 3)
+    assert body == wanted + struct.pack("<HHIII", 7, 1, 2, 3, 4)
+    found = unpack_count_states(body)
+    assert found[:5] == (2, 0, 4, 3, 3)
+    assert found.states["next"].tolist() == [[1, 2, 3], [2, 3, 4]]
+    for wrong in (body[:-1], body[:12], body + bytes(16), b"", struct.pack("<HHHHI", 2, 0, 4, 2, 3) + bytes(24)):
+        with pytest.raises(MalformedMessage):
+            unpack_count_states(wrong)
+
+
+def test_states_are_cut_and_joined() -> None:
+    rows = np.zeros(2000, state_dtype(16))
+    rows["next"] = np.arange(2000 * 16).reshape(2000, 16)
+    chunks = [unpack_count_states(pack_count_states(one)) for one in count_state_chunks((2000, 4, 16, 5), rows)]
+    assert len(chunks) > 10
+    assert [one.first_state for one in chunks] == list(np.cumsum([0, *(len(one.states) for one in chunks[:-1])]))
+    assert np.array_equal(np.concatenate([one.states for one in chunks]), rows)
+
+
+def test_what_a_device_announces() -> None:
+    assert announced_counts(count_announcement(15)) == 15
+    assert announced_counts({}) == announced_counts({"photon_number_max": 15}) == 1
+    assert announced_counts({"photon_number_max": 15, "count_schema": 0xEEF01CE0}) == 1
