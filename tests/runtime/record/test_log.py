@@ -183,7 +183,7 @@ def test_exposures_of_walks_stand_in_a_recording_of_their_version_and_cost_other
         assert found.decisions_sha256 == decision_log_sha256(rows) != plain
 
 
-@pytest.mark.parametrize("version", [1, 6])
+@pytest.mark.parametrize("version", [1, 7])
 def test_a_recording_of_another_version_is_refused(tmp_path: Path, version: int) -> None:
     start = b"PANSRECD" + struct.pack("<I", version)
     (tmp_path / "a.pansrec").write_bytes(start + struct.pack("<I", zlib.crc32(start)))
