@@ -8,11 +8,10 @@ window_kernels.py's. Never allocates.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.bare import bare, load4, load8
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
@@ -37,7 +36,7 @@ SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byt
 ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
 
 
-@njit(cache=True, nogil=True)
+@outer
 def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
     """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
 

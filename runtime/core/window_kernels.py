@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import DARK_PATTERN
 
 DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
@@ -61,7 +60,7 @@ class WindowArrays(NamedTuple):
     bits: npt.NDArray[np.uint8]
 
 
-@njit(cache=True, nogil=True)
+@outer
 def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
     """Add exposures `relative`... of a visit to its windows; see tests/naive_window.py for the meaning in plain loops.
 
@@ -87,7 +86,7 @@ def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen,
             seen[window, 1] += 1
 
 
-@njit(cache=True, nogil=True)
+@outer
 def add_frames(relative, words, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
     """Add frames of all channels `relative`... of a visit: words uint8 (n, bytes), bit c of a word is channel c.
 
@@ -107,7 +106,7 @@ def add_frames(relative, words, window_at, counts, seen, tallies):  # type: igno
             seen[window, 0] += n_features
 
 
-@njit(cache=True, nogil=True)
+@outer
 def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # type: ignore[no-untyped-def]
     """Follow the walks of a visit through exposures `relative`...; tests/oracles/naive_window.py has the meaning in plain loops.
 

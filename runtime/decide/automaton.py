@@ -9,18 +9,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.automaton import Automaton, stopped
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.walks import log_scores
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
+from pans.runtime.wire.inner import outer
 
 from .verdict import NO_LABEL, Verdict, Verdicts, checked_counts, demand_golden
 
 
-@njit(cache=True, nogil=True)
+@outer
 def walk_words(
     successors: NDArray[np.uint32],
     words: NDArray[Any],
@@ -50,7 +50,7 @@ def walk_words(
     return -1
 
 
-@njit(cache=True, nogil=True)
+@outer
 def walk_counts(
     successors: NDArray[np.uint32], words: NDArray[Any], leaves: NDArray[np.uint32], exposures: NDArray[np.uint16]
 ) -> int:

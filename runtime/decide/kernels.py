@@ -16,14 +16,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 STEP = 8  # rows of the first matrix taken at once
 _U = np.uint64  # unsigned indices: a signed one is tested for being negative, and then nothing is vectorised
 LANES = 16  # hidden widths are padded to it: one vector of float32 or int32 at most
 
 
-@njit(cache=True, nogil=True)
+@outer
 def label_words(labels: NDArray[Any], words: NDArray[Any], out: NDArray[Any]) -> int:
     """Write labels[words[i]] to out[i]; return -1, or the first i whose word is beyond the table (the rest is untouched).
 
@@ -166,7 +166,7 @@ def float_scores(counts, i, shots, meta, numbers, work, rows):  # type: ignore[n
     return source
 
 
-@njit(cache=True, nogil=True)
+@outer
 def winner(rows, i, n_classes):  # type: ignore[no-untyped-def]
     """Label and softmax probability of the scores rows[i], as verdict.softmax_winner; probability 0.0 if not finite."""
     label, best = 0, np.float64(rows[i, 0])
@@ -184,7 +184,7 @@ def winner(rows, i, n_classes):  # type: ignore[no-untyped-def]
     return label, 1.0 / total
 
 
-@njit(cache=True, nogil=True)
+@outer
 def float_run(counts, shots, meta, numbers, room, scores, labels, probabilities):  # type: ignore[no-untyped-def]
     """Decide many objects or one: counts int64 (n, d_f) -> scores float32 (n, classes), labels uint16 (n,), probabilities float32 (n,).
 
@@ -251,7 +251,7 @@ def int8_scores(counts, i, shots, meta, numbers, room, scores):  # type: ignore[
         scores[i, k] = np.float32(sums[k]) * (affine[0, column + k] * unit) + affine[1, column + k]
 
 
-@njit(cache=True, nogil=True)
+@outer
 def int8_run(counts, shots, meta, numbers, room, scores, labels, probabilities):  # type: ignore[no-untyped-def]
     """As `float_run`, with the quantised head; `numbers` is (weights int8, affine), `room` (work int32, rows, hidden)."""
     n_classes = scores.shape[1]

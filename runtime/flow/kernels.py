@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numba
 
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 # state, int64 (N_STATE,)
 (
@@ -58,7 +58,7 @@ def _tally(word, channels):  # type: ignore[no-untyped-def]
         channel += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def put_frames(frames, first, words, counts, dark_cycle, state, dark_channels, channel_mask):  # type: ignore[no-untyped-def]
     """Put frames uint8 (n, bytes), the first one exposure number `first`, into the ring.
 
@@ -80,7 +80,7 @@ def put_frames(frames, first, words, counts, dark_cycle, state, dark_channels, c
             words[slot], counts[slot] = word, popcount(word)
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def skip_frames(first, stop, words, counts, state):  # type: ignore[no-untyped-def]
     """Say that exposures `first`..`stop` - 1 never came: the windows start afresh, an open passage is broken."""
     mask = len(words) - 1
@@ -106,7 +106,7 @@ def _close(state, limits, last, release, flags, row):  # type: ignore[no-untyped
     state[HOLD] = release + 1 + limits[REFRACTORY]
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def scan(stop, words, counts, limits, state, empty_channels, out):  # type: ignore[no-untyped-def]
     """Follow the click sums over exposures state[NEXT]..stop - 1, which are in the ring; return the number of passages in `out`.
 
@@ -161,7 +161,7 @@ def scan(stop, words, counts, limits, state, empty_channels, out):  # type: igno
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def has_two_maxima(counts, first, last, span, sigma2):  # type: ignore[no-untyped-def]
     """Whether the sums over `span` frames between `first` and `last` dip between two maxima by more than chance.
 
@@ -186,7 +186,7 @@ def has_two_maxima(counts, first, last, span, sigma2):  # type: ignore[no-untype
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def window_clicks(words, counts, first, shots, out):  # type: ignore[no-untyped-def]
     """Sum the clicks per channel of `shots` frames from exposure `first` on, int64 (d_f,); return how many of them are no light frames."""
     mask = len(words) - 1
@@ -198,7 +198,7 @@ def window_clicks(words, counts, first, shots, out):  # type: ignore[no-untyped-
     return unlit
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def count_edges(words, counts, before, start, frames, out):  # type: ignore[no-untyped-def]
     """Which bars change between the windows of `frames` exposures from `before` and from `start` on, and what was lit between them.
 
@@ -221,7 +221,7 @@ def count_edges(words, counts, before, start, frames, out):  # type: ignore[no-u
         out[4] += counts[exposure & mask] < 0
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def total_clicks(counts, first, stop):  # type: ignore[no-untyped-def]
     """Clicks of all channels in the light frames from exposure `first` to `stop` - 1."""
     mask = len(counts) - 1

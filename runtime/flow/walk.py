@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.bare import load4, load8
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import NO_OBJECT
 
 from .kernels import EMPTY_FRAMES, NEXT, put_frames, scan
@@ -52,7 +51,7 @@ class NewMarks(NamedTuple):
     photons: npt.NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
+@outer
 def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type: ignore[no-untyped-def]
     """Take messages from `place` on; return how many, 0 when that one is not ordinary.
 

@@ -16,12 +16,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.wire.frame import read_only
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 from .cusum_design import RATE_MAX, CusumDesign, design_cusum
 
@@ -287,7 +286,7 @@ def _click(state, row, trial, trials, zero, clicks, alarms, n):  # type: ignore[
 # what other calls hand over as a variable is made one.
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def take_words(words, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
     """Take exposures `first`..., words uint8 (n, bytes); returns the number of alarms. Rows 2c and 2c+1 of `state` are channel c's tests,
     the others the pool's, whose trials are counted channel by channel. clicks int64 (channels,) are totals, updated."""
@@ -322,7 +321,7 @@ def take_words(words, first, clicks, state, channel_of, zero, alarms):  # type: 
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def take_counts(exposures, block, first, clicks, state, channel_of, zero, alarms):  # type: ignore[no-untyped-def]
     """Take a block of counts, int64 (channels,), as one step of every sum; returns the number of alarms."""
     channels, found, total = clicks.size, np.int64(0), np.int64(0)

@@ -15,8 +15,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+
+from pans.runtime.wire.inner import outer
 
 RATE_MIN, RATE_MAX = 1e-12, 0.5
 FINE_RATE = 1e-3  # rarer clicks are designed at this rate and scaled: the Poisson limit, right to about the rate itself
@@ -149,7 +150,7 @@ def _threshold(rate: float, click: int, silent: int, arl: float) -> int:
     return high
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def _cycle(up_rate, up, down, alarm, length, tolerance, sweeps_max):  # type: ignore[no-untyped-def]
     """Return (probability of an alarm, mean length) of one cycle from 0, by Gauss-Seidel sweeps along the frequent step.
 

@@ -22,13 +22,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.wire.frame import read_only
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 from .cusum import FLOOR_RATE
 
@@ -230,7 +229,7 @@ def silence_limit(rate: float, n_channels: int, arl: float) -> int:
     return max(1, math.ceil(min(needed, float(_NEVER))))
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def note_silence(words, silent, clicking, limits):  # type: ignore[no-untyped-def]
     """Add a block's exposures to the silences: words uint8 (n, bytes), the rest int64 (channels,); return whether one passes its limit.
 
@@ -259,7 +258,7 @@ def note_seen(seen, byte, exposures, silent, clicking, limits):  # type: ignore[
     return passed
 
 
-@numba.njit(cache=True, nogil=True)
+@outer
 def note_object(row, clicked, quiet, then, compared, first, due):  # type: ignore[no-untyped-def]
     """Add one object, row int64 (channels,) of 0 or 1, to the shares; return whether a channel is due to be looked at.
 

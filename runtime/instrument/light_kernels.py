@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 # counts, int64 (N_COUNTS,): LightWatch's own, by their names there; decisions, batches and clicks when each sum last was 0
 DECISIONS, CLICKS, IN_BATCH, N, SUM, SQUARES, BATCHES, TOTAL, FALL, RISE, BATCH, N_COUNTS = *range(9), 11, 14, 15
@@ -20,7 +19,7 @@ LOW, HIGH, MEAN, SLACK, THRESHOLD, ERROR, LEAST, MOST, N_LEVELS = range(9)
 ALL_TAKEN, LEARNT, FELL, ROSE = range(4)  # why a call ended
 
 
-@njit(cache=True, nogil=True)
+@outer
 def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
     """Take decisions from `first` on, but those with one of the flags `left_out`; return where it ended, behind which, and why.
 

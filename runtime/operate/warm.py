@@ -74,7 +74,7 @@ def _compile_steps(name: str, profile: str) -> Core:
 
 
 def compile_link() -> None:
-    """Decoding, the decision log, the watch over dark counts, the core that is kept awake."""
+    """Decoding, the decision log, the watch over dark counts, the sums of a run, the core that is kept awake."""
     import numpy as np
 
     from pans.runtime.instrument.cusum import ChannelWatch
@@ -87,11 +87,36 @@ def compile_link() -> None:
     rates = np.full(1, 0.01)
     ChannelWatch(1, rates).warm_up()
     DeadChannelTest(rates, 1e9, 1e9).warm_up()
+    _compile_settling()
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "warm.pansrec", {}) as recorder:
         recorder.close({})
     if hasattr(os, "sched_getaffinity"):
         with busy_core(usable_cores()[0]):
             pass
+
+
+def _compile_settling() -> None:
+    """What is done with what a call of the compiled turn has brought."""
+    import numpy as np
+
+    from pans.runtime.core.decision import DECISION_DTYPE
+    from pans.runtime.core.stream_arrays import MarkArrays
+    from pans.runtime.instrument.light_level import LightWatch
+    from pans.runtime.live.tally import RunTally
+    from pans.runtime.record.format import TIMING_RUN_DTYPE
+    from pans.runtime.timing.ledger import TimingLedger
+    from pans.runtime.turn import rings, settling
+    from pans.runtime.turn.kernels import unpack_blocks
+
+    rows, whole, real = np.zeros(0, DECISION_DTYPE), np.zeros(2, np.int64), np.zeros(2)
+    LightWatch().take_many(rows, 0)
+    RunTally(2, 1).warm_up(MarkArrays(whole, np.zeros(2, np.int16), np.zeros(2, np.float32)), 1)
+    histograms = tuple(histogram.numbers for histogram in TimingLedger(1).histograms)
+    judged, marked = np.zeros(settling.N_JUDGED, np.int64), np.zeros((1, settling.N_MARKED), np.int64)
+    lines = (whole, real), (whole, real)
+    blocks, runs = np.zeros((0, rings.N_STEP), np.int64), np.zeros(1, TIMING_RUN_DTYPE)
+    settling.judge_blocks(blocks, rows, *lines, 1, histograms, judged, runs, marked)
+    unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
 
 
 def compile_flow() -> None:

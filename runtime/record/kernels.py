@@ -6,10 +6,9 @@ Owns the loops over rows and bytes; what its output means is told in log.py, whi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pans.runtime.wire.bare import copy_span
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
@@ -27,7 +26,7 @@ _LONG, _RUN_MAX = _U(LONG_VERDICT), _U(RUN_ROWS_MAX)
 _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spreads keys over slots
 
 
-@njit(cache=True, nogil=True)
+@outer
 def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
     """Encode rows, DECISION_DTYPE (n,), behind those before; return how many runs and how many verdicts were written.
 
@@ -146,7 +145,7 @@ def _keep(row, verdict):  # type: ignore[no-untyped-def]
     verdict["counts_crc"] = row["counts_crc"]
 
 
-@njit(cache=True, nogil=True)
+@outer
 def message_spans(payload, at, spans):  # type: ignore[no-untyped-def]
     """Find the bodies of a block of messages from byte `at` on; put where they begin and end into spans int64 (n, 2).
 
@@ -166,7 +165,7 @@ def message_spans(payload, at, spans):  # type: ignore[no-untyped-def]
     return n, at
 
 
-@njit(cache=True, nogil=True)
+@outer
 def pack_messages(buffer, spans, first, stop, host_ns, out, used):  # type: ignore[no-untyped-def]
     """Put the bodies at spans[first:stop] of `buffer` behind out[:used], each with `host_ns` and its length (record_format.MESSAGE).
 
@@ -181,7 +180,7 @@ def pack_messages(buffer, spans, first, stop, host_ns, out, used):  # type: igno
     return first, used
 
 
-@njit(cache=True, nogil=True)
+@outer
 def pack_stamped(buffer, spans, first, out, used):  # type: ignore[no-untyped-def]
     """As `pack_messages`, from `first` on, with a time for each: spans int64 (n, 4) of begin, end, time in ns, and what does not matter."""
     while first < spans.shape[0]:

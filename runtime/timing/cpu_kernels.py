@@ -9,8 +9,10 @@ import platform
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from pans.runtime.wire.inner import outer
 
 ENDED, SPINS = 0, 1  # places in the state of a spin
 _X86 = platform.machine() in ("x86_64", "AMD64")
@@ -31,7 +33,7 @@ def _pause(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-@njit(cache=True, nogil=True)
+@outer
 def spin(state):  # type: ignore[no-untyped-def]
     """Wait until state[ENDED], int64, is not 0; state[SPINS] is 1 from the beginning on."""
     state[SPINS] = 1

@@ -7,14 +7,13 @@ It goes on by itself with all that is ordinary; what is not it leaves, untouched
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pans.runtime.core import stream_kernels as core
 from pans.runtime.timing.evidence import OVERSLEPT_NS
 from pans.runtime.wire import kernels as wire
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.bare import bare, copy_span, load4
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
 from . import rings as ring
@@ -26,9 +25,10 @@ LEAST_WAIT_NS = 200_000
 QUIET_NS = 5_000_000
 _ACK = int(MessageType.ACK)
 _U = np.uint64
+_LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers are types of their own to the compiler
 
 
-@njit(cache=True, nogil=True)
+@outer
 def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
 
@@ -138,7 +138,7 @@ def _make_room(decoder):  # type: ignore[no-untyped-def]
 def _decode(decoder, control, held, found):  # type: ignore[no-untyped-def]
     """Decode `found` new bytes behind `held` ones."""
     tally, used = decoder.tally, held + found
-    control[ring.N_BODIES] = wire.unstuff_frames(decoder.buffer, used, MAX_FRAME_BYTES, SCHEMA, decoder.bodies, tally)
+    control[ring.N_BODIES] = wire.unstuff_frames(decoder.buffer, used, _LIMIT, _SCHEMA, decoder.bodies, tally)
     control[ring.PLACE] = 0
     tally[wire.HELD] = used - tally[wire.CONSUMED]
     tally[wire.BYTES_IN] += found
@@ -260,7 +260,7 @@ def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # typ
     control[ring.BLOCK_NS] = control[ring.ARRIVAL_NS]
 
 
-@njit(cache=True, nogil=True)
+@outer
 def unpack_blocks(kept, messages, stamps, bits):  # type: ignore[no-untyped-def]
     """Put the patterns shown and the clicks of all CLICKS among `messages` behind one another; return how many exposures fitted.
 

@@ -7,13 +7,12 @@ the sums and their meaning. Never allocates.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
 from pans.runtime.core.stream_kernels import MARK_SLOTS
 from pans.runtime.timing.clock import LARGEST_NS, STEP_MARGIN_NS
 from pans.runtime.timing.ledger import SUB_BITS
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 from . import rings as ring
 
@@ -29,7 +28,7 @@ _ABSTAINED, _AMBIGUOUS = np.uint32(DecisionFlag.ABSTAINED), np.uint32(DecisionFl
 _NO_LABEL = NO_LABEL
 
 
-@njit(cache=True, nogil=True)
+@outer
 def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objects):  # type: ignore[no-untyped-def]
     """Add rows, DECISION_DTYPE (n,), to what decisions add up to; return how many runs of one object they were.
 
@@ -75,7 +74,7 @@ def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objec
     return n_objects
 
 
-@njit(cache=True, nogil=True)
+@outer
 def judge_blocks(steps, rows, fit, anchors, deadline_ns, histograms, judged, runs, marked):  # type: ignore[no-untyped-def]
     """Judge the times of the decisions of many blocks, `steps` int64 (n, N_STEP); return how many runs and how many marked blocks.
 

@@ -7,7 +7,6 @@ of an acknowledgement in wire/session.py. Never allocates.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from pans.runtime.core import stream_kernels as core
 from pans.runtime.wire import walk as stream
@@ -80,7 +79,7 @@ def put_show(drive, number, exposure, state, out, at):  # type: ignore[no-untype
     return at + 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Name what follows the exposures taken, unless that has been said; False when it could not be sent whole."""
     exposure, state = following(walk, drive)
@@ -124,7 +123,7 @@ def _send(control, data, begin, end, scratch):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@inner
 def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
     """Account for an acknowledgement that answers the oldest command, and say whether it is done or refused; else IS_ODD, and nothing done.
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba import njit, types
+from numba import types
 
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 
 # perf_counter_ns, which stamps everything else, reads the same clock: CLOCK_MONOTONIC, on macOS CLOCK_UPTIME_RAW
 _CLOCK = np.int32(8 if sys.platform == "darwin" else 1)
@@ -39,7 +39,7 @@ if numba.config.DISABLE_JIT:
 
 elif sys.platform not in ("linux", "darwin"):
 
-    @njit(cache=True, nogil=True)
+    @outer
     def now_ns(scratch):  # type: ignore[no-untyped-def]
         """No clock: whoever feeds a turn stamps what it took."""
         return np.int64(0)
@@ -71,7 +71,7 @@ else:
         _ppoll = types.ExternalFunction("ppoll", types.int32(types.intp, types.uintp, types.intp, types.intp))
     _DARWIN = sys.platform == "darwin"
 
-    @njit(cache=True, nogil=True)
+    @outer
     def now_ns(scratch):  # type: ignore[no-untyped-def]
         """The host's clock in ns; scratch int64 (4,) is overwritten from place 2 on."""
         _clock_gettime(_CLOCK, scratch.ctypes.data + 16)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from pans.runtime.core.still import Core
 from pans.runtime.instrument.channel_health import Finding
@@ -19,7 +18,7 @@ from pans.runtime.instrument.dead_channels import DeadArrays, note_object, note_
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.bare import bare, load4, load8
 from pans.runtime.wire.frame import read_only
-from pans.runtime.wire.inner import inner
+from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.messages import FrameBlock, decode_frames
 from pans.runtime.wire.schema import HEADER, NO_OBJECT
 
@@ -110,7 +109,7 @@ def _block_of(kept: U8, span: npt.NDArray[Any]) -> FrameBlock:
     return decode_frames(kept[int(span[ring.BEGIN]) + HEADER.size : int(span[ring.END])].tobytes())
 
 
-@njit(cache=True, nogil=True)
+@outer
 def watch_frames(kept, messages, first, maps, scratch, watch, dead, place):  # type: ignore[no-untyped-def]
     """Let the tests see the FRAMES among `messages` from `first` on, until one tells something; return its place and why.
 

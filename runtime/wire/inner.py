@@ -1,9 +1,10 @@
-"""Kernels that kernels alone call, compiled without what only a call from Python needs.
+"""How kernels are compiled: those that Python calls, and those that kernels alone call, without what only a call from Python needs.
 
-Owns `inner`, the decorator, and what the compiler is told for it. By itself numba optimises each kernel, makes machine code of it and adds
-two ways in from Python, and does all of it again, inlined, in every kernel that calls it. Of an inner kernel the callers want the code
-before all that. It is kept in no cache either: where its callers are loaded from theirs, nobody asks for it. And it is inlined wherever it
-is called: a call hands over each number of each array by itself, and a turn has some forty arrays.
+Owns the decorators `outer` and `inner`, and what the compiler is told for them. Neither kind may allocate, so that references need no
+counting. By itself numba optimises each kernel, makes machine code of it and adds two ways in from Python, and does all of it again,
+inlined, in every kernel that calls it. Of an inner kernel the callers want the code before all that. It is kept in no cache either: where
+its callers are loaded from theirs, nobody asks for it. And it is inlined wherever it is called: a call hands over each number of each
+array by itself, and a turn has some forty arrays.
 
 What is left out here is numba's own, which has no option for it: other versions of numba than those it was tried with compile inner
 kernels like all others, which takes longer and gives the same results.
@@ -12,20 +13,29 @@ kernels like all others, which takes longer and gives the same results.
 from __future__ import annotations
 
 import ctypes
+import gc
 from typing import Any
 
 import numba
-from numba import njit
+from numba import njit, types
+from numba.core import event
 
 TRIED = ((0, 68),)  # versions of numba
 
 
-def inner(function: Any) -> Any:
-    """Return `function` as a kernel for other kernels to call; to call it from Python is a TypeError."""
+def outer(function: Any) -> Any:
+    """Return `function` as a kernel for Python and for other kernels to call; it must not allocate."""
     if numba.version_info.short not in TRIED:
         return njit(cache=True, nogil=True)(function)
-    options = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True, "pipeline_class": _compiler()}
-    return njit(nogil=True, **options)(function)
+    return njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)(function)
+
+
+def inner(function: Any) -> Any:
+    """Return `function` as a kernel for other kernels to call, which must not allocate; to call it from Python is a TypeError."""
+    if numba.version_info.short not in TRIED:
+        return njit(cache=True, nogil=True)(function)
+    options = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _compiler()}
+    return njit(nogil=True, _nrt=False, **options)(function)
 
 
 _made: list[Any] = []
@@ -67,6 +77,7 @@ def _compiler() -> Any:
 
             def run_pass(self, state: Any) -> bool:
                 state.library = Kept(state.targetctx.codegen(), state.func_id.func_qualname)
+                state.flags.forceinline = any(isinstance(kind, types.BaseTuple) for kind in state.args)
                 return True
 
         class Compiler(CompilerBase):  # type: ignore[misc]
@@ -86,3 +97,24 @@ class _NoEnvironment:
     @staticmethod
     def set_env(name: str, environment: Any) -> None:
         pass
+
+
+class _Uncollected(event.Listener):  # type: ignore[misc]
+    """Keeps the collector off while a kernel is compiled: what the compiler makes lives to its end, and to look at it took a quarter."""
+
+    def __init__(self) -> None:
+        self._depth, self._was_on = 0, False
+
+    def on_start(self, event: Any) -> None:
+        if self._depth == 0:
+            self._was_on = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0 and self._was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _Uncollected())

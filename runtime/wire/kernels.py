@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from .bare import copy_span, load4, load8
-from .inner import inner
+from .inner import inner, outer
 from .schema import MessageType
 
 FRAMES, CRC_ERRORS, COBS_ERRORS, SHORT_FRAMES, OVERSIZED, DISCARDED, SKIPPING, CONSUMED, HELD, BYTES_IN, N_TALLIES = (
@@ -44,7 +43,7 @@ def _crc_tables() -> npt.NDArray[np.uint32]:
 CRC_TABLES = _crc_tables()
 
 
-@njit(cache=True, nogil=True)
+@inner
 def crc32_span(data, start, stop, seed):  # type: ignore[no-untyped-def]
     """CRC-32 of data[start:stop], uint8, continued from `seed`, as zlib.crc32 gives it; a uint64 below 2^32.
 
@@ -81,7 +80,7 @@ def crc32_span(data, start, stop, seed):  # type: ignore[no-untyped-def]
     return crc ^ _LOW32
 
 
-@njit(cache=True, nogil=True)
+@inner
 def find_zero(data, start, stop):  # type: ignore[no-untyped-def]
     """First position in start..stop-1 whose byte is 0, or `stop`; all uint64. Eight bytes a step."""
     i = start
@@ -168,7 +167,7 @@ def _move_down(data, source, end, out):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
+@outer
 def unstuff_frames(data, used, limit, schema, bodies, tally):  # type: ignore[no-untyped-def]
     """Decode every frame that ends within data[:used], in place; return how many bodies are good.
 
@@ -216,7 +215,7 @@ def unstuff_frames(data, used, limit, schema, bodies, tally):  # type: ignore[no
     return n_bodies
 
 
-@njit(cache=True, nogil=True)
+@outer
 def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-untyped-def]
     """Put `data` (bytes) behind what waits in `buffer`, decode as `unstuff_frames` does, and return how many bodies are good.
 
@@ -235,7 +234,7 @@ def take_in(data, buffer, limit, schema, bodies, tally):  # type: ignore[no-unty
     return n_bodies
 
 
-@njit(cache=True, nogil=True)
+@outer
 def stream_stop(buffer, spans, first, session):  # type: ignore[no-untyped-def]
     """Return the place of the first body from `first` on that is no CLICKS, FRAMES or MARK of `session`; len(spans) without one."""
     for place in range(first, spans.shape[0]):

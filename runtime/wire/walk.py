@@ -7,7 +7,6 @@ keeps no state of its own. A walk takes messages that are in order and without l
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from .bare import as_float32, load4, load8
 from .inner import inner
@@ -25,7 +24,7 @@ _MAGNITUDE = np.uint64(0x7FFFFFFF)
 _U = np.uint64
 
 
-@njit(cache=True, nogil=True)
+@inner
 def next_block(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     """Frames and bytes per frame of the FRAMES payload from `payload` to `stop`.
 
@@ -75,7 +74,7 @@ def _follows(buffer, payload, count, place):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def is_next_mark(buffer, payload, stop, place):  # type: ignore[no-untyped-def]
     """Whether the payload from `payload` to `stop` is a whole MARK, follows `place` without loss and holds what the dictionary allows.
 

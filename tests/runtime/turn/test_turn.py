@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from heads import head_bundle, random_layers
+from inner_kernels import called
 from plans import shot_major
 from streams import SESSION, click_frames
 from tree import ROOT
@@ -168,13 +169,14 @@ def streaming() -> tuple[StreamCore, list[bytes]]:
 
 def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
     """One late name must not make the next one late; any other refusal is Python's."""
+    taken = called(shows.take_ack)
     control = np.zeros(ring.N_CONTROL, np.int64)
     control[[ring.NEXT_ID, ring.OLDEST_ID, ring.N_SHOWS, ring.ARRIVAL_NS]] = 12, 9, 3, 55
 
     def told(last: int, refused: int, status: int, mask: int) -> int:
         frame = FrameDecoder().feed(encode_ack(Ack(last, refused, status, "late", mask), SESSION))[0]
         body = np.frombuffer(pack_body(frame), np.uint8).copy()
-        return int(shows.take_ack(body, np.uint64(0), np.uint64(len(body)), control))
+        return int(taken(body, np.uint64(0), np.uint64(len(body)), control))
 
     assert told(11, 11, 5, 1) == shows.IS_ODD  # three at once
     assert told(9, 9, 0, 1) == shows.IS_ODD  # without a reason
@@ -246,7 +248,7 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         turn.control[ring.FD], turn.control[ring.NEXT_ID], turn.control[ring.OLDEST_ID] = ours.fileno(), 5, 5
         steps.load()
         scratch = np.zeros(4, np.int64)
-        assert not shows.send_show(steps.walk, drive, turn.rings, turn.control, scratch)
+        assert not called(shows.send_show)(steps.walk, drive, turn.rings, turn.control, scratch)
         size = int(turn.rings.shows[0, ring.END])
         assert 0 < turn.control[ring.UNSENT] <= size
         frame = FrameDecoder().feed(turn.rings.kept[:size].tobytes())[0]

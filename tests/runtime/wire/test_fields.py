@@ -9,6 +9,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from inner_kernels import called
 from tree import ROOT
 
 from pans.runtime.wire import messages as wire
@@ -104,6 +105,9 @@ def test_fields_that_contradict_each_other_are_malformed(name: str, values: tupl
         decode(name, values)
 
 
+is_next_mark, next_block = called(walk.is_next_mark), called(walk.next_block)
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case[0]}.{case[2].name}")
 def test_the_kernels_take_nothing_that_the_decoders_refuse(case: tuple[str, int, Field]) -> None:
     name, place, field = case
@@ -117,9 +121,9 @@ def test_the_kernels_take_nothing_that_the_decoders_refuse(case: tuple[str, int,
         state[walk.NEXT_EXPOSURE], state[walk.END_EXPOSURE] = GOOD["FRAMES"][3], 1 << 62
         buffer = np.frombuffer(body + bytes(8), np.uint8).copy()
         if name == "MARK":
-            taken = bool(walk.is_next_mark(buffer, at, stop, state))
+            taken = bool(is_next_mark(buffer, at, stop, state))
         else:
-            taken = walk.next_block(buffer, at, stop, state)[0] > 0
+            taken = next_block(buffer, at, stop, state)[0] > 0
         if taken:
             decode(name, values)
 
