@@ -45,6 +45,13 @@ MEASURED = (
 
 FAMILY = "binary"  # of the page `compressive`
 FEATURES = (4, 16, 32, 64, 128, 256, 784)
+OTHERS = (  # patterns, convolutions before the hidden layer or none, epochs, numbers of patterns
+    ("gaussian", False, 15, (16, 64, 256)),
+    ("binning", False, 15, (16, 64, 256)),
+    ("binary", True, 5, (16, 64)),
+    ("gaussian", True, 5, (16, 64)),
+    ("binning", True, 5, (16, 64)),
+)
 PHOTONS = (10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 EPOCHS = 15
 TRIALS = 3
@@ -246,27 +253,37 @@ def _commands(curves: tuple[Curve, ...]) -> Table:
 
 def compressive_page(asked: Asked) -> Made:
     """Return one row per number of patterns, with its training on clean measurements and its cells."""
+    plain = [(FAMILY, False, EPOCHS, features) for features in FEATURES]
+    others = [(family, conv, epochs, features) for family, conv, epochs, each in OTHERS for features in each]
+    rows, more = _sensings(asked, plain), _sensings(asked, others)
+    pictures: dict[str, Draw] = {}
+    if rows:
+        pictures = {"": partial(images.sensing_map, rows=rows), "-training": partial(plots.sensing_training, rows=rows)}
+    return Made(rows + more, pictures)
+
+
+def _sensings(asked: Asked, wanted: list[tuple[str, bool, int, int]]) -> Rows:
+    """The rows of patterns, classifiers, epochs and numbers of patterns, as far as they are asked for and finished."""
     rows = []
-    for features in FEATURES:
+    for family, conv, epochs, features in wanted:
         if not asked.wants(features):
             continue
-        made_with = {"family": FAMILY, "features": features, "photons": PHOTONS, "epochs": EPOCHS, "trials": TRIALS}
-        path = asked.cache / f"compressive-{FAMILY}-{features}.json"
-        found = kept(path, made_with, partial(sensed, asked, features), collect=asked.collect)
+        made_with = {"family": family, "features": features, "photons": PHOTONS, "epochs": epochs, "trials": TRIALS}
+        made_with |= {"convolutions": True} if conv else {}
+        path = asked.cache / f"compressive-{family}{'-conv' if conv else ''}-{features}.json"
+        make = partial(sensed, asked, features, family, conv, epochs)
+        found = kept(path, made_with, make, collect=asked.collect)
         if found is None:
             asked.report(f"compressive: d_f = {features} is not measured yet: pans reproduce compressive")
         else:
             rows.append(found)
-    pictures: dict[str, Draw] = {}
-    if rows:
-        pictures = {"": partial(images.sensing_map, rows=rows), "-training": partial(plots.sensing_training, rows=rows)}
-    return Made(rows, pictures)
+    return rows
 
 
-def sensed(asked: Asked, features: int) -> Row:
+def sensed(asked: Asked, features: int, family: str, conv: bool, epochs: int) -> Row:
     """Train on clean measurements by that many patterns, and judge at every photon level."""
     task = load_task(TASK, asked.data_dir)
-    measurement = measure(task, patterns(FAMILY, features, task.image_shape, seed=0))
+    measurement = measure(task, patterns(family, features, task.image_shape, seed=0))
     clean = measurement.photoelectrons(measurement.test, 1.0)
     course: dict[str, list[float]] = {"loss": [], "training": [], "held_out": []}
 
@@ -275,22 +292,53 @@ def sensed(asked: Asked, features: int) -> Row:
         course["training"].append(round(100 * epoch.accuracy, 2))
         course["held_out"].append(round(100 * float((decide(clean) == measurement.test_labels).mean()), 2))
 
-    at = clean_mlp(measurement, seed=0, epochs=EPOCHS, watch=watch)
+    at = clean_mlp(measurement, seed=0, epochs=epochs, convolutions=conv, watch=watch)
     cells = []
     for photons in PHOTONS:
         done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=TRIALS, seed=0)
         cells.append({"photons_asked": photons, **asdict(done.measured()), FIRST: asdict(done.measured(FIRST_OBJECTS))})
-        asked.report(f"compressive, d_f = {features}, {photons:g} photons: {100 * cells[-1]['accuracy_mean']:.2f} %")
+        asked.report(
+            f"compressive, {family}, d_f = {features}, {photons:g} photons: {100 * cells[-1]['accuracy_mean']:.2f} %"
+        )
     return {"features": features, "epochs": course, "cells": cells}
 
 
 def compressive_tables(rows: Rows) -> list[Table]:
     """Return the trainings, and every cell."""
-    cells = [{"features": row["features"], **cell} for row in rows for cell in row["cells"]]
-    return [
-        Table(columns("sensing_training"), rows, "## Training on clean measurements"),
+    plain = [row for row in rows if _way(row) == _PLAIN]
+    cells = [{"features": row["features"], **cell} for row in plain for cell in row["cells"]]
+    found = [
+        Table(columns("sensing_training"), plain, "## Training on clean measurements"),
         Table(columns("sensing"), cells, "## Every cell"),
     ]
+    others = [_beside_plain(row, cell, plain) for row in rows if _way(row) != _PLAIN for cell in row["cells"]]
+    if others:
+        claims = [
+            claim(f"{way[0]}, {way[1]}", "random binary, one hidden layer", of_way)
+            for way in dict.fromkeys((row["family"], row["classifier"]) for row in others)
+            if (of_way := [row.get("beside") for row in others if (row["family"], row["classifier"]) == way])
+        ]
+        found.append(Table(columns("sensing_other"), others, "## Other patterns and another classifier", claims))
+    return found
+
+
+_PLAIN = (FAMILY, "one hidden layer")
+
+
+def _way(row: Row) -> tuple[str, str]:
+    made_with = row["made_with"]
+    return made_with["family"], "convolutions" if made_with.get("convolutions") else _PLAIN[1]
+
+
+def _beside_plain(row: Row, cell: Row, plain: Rows) -> Row:
+    """A cell of other patterns or another classifier, held against random binary patterns at the same number and photons."""
+    family, classifier = _way(row)
+    found = {"features": row["features"], "family": family, "classifier": classifier, **cell}
+    for other in (one for one in plain if one["features"] == row["features"]):
+        for there in (one for one in other["cells"] if one["photons_asked"] == cell["photons_asked"]):
+            figures = [100 * one[key] for key in ("accuracy_mean", "accuracy_se_objects") for one in (cell, there)]
+            found["beside"] = against(*figures)
+    return found
 
 
 PAGES = pages(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,11 @@ from torch import Tensor
 
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import replace_file
+from pans.trainer.baselines import strings
+from pans.trainer.baselines.bayes import bayes
+from pans.trainer.baselines.common import Decide, run_trials
+from pans.trainer.baselines.common import measure as measure_frames
+from pans.trainer.baselines.direct import clean_cnn
 from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
@@ -30,7 +36,7 @@ from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.ssim import ssim
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks import barcode as task_barcode
-from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.train.anomaly_search import search
 from pans.trainer.train.barcode_search import solve, solve_patterns
 from pans.trainer.train.data import CHUNK, encoder_input
@@ -38,13 +44,22 @@ from pans.trainer.train.loop import Trained, train
 from pans.trainer.verdicts import Claim, against, claim, sampling_error
 
 from . import images, plots
-from .page import Asked, Column, Draw, Made, Row, Rows, Table, check_cached_bundle, columns, finished, pages
+from .page import Asked, Column, Draw, Made, Row, Rows, Table, check_cached_bundle, columns, finished, kept, pages
+from .paradigms import accuracy_at
 from .passive_recipes import SEARCH_SIZE, TASKS, basis_of, load, recipe
 from .tables import PASSIVE, UNPRINTED, PassiveRow, PassiveTable, table_of
 
 PROFILE = "ideal"
 TRIALS = 5
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
+POSTERIOR, CLEAN = "posterior", "network of clean frames"
+STRING_LEVELS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 50.0)  # photons of direct imaging
+SPECKLE_LEVELS = (10.0, 30.0, 100.0, 300.0, 1000.0)
+CLEAN_EPOCHS = 2
+PRINTED = 0.005  # points: of two exact figures, those that differ by no printed digit are level
+FLOOR = (
+    5e-3  # of the mean light, by which the posterior lifts every pixel: the middle one of those that it may choose from
+)
 SPECKLE = ("mmf-mnist", "mmf-mnist-image")  # in the release's way: images that no instrument sees
 
 
@@ -222,7 +237,8 @@ def passive_page(asked: Asked) -> Made:
     pictures: dict[str, Draw] = {"": partial(plots.measure_over_patterns, name=name, rows=done)}
     if samples := samples_of(asked.cache, name, done):
         pictures["-pictures"] = partial(images.samples, name=name, cells=samples)
-    return Made(done + others, pictures)
+    direct = direct_rows(asked)
+    return Made([row | _beside_direct(name, row, direct) for row in done] + others + direct, pictures)
 
 
 def passive_tables(name: str, rows: Rows) -> list[Table]:
@@ -230,7 +246,8 @@ def passive_tables(name: str, rows: Rows) -> list[Table]:
     light = "passive_reaching" if any("reaching" in row for row in rows) else "passive"
     shown = columns("passive_ssim" if table_of(name).measure == "SSIM" else light)
     seeded = (*shown[:2], Column("data seed", "{data_seed}"), *shown[2:])
-    rows = [row | _beside(name, row) for row in rows]
+    direct = [row for row in rows if "way" in row]
+    rows = [row | _beside(name, row) for row in rows if "way" not in row]
     balanced = [row for row in rows if "balanced" in row]
     others = [row for row in rows if row.get("data_seed")]
     of_draw_0 = [row for row in rows if not row.get("data_seed")]
@@ -240,7 +257,7 @@ def passive_tables(name: str, rows: Rows) -> list[Table]:
     if balanced:
         claims = _claims([row["balanced"] for row in balanced])
         found.append(Table(columns("balanced"), balanced, "## Classes equally likely, without dark counts", claims))
-    return found
+    return found + _direct_tables(name, of_draw_0, direct)
 
 
 def _claims(rows: Rows) -> list[Claim]:
@@ -267,6 +284,99 @@ def _their_error(table: PassiveTable, value: float, row: Row) -> float:
     if table.measure == "SSIM":
         return float(row["error_objects"]) * (row["objects"] / table.objects) ** 0.5
     return sampling_error(value, table.objects)
+
+
+# ---- direct imaging (paper, Fig. 4E and 5B) ----
+
+
+def direct_rows(asked: Asked) -> Rows:
+    """Return one row per way and level of photons for the two tasks of which the paper draws direct imaging; none for others."""
+    if asked.name == "barcode":
+        shared = {"task": asked.name, "way": POSTERIOR, "error_objects": 0.0}
+        return [
+            shared
+            | {"dark": dark, "asked": n, "balanced": strings.at_photons(n, dark, "balanced")["value"]}
+            | strings.at_photons(n, dark)
+            for dark in table_of(asked.name).dark
+            for n in STRING_LEVELS
+        ]
+    if asked.name != "mmf-mnist":
+        return []
+    frames = _Once(lambda: measure_frames(load_task(asked.name, asked.data_dir), None))
+    network = _Once(lambda: clean_cnn(frames(), seed=0, epochs=CLEAN_EPOCHS))
+    rows = []
+    for way, how in ((POSTERIOR, {"floor": FLOOR}), (CLEAN, {"epochs": CLEAN_EPOCHS})):
+        for photons in SPECKLE_LEVELS:
+            path = asked.cache / f"mmf-mnist-direct-{way.split()[0]}-{photons:g}.json"
+            decide = partial(_posterior, frames, photons) if way == POSTERIOR else network
+            make = partial(_speckle, asked, frames, photons, way, decide)
+            found = kept(path, {"way": way, "photons": photons, **how}, make, collect=asked.collect)
+            if found is None:
+                asked.report(f"mmf-mnist: {way} at {photons:g} photons is not measured yet (pans reproduce mmf-mnist)")
+            else:
+                rows.append({key: value for key, value in found.items() if key != "made_with"})
+    return rows
+
+
+class _Once:
+    """What is made when it is first asked for."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make, self._made = make, None
+
+    def __call__(self) -> Any:
+        if self._made is None:
+            self._made = self._make()
+        return self._made
+
+
+def _posterior(frames: _Once, photons: float) -> Decide:
+    return bayes(frames(), photons, "counting", seed=0, floor=FLOOR)[0]
+
+
+def _speckle(asked: Asked, frames: _Once, photons: float, way: str, decide: Callable[[], Decide]) -> Row:
+    """A camera at the end of the fibre, ideal shot noise, all held-out digits once."""
+    done = run_trials(frames(), photons, "counting", decide(), trials=1, seed=0)
+    every, first = done.measured(), done.measured(200)
+    row = {"task": asked.name, "way": way, "dark": 0.0, "asked": photons, "value": 100 * every.accuracy_mean}
+    row |= {"first_200": 100 * first.accuracy_mean, "error_objects": 100 * every.accuracy_se_objects}
+    row |= {"clicks": every.clicks_mean, "photons": every.photons_mean, "illumination": 0.0}
+    asked.report(f"mmf-mnist, direct imaging, {way}, {photons:g} photons: {row['value']:.2f} %")
+    return row
+
+
+def _beside_direct(name: str, row: Row, direct: Rows) -> Row:
+    """Direct imaging with the photons of a row, and of barcodes with its clicks; nothing where none was measured there."""
+    if name == "barcode":
+        there = strings.at_photons(row["photons"], row["dark"])
+        found = {"photons": there | against(row["value"], there["value"], PRINTED)}
+        as_many = strings.at_clicks(row["clicks"], row["dark"])
+        return {
+            "direct": found
+            | ({"clicks": as_many | against(row["value"], as_many["value"], PRINTED)} if as_many else {})
+        }
+    exact = [one for one in direct if one["way"] == POSTERIOR]
+    value, error = (accuracy_at(exact, row["photons"], "photons", of) for of in ("value", "error_objects"))
+    if value is None or error is None:
+        return {}
+    clicks = accuracy_at(exact, row["photons"], "photons", "clicks")
+    compared = against(row["value"], value, row["error_objects"], error)
+    return {"direct": {"photons": {"value": value, "clicks": clicks} | compared}}
+
+
+def _direct_tables(name: str, rows: Rows, direct: Rows) -> list[Table]:
+    if not direct:
+        return []
+    beside = [row for row in rows if "direct" in row]
+    claims = [claim("Ours", "direct imaging at equal photons", [row["direct"]["photons"] for row in beside])]
+    if name == "barcode":
+        claims.append(claim("Ours", "direct imaging at equal clicks", [row["direct"].get("clicks") for row in beside]))
+    shown = columns("beside_direct_strings" if name == "barcode" else "beside_direct")
+    curve = columns("direct_strings" if name == "barcode" else "direct_frames_of_speckle")
+    return [
+        Table(shown, beside, "## Beside direct imaging", claims),
+        Table(curve, direct, "## Direct imaging"),
+    ]
 
 
 PAGES = pages({name: (passive_page, partial(passive_tables, name)) for name in (*PASSIVE, *UNPRINTED)})

@@ -224,6 +224,25 @@ def test_walsh_functions_are_orthogonal_and_ordered() -> None:
     assert walsh(28).shape == (32, 32)
 
 
+def test_bins_share_the_pixels_among_them() -> None:
+    found = patterns("binning", 6, (5, 7), 0).reshape(6, 5, 7)  # 2 x 3 blocks
+    assert np.array_equal(found.sum(axis=0), np.ones((5, 7)))
+    assert sorted(found.sum(axis=(1, 2))) == [4, 4, 6, 6, 6, 9]
+    assert found[0, :3, :3].all()
+    assert found[5, 3:, 5:].all()
+    assert np.array_equal(patterns("binning", 784, (28, 28), 0), np.eye(784))
+    with pytest.raises(ValueError, match="1 x 31 blocks"):
+        patterns("binning", 31, (28, 28), 0)
+
+
+def test_gaussian_patterns_are_the_sizes_of_normal_numbers() -> None:
+    found = patterns("gaussian", 200, (28, 28), 1)
+    assert found.min() >= 0
+    assert found.mean() == pytest.approx((2 / np.pi) ** 0.5, abs=0.01)
+    assert (found**2).mean() == pytest.approx(1, abs=0.02)
+    assert not np.array_equal(found, patterns("gaussian", 200, (28, 28), 2))
+
+
 def test_hadamard_patterns_are_two_dimensional_walsh_functions() -> None:
     every = patterns("hadamard", 64, (8, 8), 0)
     signs = 2 * every - 1
@@ -242,7 +261,7 @@ def test_random_patterns_are_fair_coins_of_their_seed() -> None:
     assert np.array_equal(found, patterns("binary", 50, (28, 28), 1))
     assert not np.array_equal(found, patterns("binary", 50, (28, 28), 2))
     with pytest.raises(ValueError, match="binary, hadamard"):
-        patterns("gaussian", 5, (8, 8), 0)
+        patterns("fourier", 5, (8, 8), 0)
 
 
 # ---- networks ----

@@ -185,6 +185,7 @@ def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, tmp
     monkeypatch.setattr(paradigms, "load_task", lambda *_: task)
     monkeypatch.setattr(paradigms, "FEATURES", (4, 16))
     monkeypatch.setattr(paradigms, "EPOCHS", 30)
+    monkeypatch.setattr(paradigms, "OTHERS", (("binning", False, 30, (4,)), ("gaussian", True, 10, (16,))))
     page, said = asked(tmp_path / "cache")
     made = paradigms.compressive_page(page)
     sixteen = made.rows[1]
@@ -192,9 +193,16 @@ def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, tmp
     assert len(sixteen["epochs"]["loss"]) == 30
     accuracies = [cell["accuracy_mean"] for cell in sixteen["cells"]]
     assert accuracies[0] < 0.6 < accuracies[-1]
-    assert sum(line.startswith("compressive") for line in said) == 2 * len(paradigms.PHOTONS)
+    assert sum(line.startswith("compressive") for line in said) == 4 * len(paradigms.PHOTONS)
     again = paradigms.compressive_page(dataclasses.replace(page, collect=True))
     assert again.rows == made.rows
+    binned, convolved = made.rows[2:]
+    assert binned["made_with"]["family"] == "binning"
+    assert convolved["epochs"]["held_out"][-1] > 60  # by chance 33
+    *_, other = (table.lines() for table in paradigms.compressive_tables(made.rows))
+    assert other[0] == "## Other patterns and another classifier"
+    assert [line.split(" | ")[1] for line in other[4:16]] == 6 * ["one hidden layer"] + 6 * ["convolutions"]
+    assert other[-1].endswith("of 6.")
     write_page(tmp_path, "compressive", page_of("compressive"), made)
     assert {path.name for path in tmp_path.iterdir()} >= {
         "compressive.png",
@@ -203,7 +211,7 @@ def test_compressive_sensing_learns_on_clean_light_and_fails_on_little(task, tmp
     }
     (tmp_path / "cache" / "compressive-binary-16.json").unlink()
     partly = paradigms.compressive_page(dataclasses.replace(page, collect=True))
-    assert [one["features"] for one in partly.rows] == [4]
+    assert [one["features"] for one in partly.rows] == [4, 4, 16]
     assert said[-1] == "compressive: d_f = 16 is not measured yet: pans reproduce compressive"
 
 
