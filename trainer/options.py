@@ -14,7 +14,8 @@ from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
-ESTIMATOR_NAMES = ("ste", "exact", "local", "disarm", "loo")  # estimators.py
+STRAIGHT_THROUGH = ("ste", "identity")  # from the first epoch to the last
+ESTIMATOR_NAMES = (*STRAIGHT_THROUGH, "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
 PICTURE_HEADS = ("picture", "decoder")  # heads.py
 HEADS = ("mlp", "conv", *PICTURE_HEADS)

@@ -8,6 +8,7 @@ the mean loss of the batch and whose gradient is the estimate. Heads normalise b
 | name | gradient in p | cost |
 | --- | --- | --- |
 | `ste` | straight-through: passed on from the sampled click. Biased unless the loss is affine in every click | 1 pass |
+| `identity` | the same passed on to the light itself, undamped (the paper's "naive" way): for comparison alone | 1 pass |
 | `exact` | expectation over all 2**d_f words | 2**d_f words, once per batch |
 | `local` | L(click i) - L(no click i), the other clicks sampled: unbiased | d_f + 1 passes, only the last layer in full |
 | `disarm` | antithetic pairs (Dong, Mnih, Tucker 2020): unbiased | 2 passes |
@@ -31,6 +32,7 @@ from .ssim import ssim
 LOO_SAMPLES = 4
 SHARPNESS = 2.0  # of the soft decision in `decision_loss`
 WRONG = 3.0  # cost of a wrong decision there: about what cross-entropy charges for one
+_DARK_MIN = 1e-6  # least chance of no click that `identity` divides by: float32 knows no less; beyond 13.8 photoelectrons it is damped
 _P_MIN = 1e-4  # least chance by which a score-function gradient is divided: beyond it, one event would undo an epoch
 
 LossOf = Callable[[Tensor, Tensor], Tensor]  # scores (..., out), target (..., or broadcast) -> losses (...)
@@ -99,6 +101,16 @@ def straight_through(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, ran
     return loss_of(head(sample_clicks(p, random), None), target).mean()  # normalised by the clicks of the batch
 
 
+def identity(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
+    """The gradient of a sampled click is given to the photoelectrons, as if d click / d lambda were 1.
+
+    The click law behind damps by exp(-lambda), the chance of no click of a plain detector: divided by that beforehand.
+    """
+    clicks = sample_clicks(p, random).detach()
+    undamped = p / (1 - p.detach()).clamp(min=_DARK_MIN)
+    return loss_of(head(clicks + (undamped - undamped.detach()), None), target).mean()
+
+
 def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator) -> Tensor:
     """All click words, each once: no sampling noise in loss or gradient."""
     words = word_probabilities(p)
@@ -157,6 +169,7 @@ def _gradient_only(p: Tensor, slope: Tensor) -> Tensor:
 
 ESTIMATORS: dict[str, Estimator] = {
     "ste": straight_through,
+    "identity": identity,
     "exact": exact,
     "local": local_expectation,
     "disarm": disarm,

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 
 from pans.trainer.model.estimators import LossOf, decision_loss, similarity_loss
-from pans.trainer.options import Options
+from pans.trainer.options import STRAIGHT_THROUGH, Options
 
 
 def second_stage(options: Options) -> int:
     """Return the epoch at which stage 2 begins; the end when there is no stage 2."""
-    return round(options.warm * options.epochs) if options.estimator != "ste" else options.epochs
+    return options.epochs if options.estimator in STRAIGHT_THROUGH else round(options.warm * options.epochs)
 
 
 def whole_levels(options: Options) -> int:
@@ -24,7 +24,8 @@ def whole_levels(options: Options) -> int:
 
 def estimator(options: Options, epoch: int) -> str:
     """Return the name of the estimator of an epoch."""
-    return "ste" if epoch < second_stage(options) else options.estimator
+    first = options.estimator if options.estimator in STRAIGHT_THROUGH else "ste"
+    return first if epoch < second_stage(options) else options.estimator
 
 
 def stage(options: Options, epoch: int) -> str:
@@ -47,7 +48,7 @@ def rates(options: Options, now: float) -> tuple[float, float]:
 
 def black(options: Options, now: float, floor: float) -> float:
     """Return the transmission of black: 0 in stage 1, then rising to the modulator's; patterns found at once are worse by points."""
-    start = 0.3 * options.epochs if options.estimator == "ste" else second_stage(options)
+    start = 0.3 * options.epochs if options.estimator in STRAIGHT_THROUGH else second_stage(options)
     return floor * min(1.0, max(0.0, (now - start) / (0.4 * options.epochs)))
 
 

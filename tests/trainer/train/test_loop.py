@@ -66,7 +66,7 @@ def test_head_fits_a_joint_distribution_to_its_entropy():
     assert entropy <= loss <= entropy + 1e-3
 
 
-@pytest.mark.parametrize("estimator", ["ste", "exact", "local", "disarm", "loo"])
+@pytest.mark.parametrize("estimator", ["ste", "identity", "exact", "local", "disarm", "loo"])
 def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     options = replace(SMALL, estimator=estimator)
     reports = []
