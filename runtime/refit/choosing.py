@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .evidence import F64, I64, Evidence, log_softmax
-from .loglinear import Correction, fit, n_parameters
-from .shrinkage import best_kappa, shrunk
+from .eigentasks import Eigentasks, eigentasks
+from .evidence import F64, I64, Evidence, best_kappa, log_softmax, shrunk
+from .loglinear import Correction, Prior, fit, n_parameters
 
 FOLDS = 5
 CLEARLY = 3.0  # standard errors by which the best kind must beat the old one: at two, 6 of 100 draws without any change took one
@@ -29,14 +29,21 @@ Chosen = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of correction: blocks of the log-linear one, then perhaps row by row towards what was seen."""
+    """A kind of correction: blocks of the log-linear one, then perhaps row by row towards what was seen.
+
+    With `tasks` the clicks are taken as their first so many eigentasks; `alone`, as a head of its own in place of the old scores.
+    """
 
     blocks: tuple[str, ...]
     rows: bool = False
+    tasks: int = 0
+    alone: bool = False
 
     @property
     def name(self) -> str:
         """As reports call it."""
+        if self.tasks:
+            return f"{self.tasks} eigentasks" + (" alone" if self.alone else "")
         return "+".join((*self.blocks, *(("rows",) if self.rows else ())))
 
 
@@ -101,11 +108,20 @@ def kinds_for(evidence: Evidence, *, rows: bool) -> tuple[Kind, ...]:
     n_clicks = evidence.clicks.shape[1]
     return tuple(
         kind
-        for kind in KINDS
+        for kind in (*KINDS, *_of_tasks(evidence))
         if (rows or not kind.rows)
         and (n_clicks or "clicks" not in kind.blocks)
-        and n_parameters(kind.blocks, evidence.n_classes, n_clicks) <= PARAMETERS_MAX
+        and n_parameters(kind.blocks, evidence.n_classes, kind.tasks or n_clicks) <= PARAMETERS_MAX
     )
+
+
+def _of_tasks(evidence: Evidence) -> tuple[Kind, ...]:
+    """Heads on 2, 4, 8, ... and on all eigentasks, where noise can be told from signal: beside the old scores, and alone."""
+    if eigentasks(evidence) is None:
+        return ()
+    n_clicks = evidence.clicks.shape[1]
+    numbers = {min(1 << power, n_clicks) for power in range(1, n_clicks.bit_length() + 1)}
+    return tuple(Kind(("bias", "clicks"), False, n, alone) for alone in (False, True) for n in sorted(numbers))
 
 
 def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None = None) -> Refitted:
@@ -114,20 +130,42 @@ def choose(evidence: Evidence, kinds: tuple[Kind, ...], objects: Chosen | None =
     old, _ = evidence.losses(evidence.scores)
     trials: dict[str, tuple[float, float]] = {}
     fold = evidence.folds(FOLDS, chosen, np.random.default_rng(_SEED))
+    tasks = eigentasks(evidence, chosen) if any(kind.tasks for kind in kinds) else None
     for kind in kinds:
-        gain = Estimate.of((old - _held_out_loss(evidence, kind, fold))[chosen])
+        if kind.tasks and tasks is None:
+            continue  # too few of these objects were shown again
+        gain = Estimate.of((old - _held_out_loss(evidence, kind, fold, tasks))[chosen])
         trials[kind.name] = gain.value, gain.error
-    best = max(kinds, key=lambda kind: trials[kind.name][0], default=None)
+    tried = (kind for kind in kinds if kind.name in trials)
+    best = max(tried, key=lambda kind: trials[kind.name][0], default=None)
     if best is None or not trials[best.name][0] > CLEARLY * trials[best.name][1]:
         return Refitted(OLD, evidence.scores, None, np.inf, trials)
-    found = fitted(evidence, best, evidence.counts(chosen))
+    found = fitted(evidence, best, chosen)
     return Refitted(best.name, found.scores, found.correction, found.kappa, trials)
 
 
-def fitted(evidence: Evidence, kind: Kind, counts: F64) -> Refitted:
-    """Return the correction of this kind, fitted to `counts` (rows, classes)."""
-    correction, _ = fit(kind.blocks, evidence.scores, evidence.clicks, counts)
+def fitted(evidence: Evidence, kind: Kind, chosen: Chosen) -> Refitted:
+    """Return the correction of this kind, fitted to the objects `chosen` (objects,)."""
+    counts = evidence.counts(chosen)
+    correction, _ = _fit(evidence, kind, counts, eigentasks(evidence, chosen) if kind.tasks else None)
     return _with_rows(evidence, kind, correction, counts)
+
+
+def _fit(
+    evidence: Evidence, kind: Kind, counts: F64, tasks: Eigentasks | None, prior: Prior | None = None
+) -> tuple[Correction, Prior]:
+    """Fit to `counts` (rows, classes); a head on eigentasks is given back as one on clicks, alone as one that takes the old scores away."""
+    if not kind.tasks:
+        return fit(kind.blocks, evidence.scores, evidence.clicks, counts, prior)
+    assert tasks is not None, "eigentasks are offered where there are some"
+    readout = tasks.readout[:, : kind.tasks]
+    beside = np.zeros_like(evidence.scores) if kind.alone else evidence.scores
+    found, prior = fit(kind.blocks, beside, evidence.clicks @ readout, counts, prior)
+    gain = readout @ found.gain
+    if not kind.alone:
+        return Correction(found.blocks, gain, found.offset, found.precision), prior
+    gain = np.concatenate([-np.eye(evidence.n_classes), gain])
+    return Correction(("bias", "scores", "clicks"), gain, found.offset, found.precision), prior
 
 
 def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F64) -> Refitted:
@@ -139,14 +177,17 @@ def _with_rows(evidence: Evidence, kind: Kind, correction: Correction, counts: F
     return Refitted(kind.name, scores, correction, kappa, {})
 
 
-def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64) -> F64:
-    """Return the log loss of each object, fitted without its fold; nan outside the folds. The prior's width is that of all folds."""
+def _held_out_loss(evidence: Evidence, kind: Kind, fold: I64, tasks: Eigentasks | None) -> F64:
+    """Return the log loss of each object, fitted without its fold; nan outside the folds.
+
+    The prior's width is that of all folds, and so are the eigentasks, which know no labels.
+    """
     counts = evidence.counts(fold >= 0)
-    _, prior = fit(kind.blocks, evidence.scores, evidence.clicks, counts)
+    _, prior = _fit(evidence, kind, counts, tasks)
     found = np.full(evidence.n_objects, np.nan)
     for held in range(FOLDS):
         others = evidence.counts((fold >= 0) & (fold != held))
-        correction, _ = fit(kind.blocks, evidence.scores, evidence.clicks, others, prior)
+        correction, _ = _fit(evidence, kind, others, tasks, prior)
         scores = _with_rows(evidence, kind, correction, others).scores
         found[fold == held] = evidence.losses(scores)[0][fold == held]
     return found

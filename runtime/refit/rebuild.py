@@ -65,7 +65,7 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
     vectors, row = np.unique(clicks.counts, axis=0, return_inverse=True)
     means = vectors / clicks.shots
     scores = reference_scores(layers, means)
-    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing)
+    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing, clicks.shots)
     return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
 
 

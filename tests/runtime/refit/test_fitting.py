@@ -8,10 +8,9 @@ import onnxruntime
 import pytest
 
 from pans.runtime.bundle.layers import Layer, read_layers, reference_scores
-from pans.runtime.refit.evidence import log_softmax
+from pans.runtime.refit.evidence import KAPPAS, best_kappa, log_likelihood, log_softmax, shrunk
 from pans.runtime.refit.loglinear import fit
 from pans.runtime.refit.onnx_chain import chain_onnx, corrected_layers
-from pans.runtime.refit.shrinkage import KAPPAS, best_kappa, log_likelihood, shrunk
 
 BLOCKS = ("bias", "scores", "clicks")
 
