@@ -42,7 +42,7 @@ SPECKLE = Options(
 )
 CONSERVING = replace(SPECKLE, clicks=None, conserving=True, input_photons=100.0)
 # without a straight-through stage a cycle of the rates is half as high in front (train/schedule.py): twice the rate makes it the same
-EXACT = {"estimator": "exact", "warm": 0.0, "front_rate": 2 * FEW.front_rate}
+EXACT = replace(FEW, estimator="exact", warm=0.0, front_rate=2 * FEW.front_rate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ ARMS = (
     Arm(HEAD, "two convolutions, one hidden layer of 512", replace(MANY, head="conv")),
     Arm(GRADIENT, "damped straight-through", FEW, reference=True),
     Arm(GRADIENT, "identity straight-through", replace(FEW, estimator="identity")),
-    Arm(GRADIENT, "exact", replace(FEW, **EXACT)),
+    Arm(GRADIENT, "exact", EXACT),
     Arm(GRADIENT, "damped straight-through, then exact", replace(FEW, estimator="exact")),
     Arm(START, "neither", FEW, reference=True),
     Arm(START, "slope rises from 0.2 to 1", replace(FEW, slope=0.2)),

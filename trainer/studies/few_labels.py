@@ -71,7 +71,11 @@ class Case:
 def few_labels_page(asked: Asked) -> Made:
     """Return one row per case, number of objects and head: means over the draws."""
     rows: Rows = []
-    makers = {SHIFTED: partial(_shipped, SHIFTED, 1), NOTHING: partial(_shipped, NOTHING, 0), UNKNOWN: _unknown}
+    makers: dict[str, Callable[[str | None], Case]] = {
+        SHIFTED: partial(_shipped, SHIFTED, 1),
+        NOTHING: partial(_shipped, NOTHING, 0),
+        UNKNOWN: _unknown,
+    }
     for name, make in makers.items():
         case: Case | None = None
         for size in SIZES:

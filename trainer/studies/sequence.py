@@ -81,9 +81,9 @@ def passing(part: Objects, seed: int) -> Objects:
 
 def task_in_passing(task: Task) -> Task:
     """Return frames in passing of the cells of `task`, training and held-out ones apart."""
-    parts = [passing(part, seed) for seed, part in enumerate((task.train, task.test))]
-    named = hashlib.sha256(parts[0].images.tobytes() + parts[1].images.tobytes()).hexdigest()
-    return Task("cells", task.classes, *parts, named, "other cells of the generator", source=task.source)
+    train_part, test_part = (passing(part, seed) for seed, part in enumerate((task.train, task.test)))
+    named = hashlib.sha256(train_part.images.tobytes() + test_part.images.tobytes()).hexdigest()
+    return Task("cells", task.classes, train_part, test_part, named, "other cells of the generator", source=task.source)
 
 
 def truth_at(offset: int, label: int) -> int:
@@ -184,7 +184,8 @@ def _sequence(task: Task, whole: Task, trained: Trained) -> Row:
     strip = np.concatenate(fields)
     starts = range(0, len(strip) - SIDE_PX + 1, STEP_PX)
     light, words = _shots(task, np.stack([strip[s : s + SIDE_PX] for s in starts]), trained, seed=3)
-    nearest = [min(range(len(order)), key=lambda k, s=s: abs(s - _middle(k))) for s in starts]
+    middles = np.array([_middle(place) for place in range(len(order))])
+    nearest = np.abs(np.array(starts)[:, None] - middles).argmin(axis=1).tolist()
     truth = [truth_at(s - _middle(k), int(labels[order[k]])) for s, k in zip(starts, nearest)]
     outputs = np.exp(_log_outputs(trained)[words])
     return {
