@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from .figures import Progress
     from .options import AutomatonOptions, check_automaton_options
-    from .train import Progress, TrainedAutomaton, train_automaton
+    from .train import TrainedAutomaton, train_automaton
 
 __all__ = ["AutomatonOptions", "Progress", "TrainedAutomaton", "check_automaton_options", "train_automaton"]
 
@@ -19,7 +20,7 @@ __getattr__ = lazy_names(
     {
         "AutomatonOptions": ".options",
         "check_automaton_options": ".options",
-        "Progress": ".train",
+        "Progress": ".figures",
         "TrainedAutomaton": ".train",
         "train_automaton": ".train",
     },

@@ -1,6 +1,7 @@
 """What an automaton does on some objects, as exact sums: accuracy, loss, clicks, photons, illumination, exposures; who reaches what.
 
-Owns the pass without gradient over given objects; decisions are those of the machine's class counts.
+Owns the pass without gradient over given objects; decisions are those of the machine's class counts. Also what a
+training reports of itself.
 """
 
 from __future__ import annotations
@@ -25,6 +26,20 @@ class Figures:
     photons: float
     illumination: float
     exposures: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a training is: `done` of `steps`, and what the present stage measured on the objects that it fits."""
+
+    stage: str
+    done: int
+    steps: int
+    loss: float
+    accuracy: float
+    clicks: float
+    photons: float
+    price: float
 
 
 def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:

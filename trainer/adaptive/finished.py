@@ -61,6 +61,19 @@ def dwell_steps(profile: Profile) -> int:
     return profile.projector.dwell_steps
 
 
+def set_top(machine: Machine, top: float, profile: Profile) -> None:
+    """Let `top` photoelectrons be the most of a lit pixel, and one step of the dwell time, where there are steps, the least."""
+    steps = bit_grid(top, profile).steps
+    for level in machine.levels:
+        light = level.light
+        assert isinstance(light, Bits)
+        light.top = top
+        if steps > 1:  # no state can be darker than one step; training then lights fewer pixels
+            light.bottom = top / steps
+        with torch.no_grad():
+            light.settle()
+
+
 def to_grid(machine: Machine, grid: Grid) -> None:
     """Round the brightness of all one-bit patterns to whole steps, at least one."""
     with torch.no_grad():

@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
@@ -63,6 +66,7 @@ class AutomatonOptions:
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
     outcomes: int = 2  # of one exposure: no click and a click, or 0, 1, ... photons and the last "this many or more"
+    start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
 
 
 LIMITS = {
@@ -75,6 +79,7 @@ LIMITS = {
     "tune_epochs": (0, 100_000),
     "epochs": (1, 100_000),
     "reroutes": (0, 1000),
+    "rate": (0, 1),
     "shift_px": (0, 65536),
     "strength": (0, 10),
     "soft": (0, 1),
@@ -139,6 +144,42 @@ def for_task(options: AutomatonOptions, task: str) -> AutomatonOptions:
     soft = SOFT_OF.get(task, 0.0) if options.soft is None else options.soft
     copies = COPIES_OF.get(task, 0) if options.copies is None else options.copies
     return replace(options, soft=soft, copies=copies)
+
+
+def started_from(
+    options: AutomatonOptions, start: Bundle, sha256: str, task: Task, profile: Profile
+) -> AutomatonOptions:
+    """Return `options` for going on from the automaton of `start`, a file of that hash: its exposures and states.
+
+    UsageError or PlanError where the options ask for others, the automaton is of other classes, images or outcomes, or `profile`
+    holds fewer patterns than it has states.
+    """
+    automaton = start.automaton
+    if automaton is None:
+        raise UsageError(f"--start: {start.name} holds no automaton", remedy="give one of --encoder automaton")
+    if options.grey:
+        raise UsageError("--start: not with --grey, what is trained on are patterns of one bit and a brightness")
+    exposures, states = automaton.n_slots, int(np.bincount(automaton.depth).max())
+    found = {"exposures": exposures, "states": states, "outcomes": automaton.n_outcomes}
+    for name, value in found.items():
+        if getattr(options, name) not in (0, value):
+            raise UsageError(
+                f"--{name} is {getattr(options, name)}, the automaton of --start has {value}",
+                remedy=f"--{name} {value}",
+            )
+    if (start.classes, start.image_shape) != (task.classes, task.image_shape):
+        raise UsageError(
+            f"--start: {start.name} tells {len(start.classes)} classes of images {start.image_shape}, "
+            f"{task.name} has {len(task.classes)} of {task.image_shape}",
+            remedy="start from an automaton of the same task",
+        )
+    most = patterns_at_most(options, profile)
+    if most < automaton.n_states:
+        raise PlanError(
+            f"--start: {automaton.n_states} states with a pattern each, {most} are allowed; only a training that grows shares them",
+            remedy="leave out --start or --patterns, or choose a profile with a larger pattern memory",
+        )
+    return replace(options, exposures=exposures, states=states, start=sha256)
 
 
 def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.count_law import count_law
 from pans.runtime.instrument.profile import Profile
@@ -30,8 +31,8 @@ from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
-from .figures import Figures, figures, masses, mean_objects
-from .finished import Finished, bit_grid, dwell_steps, finished, meet_budget, to_grid
+from .figures import Figures, Progress, figures, masses, mean_objects
+from .finished import Finished, bit_grid, dwell_steps, finished, meet_budget, set_top, to_grid
 from .grow import GrowOptions, Growth
 from .light import Bits, Grey, as_bits
 from .machine import COUNT_FLOOR, Machine, Sight, forward
@@ -49,34 +50,20 @@ from .options import (
 from .posteriors import Posteriors, calibrated, node_counts
 from .reroute import reroute
 from .share import choose_patterns, share_patterns
-from .state import machine_from, machine_state
+from .state import machine_from, machine_of, machine_state
 from .tune import Price, Tuning
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached
 CHOICES, CHOICE_BLOCKS = 3, 20  # of shared patterns, before they are tuned; blocks of objects for one of them
 GROWTH_BLOCK = 1000  # objects; larger than in tuning, as fewer steps serve one level
-REROUTE_NUMBERS = 1 << 28  # objects times states that a sweep keeps: 1 GiB
+REROUTE_NUMBERS = 1 << 29  # objects times states that a sweep keeps: 2 GiB
 TOP_SHARE = 0.99  # of the exposures of all objects need no brighter pixel than the top
 DARK_COUNTS = 0.5  # per decision, at most: 0.15 to 0.8 were tried on held-back images (docs/measurements/training.md)
 BUDGET_BLOCKS = 6  # of objects, by which the budget is met
 STAGES = ("grow", "grey", "shown")
 NETWORK = "network"  # a stage before them, where targets are soft
 FIRST_EPOCH = {"grey": 1, "shown": 100_001}  # in the order of all: no epoch repeats the order and shifts of another
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a training is: `done` of `steps`, and what the present stage measured on the objects that it fits."""
-
-    stage: str
-    done: int
-    steps: int
-    loss: float
-    accuracy: float
-    clicks: float
-    photons: float
-    price: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,18 +102,22 @@ def train_automaton(
     report: Callable[[Progress], None] = lambda _: None,
     held_back: int = 0,
     teacher: Path | None = None,
+    start: Bundle | None = None,
 ) -> TrainedAutomaton:
     """Train `task` through `profile`; the same options, machine and number of threads give the same result.
 
     After every level and epoch the state goes to `checkpoint`; with `resume` a training goes on from there. `held_back` objects (0: one
     in twelve) set the price and calibrate; no pattern is trained on them. Soft targets are read from the file
-    `teacher` where there is one, else made and kept there. KeyboardInterrupt passes through.
+    `teacher` where there is one, else made and kept there. With `start`, an automaton that `started_from` gave
+    the options for, nothing is grown: its patterns and edges are trained on. KeyboardInterrupt passes through.
     """
     check_automaton_options(options, task, profile)
     saved = read_checkpoint(checkpoint, options, task.sha256) if resume and checkpoint else {}
     run = _Run(task, profile, options, report, held_back)
     if saved:
         run.restore(saved["run"])
+    elif start is not None:
+        run.go_on_from(start)
 
     def keep() -> None:
         if checkpoint:
@@ -185,6 +176,21 @@ class _Run:
         return Sight(law, self.objects.gain, self.objects.floor, products, self.options.optics is not None, links)
 
     # ---- the stages ----
+
+    def go_on_from(self, start: Bundle) -> None:
+        """Take the states and patterns of `start` in place of growing, and count its leaves on some of the objects."""
+        self.machine, self.stage = machine_of(start), "shown"
+        lights = [level.light for level in self.machine.levels if isinstance(level.light, Bits)]
+        low, high = top_limits(self.profile)[0], self._highest_top()
+        if self._one_brightness():
+            for light in lights:
+                light.log_light, light.bottom = lights[0].log_light, low
+        brightest = max(float(light.log_light.max().exp()) for light in lights)
+        set_top(self.machine, min(high, max(low, brightest)), self.profile)
+        found = node_counts(self.machine, self.sight(self.products), self._some_blocks())
+        share = self.objects.n_fit / float(found[0].sum())
+        for counts, arrived in zip(self.machine.counts, found[1:]):
+            counts.add_(torch.from_numpy(arrived[len(arrived) - len(counts) :]), alpha=share)
 
     def soften(self, task: Task, file: Path | None, keep: Callable[[], None]) -> None:
         """Let a network's answers take the place of the labels, as far as is wanted: those of the checkpoint, of `file`, or new ones."""
@@ -266,9 +272,11 @@ class _Run:
             high = min(high, max(low, self.profile.projector.peak_photoelectrons_hz * exposure_s))
         return high
 
+    def _one_brightness(self) -> bool:
+        return self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
+
     def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
-        shared = self.profile.projector.levels == 2 and dwell_steps(self.profile) == 1
-        top = self._highest_top()
+        shared, top = self._one_brightness(), self._highest_top()
         means = list(mean_objects(self.machine, self.sight(self.products), self._some_blocks()))
         made = [as_bits(light, own, top) for light, own in zip(lights, means)]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
@@ -324,16 +332,7 @@ class _Run:
         below = masses[order].cumsum(0) / masses.sum()
         low, high = top_limits(self.profile)[0], self._highest_top()
         top = float(lights[order][int((below < TOP_SHARE).sum().clamp(max=len(lights) - 1))])
-        top = min(high, max(low, top))
-        steps = bit_grid(top, self.profile).steps
-        for level in self.machine.levels:
-            light = level.light
-            assert isinstance(light, Bits)
-            light.top = top
-            if steps > 1:  # no state can be darker than one step; training then lights fewer pixels
-                light.bottom = top / steps
-            with torch.no_grad():
-                light.settle()
+        set_top(self.machine, min(high, max(low, top)), self.profile)
 
     def _sweep_blocks(self) -> list[Block]:
         """The objects of a sweep over all levels, as many as memory should hold."""

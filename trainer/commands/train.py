@@ -59,6 +59,7 @@ NUMBERS = (
     ("shift_px", "X", "move training images by up to X along the rows (default 0)"),
     ("offset_px", "Y", "and by up to Y across them (default 0)"),
     ("strength", "F", "of an automaton: of the distortions, times the usual (default 0.3)"),
+    ("rate", "R", "of an automaton: learning rate of its last stage (default 0.01)"),
     ("decide", "F", "of an automaton: part of the last loss that counts wrong decisions (default 0.7)"),
     ("exposure_price", "P", "of an automaton: nats per exposure; walks then end early where that pays (default 0)"),
     (
@@ -80,6 +81,7 @@ NUMBERS = (
 )
 OF_AUTOMATA = (
     *("exposures", "states", "patterns", "grey", "strength", "decide", "outcomes", "exposure_price", "soft", "teacher"),
+    *("start", "rate", "reroutes"),
 )
 AS_GIVEN = (
     *("features", "photons", "budget", "complex_field", "optics"),
@@ -158,6 +160,15 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE.npz",
         help="of an automaton: the network's answers are read from there; where nothing is, they are made and kept there",
+    )
+    parser.add_argument(
+        "--reroutes", type=int, metavar="R", help="of an automaton: sweeps that move edges to better states (default 2)"
+    )
+    parser.add_argument(
+        "--start",
+        type=Path,
+        metavar="OLD.pans",
+        help="of an automaton: train on the patterns and states of that one, instead of growing new ones",
     )
 
 

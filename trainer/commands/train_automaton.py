@@ -23,8 +23,9 @@ from .train_own import After, Chosen, choose, finish
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
+    from pans.trainer.adaptive.figures import Progress
     from pans.trainer.adaptive.options import AutomatonOptions
-    from pans.trainer.adaptive.train import Progress, TrainedAutomaton
+    from pans.trainer.adaptive.train import TrainedAutomaton
     from pans.trainer.export.automaton import ExportedAutomaton, WalkFigures
 
 DEFAULT_PROFILE = "ideal"
@@ -46,6 +47,8 @@ TAKEN = (
     "outcomes",
     "exposure_price",
     "soft",
+    "rate",
+    "reroutes",
     "dark",
     "optics",
 )
@@ -70,8 +73,9 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     """Train as `args` say, write the bundle, and report what it decides on the held-out objects."""
     _refuse_foreign(args)
     torch_with(args.threads)
+    from pans.runtime.bundle.model import load_bundle
     from pans.runtime.instrument.profile import load_profile
-    from pans.trainer.adaptive.options import check_automaton_options, for_task
+    from pans.trainer.adaptive.options import check_automaton_options, for_task, started_from
     from pans.trainer.adaptive.train import train_automaton
     from pans.trainer.device import computing_on, keep_freed_memory
     from pans.trainer.tasks.registry import load_task
@@ -80,6 +84,9 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args, profile)
+    start, digest = (None, "") if args.start is None else load_bundle(args.start)
+    if start is not None:
+        options = started_from(options, start, digest, task, profile)
     check_automaton_options(options, task, profile)
     if args.teacher is not None and not for_task(options, task.name).soft:
         raise UsageError("--teacher: no soft targets are wanted", remedy="add --soft 0.5, say, or leave it out")
@@ -105,6 +112,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
                 report=take,
                 held_back=chosen.task.kept,
                 teacher=args.teacher,
+                start=start,
             )
             exported = _export(args, trained, task, profile, time.perf_counter() - started, chosen.facts)
     except KeyboardInterrupt:

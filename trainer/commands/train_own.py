@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 AUTOMATON = "automaton"
 AUTOMATON_PROFILE = "ideal"
+SIZES = ("exposures", "states")  # which a training that goes on from an automaton has from it
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
 BASELINE_TRIALS = 10
 LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
@@ -70,7 +71,7 @@ def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:
     for text in warnings_of(task, profile, recipe, args.clicks):
         warn(text)
     say("chosen from the images (--as-is chooses nothing):")
-    for reason in [*recipe.reasons, *_fill(args, recipe)]:
+    for reason in [*(recipe.reasons if args.start is None else recipe.reasons[:1]), *_fill(args, recipe)]:
         say(f"  {reason}")
     bigger = enlarged(task, choice.variation, recipe.objects, recipe.kept, args.seed or 0)
     changes = {name: value for name, value in asdict(choice.variation).items() if value}
@@ -84,7 +85,7 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
         ("exposures", "states", "batch", "epochs") if recipe.encoder == AUTOMATON else ("features", "batch", "epochs")
     )
     for name in names:
-        if getattr(args, name) is None:
+        if getattr(args, name) is None and (args.start is None or name not in SIZES):
             setattr(args, name, getattr(recipe, name))
     for name in ("copies", "soft"):  # not those of a public set whose name the folder bears
         if recipe.encoder == AUTOMATON and getattr(args, name) is None:

@@ -43,6 +43,14 @@ def test_trains_exports_and_reports(images, tmp_path, capsys):
     assert not list(tmp_path.glob("*.checkpoint"))
     for key in ("clicks_mean", "illumination", "exposures_mean", "expected_calibration_error"):
         assert answer[key] == pytest.approx(answer["first_200"][key], rel=0.5, abs=0.2)
+    more = ["--encoder", "automaton", "--start", str(out), "--rate", "0.05", "--reroutes", "0", "--epochs", "1"]
+    assert main(["train", images, *more, "--photons", "2.5", "-o", str(tmp_path / "more.pans")]) == 0
+    told = capsys.readouterr().err
+    assert "shown" in told
+    assert "grow" not in told
+    options = load_bundle(tmp_path / "more.pans")[0].provenance["options"]
+    assert (options["start"], options["exposures"], options["states"]) == (digest, 4, 8)
+    assert (options["rate"], options["reroutes"]) == (0.05, 0)
 
 
 @pytest.mark.parametrize(
@@ -108,6 +116,9 @@ def test_refusals(images, tmp_path, capsys):
         assert f"{option} is {value}, allowed: 0 to" in words
     teacher = ["--teacher", str(tmp_path / "x.npz")]
     assert "no soft targets are wanted" in refusal(capsys, images, *SHORT, "--photons", "3", *teacher, *out)
+    start = ["--photons", "3", "--start", "fashion-adaptive"]
+    assert "the automaton of --start has" in refusal(capsys, images, *SHORT, *start, *out)
+    assert "--start belongs to an automaton" in refusal(capsys, images, "--features", "3", *start[2:], *out)
     assert "--features is missing" in refusal(capsys, images, "--as-is", *out)
     fiber = refusal(capsys, "fiber", *SHORT, "--photons", "3", *out)
     assert "the light is the scene's own" in fiber
