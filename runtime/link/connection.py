@@ -153,16 +153,19 @@ class Connection:
         """
         if self.on_answer is not None and frame.type in ANSWER_TYPES:
             self.on_answer(arrival_ns, pack_body(frame))
-        wanted = False
-        try:
-            wanted = self.session.on_frame(frame, arrival_ns)
-        except PansError as error:
-            self._failure = self._failure or error
-        if wanted:
+        if self.digest(frame, arrival_ns):
             stream.append(Arrived(arrival_ns, frame))
             self.delivered += 1
         else:
             self.answers += 1
+
+    def digest(self, frame: Frame, arrival_ns: int) -> bool:
+        """Give a frame to the session and return whether it is the core's too; what ends the session waits for `raise_failure`."""
+        try:
+            return self.session.on_frame(frame, arrival_ns)
+        except PansError as error:
+            self._failure = self._failure or error
+            return False
 
     def flush(self) -> bool:
         """Send what the session has to say; return whether that was anything."""

@@ -69,7 +69,36 @@ class CompiledTurns:
         self._error: LinkError | None = None  # met while something is left to take
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
 
+    @property
+    def goes_on(self) -> bool:
+        """See Turns: a call is over when `turn` is."""
+        return False
+
+    @property
+    def lives(self) -> bool:
+        """See Turns."""
+        return True
+
+    @property
+    def page_faults(self) -> dict[str, int]:
+        """See Turns: those of the run's thread are the run's."""
+        return {}
+
     def attach(self) -> None:
+        """Be ready for ARM."""
+        self.prepare()
+
+    def halt(self) -> None:
+        """Nothing goes on."""
+
+    def leave_off(self) -> int:
+        """Return 0: the session knows what was sent."""
+        return 0
+
+    def close(self) -> None:
+        """Nothing is left."""
+
+    def prepare(self) -> None:
         """Lend the run's present connection to the compiled turn, once; kernels are compiled or loaded."""
         run = self._run
         if self._attached is run.connection:
@@ -215,20 +244,20 @@ class CompiledTurns:
 
     def _note_waits(self, turn: Turn) -> None:
         """Give what a call has waited for to the evidence of what makes work late, in the order of time."""
-        evidence, counts, rings = self._run.lateness.evidence, turn.counts, turn.rings
+        evidence = self._run.lateness.evidence
         spans: list[tuple[int, int, int]] = []
         blocks = turn.blocks
         worked = np.flatnonzero(blocks[:, ring.DECIDED] - blocks[:, ring.DECODED] >= evidence.floor_ns)
         for at in worked.tolist():
             spans.append((int(blocks[at, ring.DECIDED]), int(blocks[at, ring.DECODED]), -1))
-        for began, asked, ended, _ in rings.notes[: counts.notes].tolist():
+        for began, asked, ended, _ in turn.notes.tolist():
             spans.append((ended, began, asked))
         for ended, began, asked in sorted(spans) if len(worked) else spans:
             if asked < 0:
                 evidence.worked(INFERENCE, began, ended)
             else:
                 evidence.waited(began, (asked - began) / NS_PER_S, ended)
-        evidence.arrived(*rings.arrivals[: counts.arrivals].tolist())
+        evidence.arrived(*turn.arrivals.tolist())
 
     def _settle(self, turn: Turn, outputs: list[Output]) -> None:
         """Account for what a call took and sent: session, driver, marks, recording, decisions."""
@@ -260,7 +289,7 @@ class CompiledTurns:
 
     def _settle_commands(self, turn: Turn) -> None:
         """Bring the session and the driver to where the kernel has them."""
-        run, control, shows = self._run, turn.control, turn.shows
+        run, control, shows = self._run, turn.reported, turn.shows
         first = int(control[ring.NEXT_ID]) - len(shows)
         open_since = max(int(control[ring.OLDEST_ID]), first)
         sent = [(number, turn.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]

@@ -56,14 +56,33 @@ class LiveCore(Protocol):
 
 
 class Turns(Protocol):
-    """What takes a live run's turns in the place of Python's (compiled.CompiledTurns).
+    """What takes a live run's turns in the place of Python's (compiled.CompiledTurns, lasting.LastingTurns).
 
-    `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it. `settled` is told after each call that
-    brought messages.
+    `prepare` once a connection is there, `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it.
+    `settled` is told after each call that brought messages. Where the turns go on in another thread (`goes_on`), core, session and
+    driver are behind them; `halt` ends that, and all are where the turns have come. `lives`: whether they do. `leave_off` ends it from
+    any thread and returns the id of the next command, 0: the session knows it. `close` once, at the end.
     """
 
     settled: Callable[[Turn, Output], None] | None
 
+    @property
+    def goes_on(self) -> bool: ...
+
+    @property
+    def lives(self) -> bool: ...
+
+    @property
+    def page_faults(self) -> dict[str, int]: ...
+
+    def prepare(self) -> None: ...
+
     def attach(self) -> None: ...
 
     def turn(self, poll_s: float) -> list[Output]: ...
+
+    def halt(self) -> None: ...
+
+    def leave_off(self) -> int: ...
+
+    def close(self) -> None: ...

@@ -39,11 +39,11 @@ from pans.runtime.turn.eligible import excluded
 from .compiled import CompiledTurns
 from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice
 from .continuous import INTERRUPTED, REFUSED, Stop
+from .lasting import LastingTurns
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 
 NS_PER_S = 1_000_000_000
-SETTLED_WITHIN_US = 700.0  # recorder, tally and evidence of one block take 0.2 to 0.4 ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +95,11 @@ def run_live(
         core.warm_up()
         run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
         if run.turn_choice.taken == COMPILED and isinstance(core, Core):
-            # settled behind each block where there is time for it: left to gather, it comes when the next block does
-            block_us = plan.cycle_us * min(plan.block_exposures / plan.slots_per_cycle, 1.0)
-            spare = not link.virtual and block_us >= SETTLED_WITHIN_US
-            run.compiled = CompiledTurns(run, core, prompt=spare or (observers.acts and observers.watch is not None))
+            prompt = observers.acts and observers.watch is not None
+            lasts = not link.virtual and not prompt
+            run.compiled = LastingTurns(run, core) if lasts else CompiledTurns(run, core, prompt=prompt)
             core.leave_steps()
-            run.compiled.attach()  # before the heap is touched: loading kernels takes memory
+            run.compiled.prepare()  # before the heap is touched: loading kernels takes memory
         elif isinstance(core, Core):
             core.warm_up_steps()
         reader = connection.reader.thread_id
@@ -123,10 +122,16 @@ def run_live(
                 run.drop_recorder()
                 raise
             finally:  # whatever went wrong: light off first
-                run.page_faults = counts.since()
-                run.stop()
+                try:
+                    run.halt()
+                finally:
+                    apart = {} if run.compiled is None else run.compiled.page_faults
+                    run.page_faults = apart or counts.since()
+                    run.stop()
         return _result(run, profile)
     finally:
+        if run.compiled is not None:
+            run.compiled.close()
         run.connection.close()
 
 
@@ -171,6 +176,7 @@ def _until_ended(
             stop.polled = False
         except LinkError as error:
             stop.polled = False
+            run.halt()
             if isinstance(error, DeviceError) and refusals.again(run, error):
                 run.ended = f"{REFUSED}{error.message}"
             elif recovery is None:

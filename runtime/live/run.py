@@ -204,7 +204,7 @@ class LiveRun(Reconciled):
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
-        self.turned_s = time.monotonic()
+        self.beat()
         looked_ns = self.now_ns()
         poll_s = self.lateness.poll_s(looked_ns)
         self._watch, self._idle = watch, True
@@ -389,7 +389,7 @@ class LiveRun(Reconciled):
             return
         for event in recorder.keeper.news():
             self.journal.note(**event)
-        if recorder.wants_part and (place := self.core.part()) is not None:
+        if recorder.wants_part and not self.goes_on and (place := self.core.part()) is not None:
             recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())
             self.journal.session(self.connection)

@@ -84,16 +84,22 @@ class Evidence:
         self._spans: deque[Span] = deque(maxlen=MAX_SPANS)
         self._stamped: deque[Stamped] = deque(maxlen=MAX_STAMPED)
         self._collecting_ns = self._cpu_mark_ns = 0
+        self._apart = False  # another thread than the one that tells of them waits and works
         self._counters = Counters(now_ns, [])
 
-    def watch(self, threads: Iterable[int | None] = ()) -> None:
-        """From here on watch collections, the calling thread (the loop's) and `threads`, by native id; a new link has a new reader."""
+    def watch(self, threads: Iterable[int | None] = (), loop: int | None = None) -> None:
+        """From here on watch collections and `threads`, by native id; a new link has a new reader.
+
+        `loop` is the thread that waits for bytes and decides, None: the calling one.
+        """
         if self._virtual:
             return
         if self._on_gc not in gc.callbacks:
             gc.callbacks.append(self._on_gc)
         self._counters.close()
-        self._counters = Counters(self._now, [threading.get_native_id(), *(thread for thread in threads if thread)])
+        self._apart = loop is not None
+        own = threading.get_native_id() if loop is None else loop
+        self._counters = Counters(self._now, [own, *(thread for thread in threads if thread)])
 
     def close(self) -> None:
         """End: leave the collector as it was found; idempotent."""
@@ -106,7 +112,8 @@ class Evidence:
     def worked(self, kind: str, begin_ns: int, end_ns: int) -> None:
         """Note that the loop was busy with `kind`."""
         if end_ns - begin_ns >= self.floor_ns:
-            cpu_ns = -1 if self._virtual else time.thread_time_ns() - self._cpu_mark_ns
+            looked = not self._virtual and not self._apart
+            cpu_ns = time.thread_time_ns() - self._cpu_mark_ns if looked else -1
             self._spans.append(Span(kind, begin_ns, end_ns, cpu_ns))
 
     def waited(self, begin_ns: int, asked_s: float, end_ns: int) -> None:

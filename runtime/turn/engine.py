@@ -1,11 +1,13 @@
 """`Turn`: one connection's compiled turns, from bytes to rows, for a core whose steps are compiled.
 
 Owns the arrays between Python and the kernels, and the hand-over of the core's state in each call; never opens, records or judges. `run`
-says why it ended; what came stands in properties that are valid until the next `run`.
+says why it ended; what came stands in properties that are valid until the next `run`. A call that goes on in another thread (lasting.py)
+is begun by `lasting`; the properties then show one bank at a time, `show_bank`, and when it has ended the rest, `show_rest`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +36,7 @@ class Limits(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a call reports, in the order of rings.py's control."""
+    """What a call reports, or one of its banks, in the order of rings.py's control."""
 
     errno: int
     unsent: int
@@ -50,6 +52,7 @@ class Counts(NamedTuple):
 
 NO_LIMITS = Limits()
 _NOTHING = Counts(*[0] * len(Counts._fields))
+_FIRST = 3  # of the counts, the first that says up to where a ring is used
 
 
 class Turn:
@@ -59,12 +62,14 @@ class Turn:
         from .kernels import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
-        self.rings: Rings = make_rings()
-        self.counts = _NOTHING
+        self.rings: Rings = make_rings(core_kernels.N_STATE)
+        self.counts = self._first = _NOTHING  # how much there is, and where in the rings it begins
+        self._row, self._n_rows = 0, 0
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
+        self.reported = self.control  # what it was when what is shown was all that had come
         self.control[ring.FD] = -1
         self.control[ring.BLOCK_ROWS] = min(steps.windows.n_windows, CLICKS_MAX)
         self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
@@ -87,7 +92,8 @@ class Turn:
     def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits) -> int:
         self._prepare(fd, limits)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        return self._done(ended)
+        self._show(0, 1, self.control, self.steps.walk.state)
+        return int(ended)
 
     def _prepare(self, fd: int, limits: Limits) -> None:
         control, steps = self.control, self.steps
@@ -96,13 +102,51 @@ class Turn:
         control[ring.READS : ring.BUDGET + 1] = (fd >= 0, *limits[:4])
         control[ring.FLOOR_NS] = limits.floor_ns
         control[ring.OPEN] = steps.core.tracker.open
+        control[ring.LASTING : ring.TAIL + 1] = 0
         steps.load()
 
-    def _done(self, ended: int) -> int:
-        self.counts = Counts(*self.control[ring.ERRNO :].tolist())
+    def _show(self, bank: int, banks: int, reported: I64, state: I64) -> None:
+        """Let the properties show `bank` of `banks`, and bring the core to where its `state` is."""
+        self.reported = reported
+        self._row = len(self._walk.rows) // banks * bank
+        self._n_rows = int(state[core_kernels.N_ROWS]) - self._row
+        counts = reported[ring.ERRNO :].tolist()
+        first = [0] * len(counts)
+        if bank:
+            first[_FIRST:] = [len(part) // banks * bank for part in self._parts]
+        self._first = Counts(*first)
+        self.counts = Counts(*[count - begin for count, begin in zip(counts, first)])
         if self.counts.messages:
-            self.steps.store()
-        return int(ended)
+            self.steps.store(state)
+
+    # -- a call that goes on -------------------------------------------------------------------------------------------
+
+    @property
+    def can_last(self) -> bool:
+        """Whether a call may go on: each decision is the kernel's, and a bank holds those of any block."""
+        return self.steps.decides and len(self._walk.rows) // ring.N_BANKS >= self.control[ring.BLOCK_ROWS]
+
+    def lasting(self, fd: int, floor_ns: int) -> Callable[[], int]:
+        """Return the call that reads `fd` and goes on until it is stopped or something is not ordinary; then only may others be made.
+
+        `fd` -1: nothing is read and it ends at once.
+        """
+        self._prepare(fd, Limits(floor_ns=floor_ns))
+        control = self.control
+        control[ring.LASTING], control[ring.PUBLISH_NS] = 1, 0
+        arguments = (*self._nothing, self._decoder, self._walk, self._drive, self.rings, control, self._scratch)
+        return lambda: int(self._kernel(*arguments))
+
+    def show_bank(self) -> None:
+        """Show the next bank of a call that goes on, which has been published."""
+        bank = int(self.control[ring.TAIL]) % ring.N_BANKS
+        self._show(bank, ring.N_BANKS, self.rings.heads[bank], self.rings.states[bank])
+
+    def show_rest(self) -> None:
+        """Show the bank that a call, now ended, has not published; all others have been taken."""
+        bank = int(self.control[ring.HEAD]) % ring.N_BANKS
+        self._show(bank, ring.N_BANKS, self.control, self.steps.walk.state)
+        self.control[ring.STOP] = 0
 
     def feed(self, data: U8, reads: I64) -> int:
         """Take what was read elsewhere, uint8 (n,), read by read: `reads` int64 (n, 2), bytes (at most CHUNK_BYTES) and when they came.
@@ -146,27 +190,47 @@ class Turn:
     @property
     def rows(self) -> npt.NDArray[np.void]:
         """The decisions of the call, DECISION_DTYPE (n,), in order."""
-        return self.steps.labelled(int(self._walk.state[core_kernels.N_ROWS]))
+        return self.steps.labelled(self._n_rows, self._row)
 
     @property
     def blocks(self) -> I64:
         """When each block came, was decoded, decided and kept, and what had come up to it: rings.py's steps (n, N_STEP)."""
-        return self.rings.steps[: self.counts.steps]
+        return self._part(self.rings.steps, self._first.steps, self.counts.steps)
 
     @property
     def messages(self) -> I64:
         """Where the stream messages of the call stand in `kept`: rings.py's spans (n, 4)."""
-        return self.rings.messages[: self.counts.messages]
+        return self._part(self.rings.messages, self._first.messages, self.counts.messages)
 
     @property
     def answers(self) -> I64:
         """Where the acknowledgements stand in `kept`."""
-        return self.rings.answers[: self.counts.answers]
+        return self._part(self.rings.answers, self._first.answers, self.counts.answers)
 
     @property
     def shows(self) -> I64:
         """Where the commands stand in `kept` that were sent."""
-        return self.rings.shows[: self.counts.shows]
+        return self._part(self.rings.shows, self._first.shows, self.counts.shows)
+
+    @property
+    def notes(self) -> I64:
+        """The waits for bytes: rings.py's notes (n, 4)."""
+        return self._part(self.rings.notes, self._first.notes, self.counts.notes)
+
+    @property
+    def arrivals(self) -> I64:
+        """When bytes were read, int64 (n,)."""
+        return self._part(self.rings.arrivals, self._first.arrivals, self.counts.arrivals)
+
+    @staticmethod
+    def _part(part: I64, first: int, count: int) -> I64:
+        return part[first : first + count]
+
+    @property
+    def _parts(self) -> tuple[npt.NDArray[Any], ...]:
+        """The rings in the order of the counts."""
+        rings = self.rings
+        return rings.steps, rings.messages, rings.answers, rings.shows, rings.notes, rings.arrivals, rings.kept
 
     @property
     def kept(self) -> U8:

@@ -17,6 +17,7 @@ from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
 from pans.runtime.wire.session import COMMAND_WINDOW
 
 from . import rings as ring
+from .shared import load, store, take
 from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 
 ACK_BYTES = STRUCTS["ACK"].size
@@ -24,6 +25,7 @@ ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
 TAIL_AT = EXPOSURE_AT + 8
 IS_ODD, IS_DONE, IS_REFUSED = range(3)  # what `take_ack` says of an acknowledgement
 WRITE_WAIT_NS = 20_000_000  # for room; what then is left, the caller sends
+HOLD_WAIT_NS = 20_000  # while the other thread writes a frame of its own
 _U = np.uint64
 
 
@@ -91,7 +93,12 @@ def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-
         return True  # what waits for acknowledgements comes late: the next walk is named in time
     begin = control[ring.KEPT]
     end = put_show(drive, control[ring.NEXT_ID], exposure, state, rings.kept, begin)
+    if control[ring.LASTING]:
+        while not take(control, ring.WRITES) and not load(control, ring.STOP):
+            wait_for(np.int64(-1), np.int64(HOLD_WAIT_NS), np.bool_(False), scratch)
     sent = _send(control, rings.kept, begin, end, scratch)
+    if control[ring.LASTING]:
+        store(control, ring.WRITES, 0)
     left_ns = now_ns(scratch)
     control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = exposure, state
     control[ring.NEXT_ID] += 1
@@ -141,7 +148,7 @@ def take_ack(buffer, start, stop, control):  # type: ignore[no-untyped-def]
     if not oldest <= last < control[ring.NEXT_ID] or last - oldest > COMMAND_WINDOW:
         return IS_ODD
     fresh = load4(buffer, at + _U(8)) & ((_U(2) << _U(last - oldest)) - _U(1))
-    own = oldest >= control[ring.NEXT_ID] - control[ring.N_SHOWS]
+    own = oldest >= control[ring.FIRST_ID]
     is_refused = refused == last and last == oldest and own and status != _U(0) and fresh == _U(1)
     if not is_refused and (fresh != _U(0) or refused >= oldest):
         return IS_ODD  # an earlier refusal stays named, and has been told

@@ -97,7 +97,12 @@ class Watchdog:
     def _turn_light_off(self, run: LiveRun) -> None:
         """Send STOP in the loop's place."""
         connection = run.connection
-        _within(STEP_S, lambda: connection.link.write(connection.session.stop_frames()))
+
+        def speak() -> None:
+            next_id = 0 if run.compiled is None else run.compiled.leave_off()
+            connection.link.write(connection.session.stop_frames(next_id))
+
+        _within(STEP_S, speak)
 
     def _end_process(self, signum: int) -> None:
         asked = ASKED_TO_STOP if self._continuous and signum == signal.SIGTERM else INTERRUPTED

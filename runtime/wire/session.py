@@ -119,13 +119,14 @@ class HostSession:
         """Move the receive window and renew the lease."""
         self._output.append(wire.encode_frame(GRANT, _GRANT.pack(stream_limit & 0xFFFFFFFF, lease_ms), self.nonce))
 
-    def stop_frames(self) -> bytes:
+    def stop_frames(self, next_id: int = 0) -> bytes:
         """Return bytes that stop the device, whatever it has of the commands so far: those that it may lack, in order, then STOP.
 
-        Nothing changes here: it is for a thread that speaks in the place of a loop that is stuck.
+        Nothing changes here: it is for a thread that speaks in the place of a loop that is stuck. `next_id` above 0 where a compiled turn
+        has sent commands of which the session has not been told.
         """
         before = [frame for _, frame in (*self._unacknowledged, *self._waiting)]
-        return b"".join((*before, wire.encode_command(self.next_id, Opcode.STOP, b"", self.nonce)))
+        return b"".join((*before, wire.encode_command(max(self.next_id, next_id), Opcode.STOP, b"", self.nonce)))
 
     @property
     def has_room(self) -> bool:

@@ -171,7 +171,7 @@ def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
     """One late name must not make the next one late; any other refusal is Python's."""
     taken = called(shows.take_ack)
     control = np.zeros(ring.N_CONTROL, np.int64)
-    control[[ring.NEXT_ID, ring.OLDEST_ID, ring.N_SHOWS, ring.ARRIVAL_NS]] = 12, 9, 3, 55
+    control[[ring.NEXT_ID, ring.OLDEST_ID, ring.FIRST_ID, ring.ARRIVAL_NS]] = 12, 9, 9, 55
 
     def told(last: int, refused: int, status: int, mask: int) -> int:
         frame = FrameDecoder().feed(encode_ack(Ack(last, refused, status, "late", mask), SESSION))[0]
@@ -183,7 +183,7 @@ def test_the_refusal_of_a_name_is_taken_in_the_call_that_sent_it() -> None:
     assert told(9, 9, 5, 3) == shows.IS_REFUSED
     assert control[[ring.OLDEST_ID, ring.OLDEST_NS]].tolist() == [10, 55]
     assert told(10, 9, 5, 2) == shows.IS_DONE  # the refusal before it stays named
-    control[ring.N_SHOWS] = 0
+    control[ring.FIRST_ID] = 12
     assert told(11, 11, 5, 1) == shows.IS_ODD  # sent by another call, or by Python
     assert control[ring.OLDEST_ID] == 11
 
