@@ -297,9 +297,7 @@ def _is_aside(buffer, start, stop, walk, control):  # type: ignore[no-untyped-de
     state = load4(buffer, at)  # reason and the reserved bytes above it are 0
     believable = load8(buffer, at + _U(12)) < stream.LARGEST and load8(buffer, at + _U(20)) < stream.LARGEST
     return (
-        (state == _U(_ARMED) or state == _U(_RUNNING))
-        and believable
-        and load4(buffer, at + _U(4)) <= _U(MAX_LEASE_MS)
+        (state == _U(_ARMED) or state == _U(_RUNNING)) and believable and load4(buffer, at + _U(4)) <= _U(MAX_LEASE_MS)
     )
 
 

@@ -18,7 +18,7 @@ def now_ns(scratch: I64) -> int:
     return time.perf_counter_ns()
 
 
-def wait_for(fd: int, wait_ns: Any, to_write: Any, scratch: I64) -> int:
+def wait_for(fd: Any, wait_ns: Any, to_write: Any, scratch: I64) -> int:
     """Wait at most `wait_ns` until `fd` can be read (or written): above 0 when it can or is gone, 0 when not, else minus errno."""
     wanted, none = [int(fd)], []  # type: ignore[var-annotated]
     try:
