@@ -1,4 +1,4 @@
-"""What goes into a live run and what comes out of it, as plain facts.
+"""What goes into a live run and what comes out of it: plain facts, and the calls that a run makes of a core and of what takes its turns.
 
 Owns no behaviour; units are in the names. Light to import: the command line fills these in before anything is loaded.
 """
@@ -7,17 +7,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from pans.runtime.instrument.calibration import MAX_AGE_H
 
 if TYPE_CHECKING:
+    from collections import Counter
+    from collections.abc import Callable, Mapping
+
     from numpy.typing import NDArray
 
+    from pans.runtime.core.decision import Output
+    from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
+    from pans.runtime.turn import Turn
+    from pans.runtime.wire.frame import Messages
+    from pans.runtime.wire.messages import Frame, Mark
+    from pans.runtime.wire.tracker import StreamTracker
 
     from .tally import RunTally
 
@@ -97,3 +106,71 @@ class RunResult:
     decisions_sha256: str = ""
     events: list[dict[str, Any]] = field(default_factory=list)
     page_faults: dict[str, int] = field(default_factory=dict)  # of the loop's thread while armed; its switches too
+
+
+class LiveCore(Protocol):
+    """What a live run needs of a core (core.Core is one): stream frames in, outputs out, deterministic, no clock.
+
+    `tracker` accounts for the stream, `marks` are the objects' marks by number, `tallies` int64 (window.N_TALLIES,) the dark
+    exposures, dark clicks and wrong patterns, in that order.
+    """
+
+    start_tick: int
+    completed: bool
+    n_decisions: int
+    jitter_ticks: int
+    tracker: StreamTracker
+    contradictions: Counter[str]
+
+    @property
+    def marks(self) -> Mapping[int, Mark]: ...
+
+    @property
+    def tallies(self) -> NDArray[np.int64]: ...
+
+    def warm_up(self) -> None: ...
+
+    def begin(self, start_tick: int, n_cycles: int) -> Output: ...
+
+    def step(self, frame: Frame) -> Output: ...
+
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]: ...
+
+    def end(self) -> Output: ...
+
+    def cycles_left(self, n_cycles: int) -> int: ...
+
+    def part(self) -> Place | None: ...
+
+
+class Turns(Protocol):
+    """What takes a live run's turns in the place of Python's (compiled.CompiledTurns, lasting.LastingTurns).
+
+    `prepare` once a connection is there, `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it.
+    `settled` is told after each call that brought messages. Where the turns go on in another thread (`goes_on`), core, session and
+    driver are behind them; `halt` ends that, and all are where the turns have come. `lives`: whether they do. `leave_off` ends it from
+    any thread and returns the id of the next command, 0: the session knows it. `close` once, at the end.
+    """
+
+    settled: Callable[[Turn, Output], None] | None
+
+    @property
+    def goes_on(self) -> bool: ...
+
+    @property
+    def lives(self) -> bool: ...
+
+    @property
+    def page_faults(self) -> dict[str, int]: ...
+
+    def prepare(self) -> None: ...
+
+    def attach(self) -> None: ...
+
+    def turn(self, poll_s: float) -> list[Output]: ...
+
+    def halt(self) -> None: ...
+
+    def leave_off(self) -> int: ...
+
+    def close(self) -> None: ...

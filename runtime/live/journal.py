@@ -19,7 +19,7 @@ from pans.runtime.record import AnyRecorder
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.session import Refusal
 
-from .live_core import Turns
+from .config import Turns
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts

@@ -28,13 +28,12 @@ from pans.runtime.wire.messages import DeviceState, MessageType, Opcode, StateRe
 from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
-from .config import RunConfig, TurnChoice
+from .config import LiveCore as LiveCore
+from .config import RunConfig, TurnChoice, Turns
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
 from .journal import Journal, Reconciled
 from .lateness import Lateness
-from .live_core import LiveCore as LiveCore
-from .live_core import Turns
 from .tally import RunTally
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
