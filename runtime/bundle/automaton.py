@@ -28,6 +28,7 @@ DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
 CONFIDENCE_RANGE = Range(1e-6, 1.0)
 DOSE_PARTS = 64  # of the cap, to which the doses of walks that meet are told apart
 DOSE_ROUNDING = 1e-9  # of a cap: sums of light come in another order here than elsewhere
+DOSE_RANGE, STATES_RANGE = Range(1e-9, 1e15), Range(1, STATES_MAX, whole=True)
 _EDGES_AT_ONCE = 1 << 20  # explored together, so that memory stays small
 _UNREACHED = 0xFFFF  # as a depth: above SLOTS_MAX
 
@@ -144,6 +145,18 @@ def stopped(automaton: Automaton, confidence: float) -> Automaton:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class DoseCap:
+    """The most light that one walk may bring, and the most states of the automaton that keeps it."""
+
+    most: float
+    states: int = STATES_MAX
+
+    def __post_init__(self) -> None:
+        DOSE_RANGE.checked(self.most, "dose cap")
+        STATES_RANGE.checked(self.states, "states within a dose cap")
+
+
 def capped(automaton: Automaton, light: ArrayLike, cap: float, most_states: int = STATES_MAX) -> Automaton:
     """Return the automaton whose walks never pass a dose: where the next state would, the walk ends with that state's posterior.
 
@@ -157,14 +170,17 @@ def capped(automaton: Automaton, light: ArrayLike, cap: float, most_states: int 
     demand(bool(dose[0] <= cap), f"the first exposure brings {dose[0]:.6g}, the dose may not pass {cap:.6g}")
     parts = DOSE_PARTS
     while True:
-        found = _parted(automaton, dose, cap, parts)
-        if found.n_states <= max(most_states, automaton.n_states) or parts == 1:
-            return found
+        levels, edges = _parted(automaton, dose, cap, parts)
+        kept = _joined(levels, edges)
+        if sum(len(rows) for rows in kept) <= max(most_states, automaton.n_states) or parts == 1:
+            return _numbered(kept, automaton)
         parts //= 2
 
 
-def _parted(automaton: Automaton, light: NDArray[np.float64], cap: float, parts: int) -> Automaton:
-    """`capped` with each state in at most `parts` parts of equal width in dose; parts that do the same are one again."""
+def _parted(
+    automaton: Automaton, light: NDArray[np.float64], cap: float, parts: int
+) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:
+    """The states of each slot in at most `parts` parts of equal width in dose, and where each of them leads."""
     n_states = automaton.n_states
     levels = [(np.zeros(1, np.int64), np.zeros(1))]  # states, and the dose before each
     edges = []  # of each level: an entry of the next one, or -1 - the node at which the walk ends
@@ -182,11 +198,11 @@ def _parted(automaton: Automaton, light: NDArray[np.float64], cap: float, parts:
         edge[goes_on] = entry.reshape(-1)
         edges.append(edge)
         levels.append((keys // parts, most))
-    return _joined([state for state, _ in levels[:-1]], edges, automaton)
+    return [state for state, _ in levels[:-1]], edges
 
 
-def _joined(states: list[NDArray[np.int64]], edges: list[NDArray[np.int64]], automaton: Automaton) -> Automaton:
-    """Put levels together from the last one up; entries that show the same state and lead to the same nodes become one."""
+def _joined(states: list[NDArray[np.int64]], edges: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    """The entries of each slot, rows of a state and where it leads; those of a slot that do the same are one, from the last slot up."""
     kept: list[NDArray[np.int64]] = []
     number = np.zeros(0, np.int64)
     for state, edge in zip(reversed(states), reversed(edges)):
@@ -195,6 +211,11 @@ def _joined(states: list[NDArray[np.int64]], edges: list[NDArray[np.int64]], aut
         rows, number = np.unique(np.column_stack([state, edge]), axis=0, return_inverse=True)
         number = number.reshape(-1)
         kept.insert(0, rows)
+    return kept
+
+
+def _numbered(kept: list[NDArray[np.int64]], automaton: Automaton) -> Automaton:
+    """The automaton of the entries of each slot."""
     starts = np.cumsum([0, *(len(rows) for rows in kept)])
     total = int(starts[-1])
     successors = []

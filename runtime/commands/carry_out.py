@@ -24,7 +24,7 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
 from pans.runtime.operate.first_start import compiled_beside
 
-from .job import Job, recording_header, what_was_run
+from .job import Job, recording_header, stops_of, what_was_run
 from .run_files import check_run_files, claimed, gone_if_refused
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.registration.use import in_use
 
     bundle, bundle_sha256 = load_bundle(job.bundle_path)
-    decider = make_decider(bundle, shots=job.shots, backend=job.backend, confidence=job.confidence)
+    decider = make_decider(bundle, shots=job.shots, backend=job.backend, **stops_of(job, bundle))
     placed = in_use(job.dark.registration, bundle, job.profile, now_utc(), job.dark.max_age_h)
     if placed is not None:
         say(f"pans: {placed.words()}")

@@ -1,6 +1,6 @@
 """What one `pans run` is to do, resolved, and how a recording and a page tell it.
 
-Owns the keys of the recording's header; never measures and never runs anything.
+Owns the keys of the recording's header, and what a dose cap means for the bundle; never measures and never runs anything.
 """
 
 from __future__ import annotations
@@ -11,15 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__
+from pans.runtime.errors import UsageError
 from pans.runtime.flow.settings import FlowSettings
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.live.config import DarkSettings
 from pans.runtime.live.continuous import Continuous
 
 if TYPE_CHECKING:
+    from pans.runtime.bundle.automaton import DoseCap
+    from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.plan import Plan
     from pans.runtime.decide.verdict import Decider
     from pans.runtime.report.summary import Summary
+
+ROUNDING = 1e-9  # of a dose cap: a sum of light is known to so many digits
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +53,7 @@ class Job:
     backend: str = "auto"
     drive: str = "auto"  # of an automaton
     confidence: float = 0.0  # at which an automaton decides; 0: where its walk ends
+    dose_cap: float = 0.0  # most illumination of one object; 0: no cap
     realtime: bool = True
     core: int | None = None
     turn: str = "auto"
@@ -105,6 +111,7 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
 
     from pans.runtime.decide.verdict import choice_of
 
+    dose = getattr(decider, "dose", None)
     return {
         "bundle_sha256": bundle_sha256,
         "command": job.command,
@@ -125,6 +132,8 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             **({"mode": "parallel"} if job.profile.mode == "parallel" else {}),
             **({"drive": plan.drive, "confidence": job.confidence} if plan.drive else {}),
             **({"photon_number_max": plan.largest} if plan.largest > 1 else {}),
+            **({"dose_cap": job.dose_cap} if job.dose_cap else {}),
+            **({"walk_dose": {"most": dose.most, "states": dose.states}} if dose is not None else {}),
         },
         "versions": {
             "pans": __version__,
@@ -135,3 +144,36 @@ def recording_header(job: Job, bundle_sha256: str, decider: Decider, n_objects: 
             "platform": platform.platform(),
         },
     }
+
+
+def stops_of(job: Job, bundle: Bundle) -> dict[str, Any]:
+    """Return where walks end before their leaf, as `make_decider` takes it; UsageError as `dose_of`."""
+    return {"confidence": job.confidence, "dose": dose_of(job, bundle)}
+
+
+def dose_of(job: Job, bundle: Bundle) -> DoseCap | None:
+    """Return what each walk of an automaton may bring, so that no object receives more than `job.dose_cap`; None of fixed patterns.
+
+    UsageError where the cap cannot be kept: for fixed patterns that bring more, passive bundles, objects in flow, and patterns that a
+    registration changes.
+    """
+    if not job.dose_cap:
+        return None
+    if bundle.analyser is not None or job.flow is not None or job.dark.registration is not None:
+        raise UsageError(
+            "--dose-cap is for patterns that are shown to one object after another as the bundle states them: not for passive optics, "
+            "--flow or --registration",
+            remedy="leave --dose-cap out, or the other one",
+        )
+    if bundle.automaton is not None:
+        from pans.runtime.bundle.automaton import STATES_MAX, DoseCap
+
+        return DoseCap(job.dose_cap / job.trials, min(job.profile.projector.automaton_states or STATES_MAX, STATES_MAX))
+    light = bundle.illumination() * job.shots * job.trials
+    if light > job.dose_cap * (1 + ROUNDING):
+        raise UsageError(
+            f"{bundle.name} sends {light:.6g} photoelectrons of illumination to an object ({bundle.n_features} patterns, {job.shots} "
+            f"shots, {job.trials} trials), --dose-cap allows {job.dose_cap:.6g}",
+            remedy="pans order BUNDLE --by dose --dose-cap N makes a bundle of as many patterns as stay below; or fewer shots or trials",
+        )
+    return None

@@ -37,6 +37,7 @@ RANGES = {
     "keep_mb": Range(1e-6, 1e9),
     "disk_reserve_mb": Range(0, 1e9),
     "confidence": Range(0.0, 1.0),
+    "dose_cap": Range(1e-9, 1e15),
     "seed": Range(0, (1 << 63) - 1, whole=True),
 }
 

@@ -108,6 +108,12 @@ def _configure_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--decisions", type=RANGES["decisions"].option, default=0, help="stop after this many decisions"
     )
+    parser.add_argument(
+        "--dose-cap",
+        type=RANGES["dose_cap"].option,
+        metavar="N",
+        help="no object receives more than N photoelectrons of illumination: walks end in time, fixed patterns must all fit",
+    )
     _configure_common(parser, trials=1)
     add_flow_options(parser)
     add_dark_options(parser)
@@ -179,6 +185,7 @@ def _job(args: argparse.Namespace, bundle: Path, device: str, profile: str, deci
         backend=args.backend,
         drive=args.drive,
         confidence=args.confidence,
+        dose_cap=getattr(args, "dose_cap", None) or 0.0,
         realtime=not args.no_realtime,
         core=args.core,
         turn=args.turn,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pans.runtime.bundle.automaton import Automaton, stopped
+from pans.runtime.bundle.automaton import Automaton, DoseCap, capped, stopped
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.walks import log_scores
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
@@ -74,14 +74,15 @@ class AutomatonDecider:
 
     name = "automaton"
 
-    def __init__(self, bundle: Bundle, confidence: float = 0.0) -> None:
-        """`confidence` above 0: a walk ends where a class is that sure, and a leaf below it abstains. UsageError, DamagedFileError."""
+    def __init__(self, bundle: Bundle, confidence: float = 0.0, dose: DoseCap | None = None) -> None:
+        """`confidence` above 0: a walk ends where a class is that sure, and a leaf below it abstains. `dose`: it ends before it brings
+        more light than that. UsageError, DamagedFileError."""
         if bundle.automaton is None:
             raise UsageError(f"{bundle.name} has no automaton", remedy="use the back end auto")
         whole = bundle.automaton
         with as_usage_error():
-            self.automaton: Automaton = stopped(whole, confidence) if confidence else whole
-        self.confidence = confidence
+            self.automaton: Automaton = walked_within(bundle, whole, confidence, dose)
+        self.confidence, self.dose = confidence, dose
         self.n_features, self.n_classes = self.automaton.n_bits, self.automaton.n_classes
         self.posteriors = self.automaton.posteriors[self.automaton.n_states :]  # of the leaves
         self.labels, self.probabilities = leaf_verdicts(self.automaton, confidence)
@@ -134,6 +135,12 @@ class AutomatonDecider:
                 f"{bundle.name}: golden walk {row} ends at leaf {leaves[row]} here", remedy="export the bundle again"
             )
         demand_golden(self.name, log_scores(whole.posteriors[walks[:, -1]]), bundle.golden_scores, bundle)
+
+
+def walked_within(bundle: Bundle, automaton: Automaton, confidence: float, dose: DoseCap | None) -> Automaton:
+    """Return the automaton that really runs: `automaton` of `bundle` where it stops by confidence (0: never) and within a dose."""
+    found = stopped(automaton, confidence) if confidence else automaton
+    return found if dose is None else capped(found, bundle.light_of(found), dose.most, dose.states)
 
 
 def leaf_verdicts(automaton: Automaton, confidence: float) -> Verdicts:

@@ -14,6 +14,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import DoseCap
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
 
@@ -31,13 +32,16 @@ from .verdict import softmax_winner as softmax_winner
 MEASURED_CALLS = 200
 
 
-def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto", confidence: float = 0.0) -> Decider:
+def make_decider(
+    bundle: Bundle, *, shots: int = 1, backend: str = "auto", confidence: float = 0.0, dose: DoseCap | None = None
+) -> Decider:
     """Return a warmed-up back end that has answered the golden vectors of `bundle`.
 
     `auto` takes the table for single shots where there is one, and else the one whose median time for a decision is the least here, among
     those that answer as the float head does (`choice` says what was measured). An automaton decides by itself; with a `confidence` above 0
-    it stops as soon as a class is that sure, and abstains at a leaf below it. UsageError for a back end that the bundle does not have
-    or that cannot answer `shots`; DamagedFileError when it contradicts the golden vectors.
+    it stops as soon as a class is that sure, and abstains at a leaf below it; with a `dose` it stops before it brings more light.
+    UsageError for a back end that the bundle does not have or that cannot answer `shots`; DamagedFileError when it contradicts the
+    golden vectors.
     """
     if backend not in BACKENDS and backend not in offered_backends():
         raise UsageError(
@@ -47,7 +51,9 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto", confi
     if shots < 1:
         raise UsageError(f"shots is {shots}, allowed: 1 or more")
     if bundle.automaton is not None and backend in BACKENDS:
-        return _automaton_decider(bundle, shots, backend, confidence)
+        return _automaton_decider(bundle, shots, backend, confidence, dose)
+    if dose is not None:
+        raise UsageError(f"a walk's dose, but {bundle.name} has no automaton", remedy="leave it out")
     if confidence:
         raise UsageError(
             f"confidence is {confidence:g}, but {bundle.name} shows all its patterns before it decides",
@@ -64,7 +70,7 @@ def make_decider(bundle: Bundle, *, shots: int = 1, backend: str = "auto", confi
     return OfferedDecider(offered_backends()[backend], bundle, shots)
 
 
-def _automaton_decider(bundle: Bundle, shots: int, backend: str, confidence: float) -> Decider:
+def _automaton_decider(bundle: Bundle, shots: int, backend: str, confidence: float, dose: DoseCap | None) -> Decider:
     from .automaton import AutomatonDecider, demand_one_shot
 
     if backend not in ("auto", AutomatonDecider.name):
@@ -73,7 +79,7 @@ def _automaton_decider(bundle: Bundle, shots: int, backend: str, confidence: flo
             remedy="use the back end auto",
         )
     demand_one_shot(shots)
-    return AutomatonDecider(bundle, confidence)
+    return AutomatonDecider(bundle, confidence, dose)
 
 
 def _make(bundle: Bundle, shots: int, backend: str) -> Decider:

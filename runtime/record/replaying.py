@@ -32,7 +32,7 @@ from pans.runtime.wire.messages import MalformedMessage, unpack_body
 from .log import LogEncoder
 from .parts import place_of
 from .recording import Recording
-from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device
+from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
 
 SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
@@ -144,7 +144,8 @@ def _rebuilt(
         sent = sent_to_device(recording)
         tick_hz, shots = TICK_HZ.checked(config["tick_hz"], "tick_hz"), SHOTS.checked(config["shots"], "shots")
         automaton, confidence = automaton_of(config, bundle), float(config.get("confidence", 0.0))
-        decider = make_decider(bundle, shots=shots, backend=str(config.get("backend", "auto")), confidence=confidence)
+        backend = str(config.get("backend", "auto"))
+        decider = make_decider(bundle, shots=shots, backend=backend, confidence=confidence, dose=walk_dose(config))
         plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton))
         if pictures is not None:
             decider = pictures.over(decider)

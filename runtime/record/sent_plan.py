@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pans.runtime.bundle.automaton import Automaton, stopped
+from pans.runtime.bundle.automaton import Automaton, DoseCap
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_from_chunks
@@ -115,10 +115,17 @@ def automaton_of(config: Mapping[str, Any], bundle: Bundle | None) -> Automaton 
         if automaton is not None:
             raise ValueError("config.drive is missing: the recording does not say who drove its automaton")
         return None
-    if automaton is None:
+    from pans.runtime.decide.automaton import walked_within  # numba is loaded only for those who follow a walk
+
+    if automaton is None or bundle is None:
         raise ValueError("the run followed an automaton, which is not in the recording")
-    confidence = float(config["confidence"])
-    return stopped(automaton, confidence) if confidence else automaton
+    return walked_within(bundle, automaton, float(config["confidence"]), walk_dose(config))
+
+
+def walk_dose(config: Mapping[str, Any]) -> DoseCap | None:
+    """Return the cap that a run with this `config` kept on each walk, None of others; KeyError or ValueError if it does not tell."""
+    told = config.get("walk_dose")
+    return None if told is None else DoseCap(float(told["most"]), int(told["states"]))
 
 
 def recorded_plan(recording: Recording) -> Plan:

@@ -165,9 +165,10 @@ def _read(path: Path, bundle: Bundle, bundle_sha256: str, cycle: int) -> _Read:
             remedy="refit the bundle that the recording was made with",
         )
     config = recording.header.get("config")
-    if isinstance(config, dict) and ("flow" in config or config.get("confidence")):
-        what = "objects flow past" if "flow" in config else "walks end early (--confidence)"
-        raise UsageError(f"{path}: {what} in this run", remedy="record objects that stand still, without --confidence")
+    if isinstance(config, dict) and ("flow" in config or config.get("confidence") or config.get("walk_dose")):
+        what = "objects flow past" if "flow" in config else "walks end early (--confidence, --dose-cap)"
+        remedy = "record objects that stand still, without --confidence and --dose-cap"
+        raise UsageError(f"{path}: {what} in this run", remedy=remedy)
     log = ClickLog()
     found_again = replay(recording, bundle, log)
     if not found_again.as_recorded or len(log.counts) != len(log.decisions):

@@ -226,7 +226,7 @@ def walk_figures(result: RunResult, plan: Plan, bundle: Bundle, profile: str, co
     hosted = plan.drive == "host"
     light = float(result.states_shown @ bundle.light_of(plan.automaton))
     figures, off = tally.figures(), None
-    if expected is not None and expected["profile"] == profile and not confidence:
+    if expected is not None and expected["profile"] == profile and plan.automaton is bundle.automaton:
         off = _in_standard_errors(figures.accuracy, figures.accuracy_stderr_objects, expected)
     return WalkFigures(
         drive=plan.drive,

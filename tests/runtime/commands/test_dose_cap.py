@@ -1,0 +1,103 @@
+"""`pans run --dose-cap`: which walk each object is left, and what is refused with the numbers."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from automata import automaton_bundle
+from bundles import made_bundle
+from commands import json_of
+
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.automaton import STATES_MAX, DoseCap
+from pans.runtime.commands.job import Job, dose_of, stops_of
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.errors import UsageError
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.live.config import DarkSettings
+from pans.runtime.record.sent_plan import automaton_of
+
+IDEAL = load_profile("ideal")
+JOB = Job(Path("toy.pans"), "sim:ideal", IDEAL, 100.0, IDEAL, dose_cap=3.0)
+
+
+def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
+    bundle = automaton_bundle()
+    assert bundle.automaton is not None
+    job = replace(JOB, dose_cap=6.0, trials=2)
+    dose = dose_of(job, bundle)
+    assert dose is not None
+    assert dose.most == 3.0
+    decider = make_decider(bundle, **stops_of(job, bundle))
+    automaton = decider.automaton  # type: ignore[attr-defined]
+    assert automaton.n_states < bundle.automaton.n_states
+    light = bundle.light_of(automaton)
+    most = 0.0
+    for word in itertools.product((0, 1), repeat=automaton.n_slots):
+        node, spent = 0, 0.0
+        for click in word:
+            if node < automaton.n_states:
+                spent += light[node]
+                node = int(automaton.successors[node, click])
+        most = max(most, spent)
+    assert 2.0 < most <= 3.0
+    config = {"drive": "device", "confidence": 0.0, "walk_dose": {"most": dose.most, "states": dose.states}}
+    again = automaton_of(config, bundle)
+    assert again is not None
+    np.testing.assert_array_equal(again.successors, automaton.successors)
+    np.testing.assert_array_equal(again.posteriors, automaton.posteriors)
+
+
+def test_without_a_cap_nothing_changes() -> None:
+    bundle = automaton_bundle()
+    assert dose_of(replace(JOB, dose_cap=0.0), bundle) is None
+    assert make_decider(bundle, **stops_of(replace(JOB, dose_cap=0.0), bundle)).automaton is bundle.automaton  # type: ignore[attr-defined]
+
+
+def test_the_device_s_memory_for_states_bounds_the_automaton() -> None:
+    bundle = automaton_bundle()
+    for held, allowed in ((0, STATES_MAX), (7, 7), (10**6, STATES_MAX)):
+        profile = replace(IDEAL, projector=replace(IDEAL.projector, automaton_states=held))
+        assert dose_of(replace(JOB, profile=profile), bundle) == DoseCap(3.0, allowed)
+
+
+def test_fixed_patterns_must_fit() -> None:
+    bundle = made_bundle(3, 2, table=np.zeros((8, 2)))  # one photoelectron each
+    assert dose_of(JOB, bundle) is None
+    for changed in (replace(JOB, dose_cap=2.9), replace(JOB, shots=2), replace(JOB, trials=2)):
+        with pytest.raises(
+            UsageError, match=r"photoelectrons of illumination to an object .*--dose-cap allows"
+        ) as told:
+            dose_of(changed, bundle)
+        assert "pans order" in (told.value.remedy or "")
+    with pytest.raises(UsageError, match="has no automaton"):
+        make_decider(bundle, dose=DoseCap(1.0))
+
+
+def test_what_a_cap_cannot_know_is_refused() -> None:
+    changed = replace(JOB, dark=DarkSettings(registration=Path("there.registration")))
+    with pytest.raises(UsageError, match="not for passive optics"):
+        dose_of(changed, automaton_bundle())
+
+
+@pytest.mark.parametrize("most", [0.0, -1.0, float("nan"), float("inf")])
+def test_no_cap_is_no_dose(most: float) -> None:
+    with pytest.raises(ValueError, match="dose cap"):
+        DoseCap(most)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["device", "host"])
+def test_a_run_within_a_cap_replays_to_the_same_decisions(
+    drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = "sim:dmd-spad?scene=fashion200&pace=fast"
+    words = ("--dose-cap", 200, "--drive", drive, "--decisions", 40, "--no-realtime", "--out", tmp_path / "run")
+    ran = json_of(capsys, "run", SHIPPED / "fashion-adaptive.pans", "--device", device, *words)
+    assert 100 < ran["illumination"] <= 200
+    again = json_of(capsys, "replay", tmp_path / "run" / "run.pansrec")
+    assert again["identical"]
