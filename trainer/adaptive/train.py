@@ -190,7 +190,7 @@ class _Run:
         found = node_counts(self.machine, self.sight(self.products), self._some_blocks())
         share = self.objects.n_fit / float(found[0].sum())
         for counts, arrived in zip(self.machine.counts, found[1:]):
-            counts.add_(torch.from_numpy(arrived[len(arrived) - len(counts) :]), alpha=share)
+            counts.add_(torch.from_numpy(arrived[len(arrived) - len(counts) :]), alpha=share).add_(COUNT_FLOOR)
 
     def soften(self, task: Task, file: Path | None, keep: Callable[[], None]) -> None:
         """Let a network's answers take the place of the labels, as far as is wanted: those of the checkpoint, of `file`, or new ones."""

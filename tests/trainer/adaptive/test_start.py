@@ -14,6 +14,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import load_profile
+from pans.trainer.adaptive import train as module
 from pans.trainer.adaptive.options import AutomatonOptions, started_from
 from pans.trainer.adaptive.state import machine_of
 from pans.trainer.adaptive.train import train_automaton
@@ -74,6 +75,23 @@ def test_training_goes_on_to_fewer_photons_and_repeats_itself(task, first):
     assert (
         (once.arrays.pattern_levels[once.arrays.pattern] > 0) != began
     ).any()  # patterns changed, not only brightness
+
+
+def test_no_class_is_ruled_out_in_a_leaf_that_no_object_reaches(task, first, monkeypatch):
+    bundle, digest = first
+    sure = np.eye(4, dtype=np.float32)[bundle.automaton.posteriors.argmax(axis=1)]
+    bundle = replace(bundle, automaton=replace(bundle.automaton, posteriors=sure))
+    run = module._Run(task, IDEAL, started_from(FREE, bundle, digest, task, IDEAL), lambda _: None, 0)
+    reached = module.node_counts
+
+    def none_reached(*given):
+        return [counts * (number == 0) for number, counts in enumerate(reached(*given))]
+
+    monkeypatch.setattr(module, "node_counts", none_reached)
+    run.go_on_from(bundle)
+    losses = torch.cat([-torch.log(counts / counts.sum(dim=1, keepdim=True)) for counts in run.machine.counts])
+    assert losses.isfinite().all()
+    assert losses.min() < 0.01  # what the bundle's leaf was sure of
 
 
 def test_what_cannot_be_started_from_is_refused(task, first):
