@@ -64,6 +64,7 @@ class Options:
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
+    spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (concentration.py)
 
 
 SLOPE_MAX = 1e6  # times the light that is meant: far beyond what annealing needs
@@ -79,6 +80,7 @@ LIMITS = {
     "shots": (1, 64),
     "warm": (0, 1),
     "polish": (0, 1),
+    "spread": (0, 10),
     "similarity": (0, 1),
     "mix": (0, 1),
     "shift_px": (0, 65536),

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from pans.runtime.detector import Afterpulses
 from pans.trainer.model.afterpulses import MeanMemory
+from pans.trainer.model.concentration import concentration_slope
 
 from .light import Light
 from .outcomes import Law, mean_reading, readings
@@ -204,12 +205,14 @@ class Aim:
     """What training makes small, the mean of loss + price * photons + exposure_price * exposures.
 
     Prices are in nats, of a photoelectron and of an exposure (saved where a walk ends early). Of the loss `decide` is the part that
-    counts wrong decisions, `WRONG` nats each; the rest is the log loss.
+    counts wrong decisions, `WRONG` nats each; the rest is the log loss. `spread` times the mean over exposures of how concentrated
+    the light is (model/concentration.py) is added.
     """
 
     price: float
     exposure_price: float = 0.0
     decide: float = 0.0
+    spread: float = 0.0
 
     def at_leaves(self, counts: Tensor, one_hot: Tensor) -> Tensor:
         """Return the loss of the objects in every leaf of these class counts, (leaves, objects)."""
@@ -238,7 +241,11 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
         mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
-        level.light.take(mask_slope if scale is None else mask_slope.mul_(scale), light_slope)
+        mask_slope = mask_slope if scale is None else mask_slope.mul_(scale)
+        if aim.spread:
+            mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
+            mask_slope.addcmul_(mass, concentration_slope(level.light.shown()[0]))
+        level.light.take(mask_slope, light_slope)
         beta = gains[0].mul_(step.chances[0])
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)

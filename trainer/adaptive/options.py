@@ -19,10 +19,13 @@ from pans.trainer.options import check_optics
 from pans.trainer.tasks.registry import Task
 
 PHOTONS_PER_CLICK = 1.85  # of a trained automaton, about; only to choose defaults for a budget of clicks
+# of an excess over the budget while growing: without it 56 levels through optics spent 31 of 12 photons
+DEARER_POWER, DEARER_MAX = 2.0, 100.0
 PRICE_AT_10 = 0.02  # nats per photoelectron at which training spends about 10 of them on the public sets
 PRICE_POWER = 1.6  # how the price falls with the budget
 GROWN_PRICE = 0.7  # of the last level grown, over the price of the budget: tuning saves light
 DEFAULT_PHOTONS = 10.0
+GREY_EPOCHS = 3
 # by task, where they helped on held-back objects (docs/how-to/automaton.md)
 COPIES_OF = {"mnist": 20}
 SOFT_OF = {"fashion-mnist": 0.5}
@@ -44,7 +47,7 @@ class AutomatonOptions:
         0.2  # nats per photoelectron of the first question, halved every `half` levels towards the last price
     )
     half: float = 6.0
-    tune_epochs: int = 3
+    tune_epochs: int | None = None  # of grey patterns; None: 3, or 0 through optics, where they brought nothing
     epochs: int = 6  # of the patterns as they are shown
     tune_rate: float = 0.005
     rate: float = 0.01
@@ -65,6 +68,7 @@ class AutomatonOptions:
     teacher_epochs: int = 6  # of that network
     dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
+    spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (model/concentration.py)
     outcomes: int = 2  # of one exposure: no click and a click, or 0, 1, ... photons and the last "this many or more"
     start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
 
@@ -85,6 +89,7 @@ LIMITS = {
     "soft": (0, 1),
     "decide": (0, 1),
     "exposure_price": (0, 10),
+    "spread": (0, 10),
     "teacher_epochs": (1, 1000),
     "outcomes": (2, OUTCOMES_MAX),
     "patterns": (0, 65_535),
@@ -133,17 +138,28 @@ def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int
     return exposures, states
 
 
-def price_at(options: AutomatonOptions, level: int) -> float:
-    """Return the price of light in a level that grows: dear at first, when every photon is spent on all objects."""
+def price_at(options: AutomatonOptions, level: int, excess: float = 0.0) -> float:
+    """Return the price of light in a level that grows: dear at first, when every photon is spent on all objects.
+
+    Through optics it is dearer where more was spent than the share of the levels so far: `excess` times as much.
+    """
     last = GROWN_PRICE * price_of(photons_wanted(options))
-    return last + (max(last, options.first_price) - last) * 0.5 ** (level / options.half)
+    price = last + (max(last, options.first_price) - last) * 0.5 ** (level / options.half)
+    return price if options.optics is None else price * min(DEARER_MAX, max(1.0, excess**DEARER_POWER))
 
 
 def for_task(options: AutomatonOptions, task: str) -> AutomatonOptions:
     """Return `options` with soft targets and copies spelt out where they were left to the task of that name."""
     soft = SOFT_OF.get(task, 0.0) if options.soft is None else options.soft
     copies = COPIES_OF.get(task, 0) if options.copies is None else options.copies
-    return replace(options, soft=soft, copies=copies)
+    return replace(options, soft=soft, copies=copies, tune_epochs=tune_epochs_of(options))
+
+
+def tune_epochs_of(options: AutomatonOptions) -> int:
+    """Return how many epochs grey patterns are tuned: those asked for, else 3, or none where light leaks through dark pixels."""
+    if options.tune_epochs is not None:
+        return options.tune_epochs
+    return GREY_EPOCHS if options.optics is None else 0
 
 
 def started_from(

@@ -45,6 +45,7 @@ from .options import (
     photons_wanted,
     price_at,
     price_of,
+    tune_epochs_of,
     with_defaults,
 )
 from .posteriors import Posteriors, calibrated, node_counts
@@ -125,7 +126,7 @@ def train_automaton(
 
     run.soften(task, teacher, keep)
     run.grow(keep)
-    run.tune("grey", options.tune_epochs, options.tune_rate, keep)
+    run.tune("grey", tune_epochs_of(options), options.tune_rate, keep)
     run.start_showing()
     run.tune("shown", options.epochs, options.rate, keep)
     return run.finish()
@@ -160,7 +161,7 @@ class _Run:
     @property
     def steps(self) -> int:
         """Levels to grow and epochs to tune."""
-        return self.exposures + self.options.tune_epochs + self.options.epochs
+        return self.exposures + tune_epochs_of(self.options) + self.options.epochs
 
     # ---- the instrument ----
 
@@ -225,7 +226,9 @@ class _Run:
             growth = Growth(blocks, self.sight(self.products), options, new_generator(self.options.seed))
             growth.follow(self.machine.levels)
             while len(growth.levels) < self.exposures:
-                growth.grow(price_at(self.options, len(growth.levels)))
+                level = len(growth.levels)
+                excess = self.price.excess(growth.spent, level / self.exposures)
+                growth.grow(price_at(self.options, level, excess))
                 self.machine = growth.machine()
                 self.report(self._grown(growth))
                 if len(growth.levels) % KEPT_EVERY == 0:
@@ -301,7 +304,7 @@ class _Run:
         steps = max(1, epochs * -(-self.objects.n_fit // size))
         if self.tuning is None:
             self.tuning = Tuning(self.machine, self.sight(self.products), self.price, rate, steps)
-            self.tuning.exposure_price = self.options.exposure_price
+            self.tuning.exposure_price, self.tuning.spread = self.options.exposure_price, self.options.spread
             if self.saved_tuning is not None:
                 self.tuning.restore(self.saved_tuning)
                 self.saved_tuning = None
@@ -317,7 +320,7 @@ class _Run:
             blocks = self.objects.epoch(FIRST_EPOCH[stage] + self.epoch, size, self.products)
             told = self.tuning.epoch(blocks)
             self.epoch += 1
-            before = self.exposures + (self.options.tune_epochs if stage == "shown" else 0)
+            before = self.exposures + (tune_epochs_of(self.options) if stage == "shown" else 0)
             figures_told = told.loss, told.accuracy, told.clicks, told.photons, told.price
             self.report(Progress(stage, before + self.epoch, self.steps, *figures_told))
             keep()

@@ -29,6 +29,10 @@ class Price:
     rate: float = 0.05  # of the logarithm, per step and relative excess
     most: float = 0.02  # change of the logarithm in one step
 
+    def excess(self, spent: tuple[float, float], part: float) -> float:
+        """Return how many times that `part` of the budget was spent, of (photons, clicks); 0 where there is no budget or part."""
+        return spent[self.of_clicks] / (self.budget * part) if self.budget and part else 0.0
+
     def follow(self, spent: float) -> None:
         """Raise the price where more was spent than the budget allows, else lower it."""
         if self.budget is not None:
@@ -54,7 +58,7 @@ class Tuning:
 
     def __init__(self, machine: Machine, sight: Sight, price: Price, rate: float, steps: int) -> None:
         self.machine, self.sight, self.price, self.rate, self.steps = machine, sight, price, rate, steps
-        self.exposure_price = self.decide = 0.0  # see Aim; they may change from epoch to epoch
+        self.exposure_price = self.decide = self.spread = 0.0  # see Aim; they may change from epoch to epoch
         self.done = self.epochs = 0
         self.optimiser = torch.optim.Adam(machine.parameters(), lr=rate, fused=True)
 
@@ -81,7 +85,7 @@ class Tuning:
         machine = self.machine
         with torch.no_grad():
             passed = forward(machine, self.sight, block.grey)
-            aim = Aim(self.price.value, self.exposure_price, self.decide)
+            aim = Aim(self.price.value, self.exposure_price, self.decide, self.spread)
             backward(machine, self.sight, block.grey, block.one_hot, passed, aim)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate * max(0.0, 1 - self.done / self.steps) + 1e-5

@@ -53,6 +53,11 @@ NUMBERS = (
     ("starts", "S", "runs of the first stage per restart; the best goes on"),
     ("warm", "W", "part of the epochs in the first stage"),
     ("polish", "P", "last part of the epochs, trained for decisions (default 0)"),
+    (
+        "spread",
+        "W",
+        "weight in the loss of how concentrated the light of a pattern is, for optics that are not perfect (default 0)",
+    ),
     ("similarity", "S", "of pictures: share of 1 - SSIM in the loss, the rest being the squared error (default 0)"),
     ("mix", "M", "share of the loss of 2 to K shots, for patterns too (default 0)"),
     ("shots", "K", "fit the head to 1 to K shots (default 1)"),

@@ -51,6 +51,7 @@ TAKEN = (
     "reroutes",
     "dark",
     "optics",
+    "spread",
 )
 FOREIGN = (
     *("features", "order", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),

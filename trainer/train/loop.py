@@ -29,6 +29,7 @@ from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.afterpulses import trained_through, with_mean_memory
+from pans.trainer.model.concentration import concentration
 from pans.trainer.model.detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
 from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
@@ -225,6 +226,8 @@ class Run:
     def _penalty(self, clicks: Tensor, photons: Tensor, illumination: Tensor) -> Tensor:
         """Illumination by `alpha`; a budget by a weight that grows while it is exceeded and shrinks while it is not."""
         penalty = (self.options.alpha or 0.0) * illumination
+        if self.options.spread and isinstance(self.encoder, ActiveIllumination):
+            penalty = penalty + self.options.spread * concentration(self.encoder.patterns())
         for name, measured in (("photons", photons), ("clicks", clicks)):
             target = getattr(self.options, name)
             if target is not None:
