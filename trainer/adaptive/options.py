@@ -152,7 +152,7 @@ def for_task(options: AutomatonOptions, task: str) -> AutomatonOptions:
     """Return `options` with soft targets and copies spelt out where they were left to the task of that name."""
     soft = SOFT_OF.get(task, 0.0) if options.soft is None else options.soft
     copies = COPIES_OF.get(task, 0) if options.copies is None else options.copies
-    return replace(options, soft=soft, copies=copies, tune_epochs=tune_epochs_of(options))
+    return replace(options, soft=soft, copies=copies)
 
 
 def tune_epochs_of(options: AutomatonOptions) -> int:

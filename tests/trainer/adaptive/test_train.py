@@ -1,6 +1,7 @@
 """Training of an automaton on a small task: what it learns, the budget, repeatability, checkpoints, the export, and what is refused."""
 
 # ruff: noqa: E402  (what follows needs torch)
+import math
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -24,9 +25,11 @@ from pans.trainer.adaptive.options import (
     for_task,
     price_at,
     states_at_most,
+    tune_epochs_of,
     with_defaults,
 )
 from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.adaptive.tune import Price
 from pans.trainer.export.automaton import compare_walks, export_automaton, measure_walks
 
 IDEAL = load_profile("ideal")
@@ -307,3 +310,18 @@ def test_one_bright_state_does_not_set_the_exposure(task):
     run._choose_top()
     assert level.light.top < 0.9
     assert float(level.light.scale().max()) <= level.light.top * (1 + 1e-6)
+
+
+def test_growing_through_optics_is_dearer_where_more_was_spent_than_the_levels_share():
+    plain, through = replace(SMALL, optics=None), replace(SMALL, optics="psf=0.6:black=0.002")
+    price = Price(0.02, budget=12.0)
+    assert price.excess((6.0, 2.0), 0.25) == pytest.approx(2.0)
+    assert Price(0.02, budget=4.0, of_clicks=True).excess((6.0, 2.0), 0.25) == pytest.approx(2.0)
+    assert price.excess((0.0, 0.0), 0.0) == Price(0.02).excess((6.0, 2.0), 0.25) == 0.0
+    for excess in (0.0, 0.5, 1.0, 2.0, 1e9):
+        assert price_at(plain, 3, excess) == price_at(plain, 3)
+    assert price_at(through, 3, 0.5) == price_at(through, 3, 1.0) == price_at(plain, 3)
+    assert price_at(plain, 3) < price_at(through, 3, 1.5) < price_at(through, 3, 3.0) < math.inf
+    assert price_at(through, 3, 1e9) == price_at(through, 3, 1e12)
+    assert tune_epochs_of(replace(plain, tune_epochs=None)) > tune_epochs_of(replace(through, tune_epochs=None)) == 0
+    assert tune_epochs_of(replace(through, tune_epochs=2)) == 2
