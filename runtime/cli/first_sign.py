@@ -17,7 +17,7 @@ from .talk import has_said, say
 FIRST_AFTER_S = 0.35
 LOOK_EVERY_S = 0.05
 LOOK_FOR_S = 60.0  # a command that has not loaded numba by then does not wait for it
-COMPILING = "compiling kernels: once per machine, about 30 s"
+COMPILING = "compiling kernels: once per machine, about 10 s"
 _listening: list[Any] = []  # numba keeps listeners for good: one per process
 
 

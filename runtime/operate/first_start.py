@@ -76,7 +76,7 @@ def _stamp() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             return None
-        digest = hashlib.sha256(f"{sys.version}{version('numba')}{platform.processor()}{platform.machine()}".encode())
+        digest = hashlib.sha256(f"{sys.version}{version('numba')}{_processor()}{platform.machine()}".encode())
         for package in PACKAGES:
             for path in sorted((Path(__file__).parents[1] / package).glob("*.py")):
                 facts = path.stat()
@@ -84,3 +84,10 @@ def _stamp() -> Path | None:
     except OSError:
         return None
     return folder / f"pans-compiled-{digest.hexdigest()[:16]}"
+
+
+def _processor() -> str:
+    """Return the processor's name, "" where it cannot be read; platform.processor() starts a process for it."""
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as facts:
+        return next((line for line in facts if line.startswith("model name")), "")
+    return ""

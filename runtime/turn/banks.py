@@ -6,6 +6,8 @@ the moment `rings.HEAD` has passed it until `rings.TAIL` does. Never allocates.
 
 from __future__ import annotations
 
+import numpy as np
+
 from pans.runtime.core import stream_kernels as core
 from pans.runtime.wire import walk as stream
 from pans.runtime.wire.inner import inner
@@ -53,7 +55,7 @@ def publish(walk, rings, control, now):  # type: ignore[no-untyped-def]
         rings.states[bank, column] = walk.state[column]
     walk.state[stream.MESSAGES], walk.state[stream.EXPOSURES] = 0, 0
     store(control, ring.HEAD, head + 1)
-    enter_bank(walk, rings, control, (head + 1) % _BANKS, _BANKS)
+    enter_bank(walk, rings, control, (head + 1) % _BANKS, np.int64(_BANKS))
     control[ring.PUBLISH_NS] = now + PUBLISH_EVERY_NS
     return True
 

@@ -169,7 +169,7 @@ def _begin(walk, rings, control):  # type: ignore[no-untyped-def]
     for column in range(ring.ERRNO, ring.N_CONTROL):
         control[column] = 0
     control[ring.FIRST_ID] = control[ring.NEXT_ID]
-    enter_bank(walk, rings, control, 0, ring.N_BANKS if control[ring.LASTING] else 1)
+    enter_bank(walk, rings, control, np.int64(0), ring.N_BANKS if control[ring.LASTING] else 1)
 
 
 @inner
