@@ -18,6 +18,7 @@ from pans.firmware_sim.program import Program, States
 from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, mix
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, stream_key
 from pans.runtime.instrument.count_law import count_chances, counting
+from pans.runtime.wire.inner import inner
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN
 
 from .states import ShowList
@@ -56,7 +57,7 @@ def reader_of(model: DetectorModel, largest: int, seed: int) -> Reader:
     )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def read_number(exposure, light, conditions, reader):  # type: ignore[no-untyped-def]
     """Expose once: `light` photoelectrons expected, conditions float64 (N_CONDITIONS,); return the number that is read."""
     noise, edges, keys = reader
@@ -75,7 +76,7 @@ def read_number(exposure, light, conditions, reader):  # type: ignore[no-untyped
     return number
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _photons(mean, uniform):  # type: ignore[no-untyped-def]
     """A Poisson number by inversion, a float."""
     if mean > _MANY:
@@ -89,12 +90,12 @@ def _photons(mean, uniform):  # type: ignore[no-untyped-def]
     return float(number)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _uniform(exposure, key):  # type: ignore[no-untyped-def]
     return np.float64(mix(mix(_U(exposure) * GOLDEN_WORD + key) + STEP_WORD) >> SHIFT_11) * _UNIT
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _normal(exposure, radius_key, angle_key):  # type: ignore[no-untyped-def]
     """A standard normal number (Box and Muller, 1958)."""
     radius = math.sqrt(-2.0 * math.log(1.0 - _uniform(exposure, radius_key)))

@@ -34,6 +34,7 @@ def test_a_short_run_finds_nothing_and_comes_far() -> None:
     assert counts.commands_executed > 100
     assert counts.commands_refused > 100
     assert counts.blocks_accepted > 100
+    assert counts.counts_accepted > 10
     assert counts.frames_decoded > 100
 
 

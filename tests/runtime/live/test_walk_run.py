@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 from automata import automaton_bundle, random_automaton
 from commands import json_of
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import NO_LABEL, DecisionFlag
-from pans.runtime.record import read_recording
+from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.format import COUNTS_VERSION
 from pans.runtime.record.parts import parts_in
@@ -73,6 +75,25 @@ def test_the_host_and_the_device_give_the_same_walks(
         assert main(["verify", str(tmp_path / drive / "run.pansrec")]) == 0
 
 
+def walked_by_hand(automaton: Automaton, recording: Recording) -> list[tuple[int, int, int]]:
+    """Photons, label and exposures of every walk, from the recorded bytes of COUNTS as protocol.md lays them out."""
+    exposures: dict[int, tuple[int, int]] = {}
+    for _, body in recording.messages():
+        if body[0] == 0x93:
+            first, _, n, largest, _ = struct.unpack_from("<QIHHI", body, 8 + 16)
+            assert largest == automaton.n_outcomes - 1
+            stamps, numbers = struct.unpack_from(f"<{n}H", body, 8 + 36), body[8 + 36 + 2 * n :]
+            exposures |= {first + i: (stamps[i], numbers[i]) for i in range(n)}
+    rows, slots = [], automaton.n_slots + 1  # one dark slot in a cycle
+    for cycle in range(len(exposures) // slots):
+        node, photons, taken = 0, 0, 0
+        for stamp, number in (exposures[cycle * slots + slot] for slot in range(slots)):
+            if node < automaton.n_states and stamp == node:
+                node, photons, taken = int(automaton.successors[node][number]), photons + number, taken + 1
+        rows.append((photons, int(automaton.posteriors[node].argmax()), taken))
+    return rows
+
+
 def test_photon_numbers_lead_the_same_walks_by_the_device_and_by_the_host(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,6 +112,7 @@ def test_photon_numbers_lead_the_same_walks_by_the_device_and_by_the_host(
         assert replays(path)
         assert main(["verify", str(path)]) == 0
         found[drive] = recording.decisions()
+        assert found[drive][["clicks", "label", "exposures"]].tolist() == walked_by_hand(automaton, recording)
         plan = recorded_plan(recording)
         clicks = click_list(recording, plan)
         lit = clicks.pattern != DARK_PATTERN
