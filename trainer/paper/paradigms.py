@@ -46,11 +46,11 @@ MEASURED = (
 FAMILY = "binary"  # of the page `compressive`
 FEATURES = (4, 16, 32, 64, 128, 256, 784)
 OTHERS = (  # patterns, convolutions before the hidden layer or none, epochs, numbers of patterns
-    ("gaussian", False, 15, (16, 64, 256)),
-    ("binning", False, 15, (16, 64, 256)),
-    ("binary", True, 5, (16, 64)),
-    ("gaussian", True, 5, (16, 64)),
-    ("binning", True, 5, (16, 64)),
+    ("gaussian", False, 15, (64,)),
+    ("binning", False, 15, (64,)),
+    ("binary", True, 5, (64,)),
+    ("binning", True, 5, (64,)),
+    ("gaussian", True, 5, (64,)),
 )
 PHOTONS = (10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 EPOCHS = 15

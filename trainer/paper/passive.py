@@ -11,6 +11,7 @@ figures are no proof.
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Callable
@@ -26,9 +27,8 @@ from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import replace_file
 from pans.trainer.baselines import strings
 from pans.trainer.baselines.bayes import bayes
-from pans.trainer.baselines.common import Decide, run_trials
+from pans.trainer.baselines.common import Measurement, run_trials
 from pans.trainer.baselines.common import measure as measure_frames
-from pans.trainer.baselines.direct import clean_cnn
 from pans.trainer.evaluate.picture_samples import Samples, first_of_each_class, keep_samples, read_samples, take_samples
 from pans.trainer.export.writer import analyser_of, export_trained
 from pans.trainer.model.detection import click_probability, click_words, sample_clicks, word_probabilities
@@ -52,10 +52,9 @@ from .tables import PASSIVE, UNPRINTED, PassiveRow, PassiveTable, table_of
 PROFILE = "ideal"
 TRIALS = 5
 SHOWN_CELLS = ((4, 0.01), (32, 0.01), (64, 0.01), (64, 0.05))  # the paper draws the last three
-POSTERIOR, CLEAN = "posterior", "network of clean frames"
+POSTERIOR = "posterior"
 STRING_LEVELS = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 50.0)  # photons of direct imaging
-SPECKLE_LEVELS = (10.0, 30.0, 100.0, 300.0, 1000.0)
-CLEAN_EPOCHS = 2
+SPECKLE_LEVELS = (10.0, 20.0, 30.0, 50.0, 100.0, 200.0, 300.0, 600.0, 1000.0)
 PRINTED = 0.005  # points: of two exact figures, those that differ by no printed digit are level
 FLOOR = (
     5e-3  # of the mean light, by which the posterior lifts every pixel: the middle one of those that it may choose from
@@ -302,46 +301,30 @@ def direct_rows(asked: Asked) -> Rows:
         ]
     if asked.name != "mmf-mnist":
         return []
-    frames = _Once(lambda: measure_frames(load_task(asked.name, asked.data_dir), None))
-    network = _Once(lambda: clean_cnn(frames(), seed=0, epochs=CLEAN_EPOCHS))
+    frames = functools.cache(lambda: measure_frames(load_task(asked.name, asked.data_dir), None))
     rows = []
-    for way, how in ((POSTERIOR, {"floor": FLOOR}), (CLEAN, {"epochs": CLEAN_EPOCHS})):
-        for photons in SPECKLE_LEVELS:
-            path = asked.cache / f"mmf-mnist-direct-{way.split()[0]}-{photons:g}.json"
-            decide = partial(_posterior, frames, photons) if way == POSTERIOR else network
-            make = partial(_speckle, asked, frames, photons, way, decide)
-            found = kept(path, {"way": way, "photons": photons, **how}, make, collect=asked.collect)
-            if found is None:
-                asked.report(f"mmf-mnist: {way} at {photons:g} photons is not measured yet (pans reproduce mmf-mnist)")
-            else:
-                rows.append({key: value for key, value in found.items() if key != "made_with"})
+    for photons in SPECKLE_LEVELS:
+        path = asked.cache / f"mmf-mnist-direct-{POSTERIOR}-{photons:g}.json"
+        made_with = {"way": POSTERIOR, "photons": photons, "floor": FLOOR}
+        found = kept(path, made_with, partial(_speckle, asked, frames, photons), collect=asked.collect)
+        if found is None:
+            asked.report(
+                f"mmf-mnist: direct imaging at {photons:g} photons is not measured yet (pans reproduce mmf-mnist)"
+            )
+        else:
+            rows.append({key: value for key, value in found.items() if key != "made_with"})
     return rows
 
 
-class _Once:
-    """What is made when it is first asked for."""
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        self._make, self._made = make, None
-
-    def __call__(self) -> Any:
-        if self._made is None:
-            self._made = self._make()
-        return self._made
-
-
-def _posterior(frames: _Once, photons: float) -> Decide:
-    return bayes(frames(), photons, "counting", seed=0, floor=FLOOR)[0]
-
-
-def _speckle(asked: Asked, frames: _Once, photons: float, way: str, decide: Callable[[], Decide]) -> Row:
+def _speckle(asked: Asked, frames: Callable[[], Measurement], photons: float) -> Row:
     """A camera at the end of the fibre, ideal shot noise, all held-out digits once."""
-    done = run_trials(frames(), photons, "counting", decide(), trials=1, seed=0)
+    decide, _ = bayes(frames(), photons, "counting", seed=0, floor=FLOOR)
+    done = run_trials(frames(), photons, "counting", decide, trials=1, seed=0)
     every, first = done.measured(), done.measured(200)
-    row = {"task": asked.name, "way": way, "dark": 0.0, "asked": photons, "value": 100 * every.accuracy_mean}
+    row = {"task": asked.name, "way": POSTERIOR, "dark": 0.0, "asked": photons, "value": 100 * every.accuracy_mean}
     row |= {"first_200": 100 * first.accuracy_mean, "error_objects": 100 * every.accuracy_se_objects}
     row |= {"clicks": every.clicks_mean, "photons": every.photons_mean, "illumination": 0.0}
-    asked.report(f"mmf-mnist, direct imaging, {way}, {photons:g} photons: {row['value']:.2f} %")
+    asked.report(f"mmf-mnist, direct imaging, {photons:g} photons: {row['value']:.2f} %")
     return row
 
 
@@ -355,11 +338,10 @@ def _beside_direct(name: str, row: Row, direct: Rows) -> Row:
             "direct": found
             | ({"clicks": as_many | against(row["value"], as_many["value"], PRINTED)} if as_many else {})
         }
-    exact = [one for one in direct if one["way"] == POSTERIOR]
-    value, error = (accuracy_at(exact, row["photons"], "photons", of) for of in ("value", "error_objects"))
+    value, error = (accuracy_at(direct, row["photons"], "photons", of) for of in ("value", "error_objects"))
     if value is None or error is None:
         return {}
-    clicks = accuracy_at(exact, row["photons"], "photons", "clicks")
+    clicks = accuracy_at(direct, row["photons"], "photons", "clicks")
     compared = against(row["value"], value, row["error_objects"], error)
     return {"direct": {"photons": {"value": value, "clicks": clicks} | compared}}
 

@@ -1,7 +1,8 @@
 """The page `ablations`: options of a training, each on and off, everything else the same.
 
-Owns the arms, what is trained in each, and the tables. Every arm is trained on the first `OBJECTS` training images alone, so that three
-seeds fit into minutes; its figures stand for differences, not for what a full training reaches. Nothing was chosen by them. Arms of one
+Owns the arms, what is trained in each, and the tables. Every arm is trained on the first `OBJECTS` training images alone, so that several
+seeds fit into minutes; its figures stand for differences, not for what a full training reaches. Seeds come one after the other over all
+arms, so that a killed run has as many of each as it can. Nothing was chosen by them. Arms of one
 study have the same light: a budget of photons, of clicks, or the light that reaches the optics. SIMULATED on the profile `ideal`.
 """
 

@@ -157,3 +157,20 @@ def test_tasks_without_printed_figures_have_none_beside_ours():
     figures |= {"photons": 3.0, "illumination": 0.0, "cpu_seconds": 30.0}
     (table,) = passive.passive_tables("nebula", [figures])
     assert table.lines()[-1] == "| 2 | 0.01 | - | 81.00 | - | - | - | 80.00 | 0.30 | 0.50 | - | 0.90 | 3.0 | 0 | 0.5 |"
+
+
+def test_direct_imaging_stands_beside_a_row_at_its_photons_and_its_clicks():
+    ours = {"task": "barcode", "features": 3, "dark": 0.0, "value": 73.92, "photons": 13.0, "clicks": 1.5}
+    beside = passive._beside_direct("barcode", ours, [])["direct"]
+    assert beside["photons"]["photons"] == pytest.approx(13.0)
+    assert beside["clicks"]["clicks"] == pytest.approx(1.5)
+    assert (beside["photons"]["verdict"], beside["clicks"]["verdict"]) == ("below", "above")
+    curve = [
+        {"photons": n, "value": v, "error_objects": e, "clicks": n}
+        for n, v, e in ((10.0, 40.0, 0.5), (1000.0, 90.0, 0.3))
+    ]
+    row = {"task": "mmf-mnist", "features": 16, "dark": 0.01, "value": 66.0, "photons": 100.0, "error_objects": 0.4}
+    found = passive._beside_direct("mmf-mnist", row, curve)["direct"]["photons"]
+    assert (found["value"], found["ahead"]) == pytest.approx((65.0, 1.0))  # half way in the logarithm
+    assert found["error"] == pytest.approx((0.4**2 + 0.4**2) ** 0.5)
+    assert passive._beside_direct("mmf-mnist", row | {"photons": 5.0}, curve) == {}  # outside of what was measured
