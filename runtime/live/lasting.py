@@ -66,16 +66,19 @@ class LastingTurns(CompiledTurns):
         """See CompiledTurns: what has been published until now."""
         call, run = self._call, self._run
         assert call is not None
-        if not call.under_way and not self._begin():
+        outputs = list[Output]()
+        if call.under_way:
+            if call.is_behind:  # what has been answered is not asked again
+                self._take_banks(outputs)
+            with call.writing():
+                run.connection.send_due()  # at once: a probe has its time already
+        elif not self._begin():
             return super().turn(poll_s)
         self._error = None
-        outputs = list[Output]()
         ended = call.wait(min(max(poll_s, LEAST_LOOK_S), LOOK_S))
         self._take_banks(outputs)
         if ended is None:
             self._look_ahead()
-            with call.writing():
-                run.connection.send_due()
             if self._wants_part:
                 self.halt()
         else:

@@ -79,7 +79,10 @@ class Turn:
 
     def warm_up(self) -> None:
         """Compile or load the kernels, before arming; nothing is read and nothing changes."""
+        from .shared import READY, ask
+
         self.run()
+        ask(self.control, READY)
 
     def drives(self, drive: Drive) -> None:
         """Name the states of walks by `drive` from here on."""

@@ -72,6 +72,12 @@ class LastingCall:
             finally:
                 ask(turn.control, TAKEN)
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether more than one bank waits to be taken."""
+        assert self._turn is not None
+        return int(ask(self._turn.control, READY)) - int(self._turn.control[ring.TAIL]) > 1
+
     def end(self) -> int | None:
         """Stop the call; return why it ended, None where it does not stop."""
         assert self._turn is not None

@@ -39,6 +39,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
+from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS, choose_turn
@@ -46,11 +47,13 @@ from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.turn import kernels, shows, system
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
+from pans.runtime.turn.lasting import LastingCall
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.automata import unpack_show
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import DARK_PATTERN, Ack, Opcode, decode_command, encode_ack, pack_body
+from pans.runtime.wire.session import HostSession
 
 pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
 LONG_NS = 10_000_000_000
@@ -108,6 +111,29 @@ def test_a_run_through_a_descriptor(mode: str, listen: str, tmp_path: Path) -> N
         assert result.turn_us["max"] > 0
     else:
         assert not decisions["flags"].any()
+
+
+def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has its time when it is made: a wait before it is sent would count as its way to the device."""
+    told: list[str] = []
+    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (LastingCall, "wait")):
+        original = getattr(owner, name)
+
+        def noted(*arguments: Any, name: str = name, original: Any = original) -> Any:
+            found = original(*arguments)
+            if name != "flush" or found:  # something was sent
+                told.append(name)
+            return found
+
+        monkeypatch.setattr(owner, name, noted)
+    setup = Served("sequential", "tcp:127.0.0.1:0")
+    recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
+    setup.close()
+    armed = told.index("wait")
+    assert told[armed:].count("probe") > 0
+    assert [told[at + 1] for at, what in enumerate(told) if what == "probe" and at > armed] == ["flush"] * told[
+        armed:
+    ].count("probe")
 
 
 @pytest.mark.parametrize("acts", [True, False])
