@@ -46,7 +46,7 @@ class DarkGuard:
         policy: str = "warn",
         bundle: Bundle | None = None,
         shots: int = 1,
-        afterpulses: bool = False,
+        afterpulses: int = 0,
         lit: DeadChannelTest | None = None,
     ) -> None:
         if policy not in POLICIES:
@@ -65,9 +65,9 @@ class DarkGuard:
         self.findings: list[Finding] = []
         self.dropped_findings = 0
         self._dark_slot = plan.slot_pattern == DARK_PATTERN
-        self._afterpulses = afterpulses  # whether the detector has them: then exposures behind a click are left out
+        self._afterpulses = int(afterpulses)  # so many exposures behind a click are left out; 0: none
         self._any_dark = bool(self._dark_slot.any())
-        self._silent_before: bool | None = None  # of the exposure before the next block; None where it is not known
+        self._silent_before = 0  # exposures without a click before the next block, as far as is known
         self._next = 0
         self._made: Decider | None = None
         self._made_for: tuple[Any, ...] = ()
@@ -87,12 +87,12 @@ class DarkGuard:
         """Follow another stream: its exposures count from 0 again, the rates go on."""
         if self.lit is not None:
             self.lit.end_object()
-        self._next, self._silent_before = 0, None
+        self._next = self._silent_before = 0
 
     def take(self, block: ClickBlock | FrameBlock) -> list[Finding]:
         """Take a block: its dark exposures, and what its lit ones say about dead channels; return the findings.
 
-        With one detector that afterpulses, an exposure right behind a click is left out: an afterpulse is no dark count.
+        With one detector that afterpulses, exposures close behind a click are left out: an afterpulse is no dark count.
         """
         if self.lit is not None:
             words = block.words if isinstance(block, FrameBlock) else _clicked(block).reshape(-1, 1)
@@ -153,10 +153,15 @@ class DarkGuard:
         bits, dark = _clicked(block), np.asarray(block.patterns) == DARK_PATTERN
         if not self._afterpulses:
             return self.take_dark_words(bits[dark].reshape(-1, 1))
-        known = self._silent_before if block.exposure_index == self._next else False
-        silent = np.concatenate([[bool(known)], bits[:-1] == 0])
-        self._next, self._silent_before = block.exposure_index + len(bits), bool(bits[-1] == 0)
-        return self.take_dark_words(bits[dark & silent].reshape(-1, 1))
+        if block.exposure_index != self._next:
+            self._silent_before = 0
+        places = np.arange(len(bits) + 1)
+        last = np.maximum.accumulate(
+            np.append(-1 - self._silent_before, np.where(bits != 0, places[:-1], -1 - self._silent_before))
+        )
+        silent = places - 1 - last  # exposures without a click before each one, and before the next block
+        self._next, self._silent_before = block.exposure_index + len(bits), int(silent[-1])
+        return self.take_dark_words(bits[dark & (silent[:-1] >= self._afterpulses)].reshape(-1, 1))
 
     def take_dark_words(self, words: NDArray[np.uint8]) -> list[Finding]:
         """Take dark exposures, words uint8 (n, bytes), in the order of time; return the findings."""
@@ -287,7 +292,14 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     lit = None
     if "lit" in header:  # recordings made before have none
         lit = DeadChannelTest(low, float(header["lit"]["arl_exposures"]), float(header["lit"]["arl_objects"]))
-    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, bool(header["afterpulses"]), lit)
+    return DarkGuard(plan, watch, str(header["policy"]), bundle, shots, _exposures_left_out(header["afterpulses"]), lit)
+
+
+def _exposures_left_out(said: Any) -> int:
+    """How many exposures behind a click are left out; recordings made before say whether one is."""
+    if not isinstance(said, int) or not 0 <= said < 1 << 31:
+        raise ValueError(f"afterpulses {said!r}, allowed: true, false or a number of exposures")
+    return int(said)
 
 
 def _clicked(block: ClickBlock) -> NDArray[np.uint8]:

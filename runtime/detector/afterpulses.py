@@ -35,6 +35,7 @@ from pans.runtime.instrument.profile_schema import FREE_RUNNING
 
 F64 = NDArray[np.float64]
 MOST_PROBABLE = 0.6  # -log(1 - p) stays below 1: beyond it every detection would cause more than one
+LEAST_DARK = 1e-9  # chance of a dark click, below which none is told from another
 LEAST_MEAN = 1e-300  # of an exposure; below it there is no click that could fill a trap
 
 
@@ -115,6 +116,16 @@ class Afterpulses:
     def after_silences(self, count: int) -> float:
         """Return what `count` silent, dark exposures leave of a memory."""
         return self.decay**count
+
+    def exposures_seen(self, dark: float) -> int:
+        """Return behind how many exposures after a click its afterpulses come less often than a tenth of `dark`, a chance per exposure."""
+        if not self.time:
+            return int(self.probability > 0)
+        first = self.carriers * self.seen
+        least = max(dark, LEAST_DARK) / 10
+        if first <= least or not self.decay:
+            return int(first > least)
+        return math.ceil(math.log(first / least) / -math.log(self.decay))
 
     def memory_by_last(self, rates: F64, rounds: int = 3) -> F64:
         """Return the mean memory before each of `rates` (slots,), shares of clicks in a cycle that repeats, float64 (slots, 2).

@@ -15,6 +15,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag, Output
 from pans.runtime.core.plan import Plan
+from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.calibration import (
     Calibration,
@@ -102,7 +103,7 @@ class DarkRun:
             "expected": expected.tolist(),
             "low": low.tolist(),
             "high": high.tolist(),
-            "afterpulses": self.profile.detector.afterpulse_probability > 0,
+            "afterpulses": afterpulses_of(self.profile, plan.exposure_us).exposures_seen(float(np.min(expected))),
             "lit": {
                 "arl_exposures": max(LEAST_ARL, 2 * FALSE_ALARM_H * plan.slots_per_cycle * 3.6e9 / plan.cycle_us),
                 "arl_objects": max(LEAST_ARL, 2 * FALSE_ALARM_H * 3600 * plan.objects_hz),

@@ -30,6 +30,7 @@ from pans.runtime.core.dark_tables import (
     n_features_of,
     word_prior,
 )
+from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.channel_health import ChannelHealth, DarkMonitor, Finding
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
@@ -336,6 +337,27 @@ def test_an_afterpulse_is_no_dark_count() -> None:
             assert watch.exposures == pytest.approx(len(behind_silence), abs=12)
     assert found[True] == []
     assert found[False]
+
+
+def test_dark_exposures_count_when_it_was_silent_for_long_enough() -> None:
+    plan = shot_major(3, 1)
+    bits = (np.random.default_rng(2).random(4000) < 0.2).astype(np.uint8)
+    for quiet in (1, 3, 7):
+        watch = ChannelWatch(1, np.array([0.2]), WatchSettings(arl_exposures=1e7))
+        guard = DarkGuard(plan, watch, afterpulses=quiet)
+        for first in range(0, len(bits), 8):  # shorter than what must be silent, and longer
+            shown = np.resize(plan.slot_pattern, 8)
+            guard.take(ClickBlock(0, 0, 0, first, 100, 0, shown, bits[first : first + 8]))
+        dark = range(0, len(bits), 4)
+        assert watch.exposures == sum(t >= quiet and not bits[t - quiet : t].any() for t in dark)
+
+
+def test_it_is_silent_for_long_enough_when_afterpulses_hide_behind_dark_counts() -> None:
+    law = Afterpulses(0.05, 2.0, 0.1)
+    behind = law.exposures_seen(1e-4)
+    memory = law.gain(1e-3, 0.0) * law.decay ** np.array([behind - 2, behind])
+    assert memory[0] > 1e-5 > memory[1]
+    assert (Afterpulses(0.0).exposures_seen(1e-4), Afterpulses(0.1).exposures_seen(1e-4)) == (0, 1)
 
 
 def test_empty_fields_as_counts() -> None:
