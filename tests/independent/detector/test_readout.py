@@ -16,6 +16,7 @@ from pans.firmware_sim.scene.detector_model import DetectorModel, detector_model
 from pans.firmware_sim.scene.drawing import moved_parts
 from pans.firmware_sim.scene.moving import Change
 from pans.runtime.instrument.click_law import ClickLaw
+from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.profile import Profile, load_profile
 
 SIGMAS = 4.5
@@ -92,3 +93,21 @@ def test_a_threshold_that_drifts_does_so_by_the_hour() -> None:
     assert found[0] == pytest.approx(float(first_click_probability(model, np.zeros(1))[0]))
     assert found[1] == pytest.approx(float(first_click_probability(later, np.zeros(1))[0]))
     assert found[1] > 1.5 * found[0]
+
+
+def alarms(seconds: int, **facts: float) -> int:
+    """How often the watch on dark counts gives an alarm, at 100 dark exposures per second and the rate of the start."""
+    changes, model = Changes(reading_changes(qcmos(**facts), 1), 1), detector_model(qcmos(), 1000.0)
+    watch = ChannelWatch(1, first_click_probability(model, np.zeros(1)), WatchSettings(arl_exposures=1e8))
+    times = np.arange(seconds, dtype=np.float64)
+    chances = changes.probability(model, np.zeros((seconds, 1)), times, 1e-3)[:, 0]
+    clicks = np.random.default_rng(1).binomial(100, chances)
+    return sum(len(watch.update(100, np.array([one]))) for one in clicks.tolist())
+
+
+def test_the_watch_on_dark_counts_sees_readings_that_rise_and_none_that_sink() -> None:
+    jumps = {"telegraph_share": 1.0, "telegraph_time_s": 60.0}
+    assert alarms(300, telegraph_offset_e=0.3, **jumps)
+    assert alarms(900, threshold_drift_e_per_hour=-1.0)
+    assert not alarms(900, threshold_drift_e_per_hour=1.0)
+    assert not alarms(900)
