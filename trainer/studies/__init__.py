@@ -14,6 +14,7 @@ from pans.trainer.paper.page import Page
 __all__ = ["PAGES", "page_of"]
 
 PAGES = {  # name of a page: its module, imported when it is asked for
+    "ablations": "ablations",
     "few-labels": "few_labels",
     "fig-2f": "fig_2f",
     "sequence": "sequence",

@@ -85,7 +85,7 @@ def ablations_page(asked: Asked) -> Made:
             if not asked.wants(arm.options.features):
                 continue
             options = replace(arm.options, seed=seed)
-            made_with = {"images": arm.images, "objects": OBJECTS, "options": plain_options(options)}
+            made_with = {"images": arm.images, "objects": OBJECTS, "options": _differing(options)}
             found = kept(
                 asked.cache / f"ablation-{_name(arm, seed)}.json",
                 made_with,
@@ -96,8 +96,23 @@ def ablations_page(asked: Asked) -> Made:
                 asked.report(f"{arm.study}, {arm.name}, seed {seed}: not trained yet (pans reproduce ablations)")
                 continue
             figures = {key: value for key, value in found.items() if key != "made_with"}
-            rows.append({"study": arm.study, "arm": arm.name, "seed": seed, **figures, **made_with})
+            rows.append(
+                {
+                    "study": arm.study,
+                    "arm": arm.name,
+                    "seed": seed,
+                    **figures,
+                    **made_with,
+                    "options": plain_options(options),
+                }
+            )
     return Made(rows)
+
+
+def _differing(options: Options) -> Row:
+    """What the options are besides the plain ones of as many patterns: options that come later leave finished parts valid."""
+    plain = plain_options(Options(features=options.features))
+    return {key: value for key, value in plain_options(options).items() if key == "features" or value != plain[key]}
 
 
 def _name(arm: Arm, seed: int) -> str:
@@ -147,7 +162,7 @@ def _mean(arm: Arm, rows: Rows) -> Row | None:
         return None
     over = [key for key in FIGURES if key in mine[0]]
     mean: Row = {key: statistics.fmean(row[key] for row in mine) for key in over}
-    spread = statistics.stdev(row["value"] for row in mine) if len(mine) > 1 else 0.0
+    spread = statistics.stdev(row["value"] for row in mine) if len(mine) > 1 else None  # of one it is not known
     return mean | {"arm": arm.name, "trainings": len(mine), "spread_seeds": spread}
 
 
@@ -156,7 +171,7 @@ FIGURES = ("value", "first_200", "error_objects", "clicks", "photons", "illumina
 
 def _beside(mean: Row, reference: Row) -> Row:
     """Errors of both: from the seeds, and from having so many test objects."""
-    errors = [one["spread_seeds"] / math.sqrt(one["trainings"]) for one in (mean, reference)]
+    errors = [(one["spread_seeds"] or 0.0) / math.sqrt(one["trainings"]) for one in (mean, reference)]
     return against(mean["value"], reference["value"], *errors, mean["error_objects"], reference["error_objects"])
 
 
