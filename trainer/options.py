@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pans.runtime.errors import PlanError, UsageError, as_usage_error
-from pans.runtime.imaging import tolerance_of
+from pans.runtime.imaging import bleaching_of, tolerance_of
 from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
@@ -63,6 +63,7 @@ class Options:
     shift_px: int = 0  # training images are moved by up to that much along the rows, for objects in flow
     offset_px: int = 0  # and across them
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
+    bleach: str | None = None  # what the patterns do to the objects, as `--bleach` spells it
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
     spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (concentration.py)
 
@@ -141,8 +142,29 @@ def _check_together(options: Options) -> None:
                 f"--optics: a {options.encoder} encoder shows no patterns that could miss the object",
                 remedy="leave it out, or use --encoder active or automaton",
             )
+    if options.bleach is not None:
+        _check_bleach(options)
     if options.mix > 0 and options.shots < 2:
         raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
+
+
+def _check_bleach(options: Options) -> None:
+    with as_usage_error():
+        bleaching_of(options.bleach or "")
+    if options.encoder != "active" or options.optics is not None or options.shots > 1:
+        raise UsageError(
+            "--bleach is for patterns that are sent once each, on perfect optics: not for a passive encoder, --optics or --shots",
+            remedy="leave --bleach out, or the other one",
+        )
+
+
+def check_order(order: str | None, options: Options) -> None:
+    """Refuse --order where there is none, before anything is trained."""
+    if order and (options.encoder != "active" or options.head != "mlp" or options.bleach is not None):
+        raise UsageError(
+            "--order is for patterns that are sent and the head mlp; trained through bleaching, they have an order already",
+            remedy="leave --order out",
+        )
 
 
 def _check_fits(options: Options, profile: Profile) -> None:
@@ -151,6 +173,11 @@ def _check_fits(options: Options, profile: Profile) -> None:
         raise PlanError(
             f"{options.features} patterns at once, {profile.name} has {channels} detector channels",
             remedy=f"--features {channels}, or fewer",
+        )
+    if options.bleach is not None and profile.mode != "sequential":
+        raise UsageError(
+            f"--bleach: {profile.name} shows all patterns at once, none meets what another has left",
+            remedy="leave it out",
         )
     if options.encoder == "active" and options.features > profile.projector.pattern_memory:
         raise PlanError(

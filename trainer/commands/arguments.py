@@ -17,6 +17,20 @@ def add_data_dir(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data-dir", metavar="DIR", help="folder of the public sets (default: $PANS_DATA)")
 
 
+def add_order_and_bleach(parser: argparse.ArgumentParser) -> None:
+    """Add --order and --bleach, of fixed patterns."""
+    parser.add_argument(
+        "--order",
+        choices=("information", "dose"),
+        help="show the patterns in the order that tells most first, per pattern or per light that it sends",
+    )
+    parser.add_argument(
+        "--bleach",
+        metavar="D0[:mixed]",
+        help="train for objects that bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination",
+    )
+
+
 def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
     """Add --threads, the number of threads of torch."""
     parser.add_argument("--threads", type=int, default=1, metavar="T", help=f"of torch (default 1){consequence}")

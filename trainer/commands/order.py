@@ -49,7 +49,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _order(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
-    from pans.trainer.evaluate.held_out import Conditions, held_out_of
+    from pans.trainer.evaluate.held_out import Conditions, held_out_of, trained_bleaching
     from pans.trainer.evaluate.shown import of_first, patterns_within, training_clicks
     from pans.trainer.tasks.remembered import remembered_task
 
@@ -61,6 +61,11 @@ def _order(args: argparse.Namespace) -> int:
         raise UsageError(
             f"{bundle.name} has an automaton: its clicks choose the order",
             remedy="pans run --dose-cap keeps it within a dose",
+        )
+    if args.by != "none" and not trained_bleaching(bundle).is_none:
+        raise UsageError(
+            f"{bundle.name} was trained through bleaching: its back end expects what the patterns before have left",
+            remedy="--by none --dose-cap N keeps the first patterns",
         )
     with usage_errors():
         bleaching = bleaching_given(args)

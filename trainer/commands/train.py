@@ -27,10 +27,19 @@ from pans.trainer.options import (
     PICTURE_HEADS,
     Options,
     check_options,
+    check_order,
     plain_options,
 )
 
-from .arguments import add_data_dir, add_threads, needing, stated_tolerance, torch_with, usage_errors
+from .arguments import (
+    add_data_dir,
+    add_order_and_bleach,
+    add_threads,
+    needing,
+    stated_tolerance,
+    torch_with,
+    usage_errors,
+)
 from .course import shown_course
 from .evaluate import passive_light, words_of
 from .train_own import Chosen, choose, finish, is_own, set_encoder
@@ -89,7 +98,7 @@ OF_AUTOMATA = (
     *("start", "rate", "reroutes"),
 )
 AS_GIVEN = (
-    *("features", "photons", "budget", "complex_field", "optics"),
+    *("features", "photons", "budget", "complex_field", "optics", "bleach"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
 )
 
@@ -195,11 +204,7 @@ def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head", choices=HEADS, help="digital back end (default mlp; picture where the task asks for it)"
     )
-    parser.add_argument(
-        "--order",
-        choices=("information", "dose"),
-        help="show the patterns in the order that tells most first, per pattern or per light that it sends",
-    )
+    add_order_and_bleach(parser)
     light = parser.add_mutually_exclusive_group()
     light.add_argument(
         "--alpha", type=float, metavar="A", help="weight of the illumination in the loss (default 0.0003)"
@@ -210,12 +215,6 @@ def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
         choices=tuple(BUDGETS),
         help="how strictly --photons and --clicks hold during training (default firm)",
     )
-
-
-def _check_order(order: str | None, options: Options) -> None:
-    """Refuse --order where there is none, before anything is trained."""
-    if order and (options.encoder != "active" or options.head != "mlp"):
-        raise UsageError("--order is for patterns that are sent and the head mlp", remedy="leave --order out")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -246,7 +245,7 @@ def _train(args: argparse.Namespace) -> int:
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
     chosen = choose(args, task, profile) if own else Chosen(task, {})
     options = _options(args, task, profile)
-    _check_order(args.order, options)
+    check_order(args.order, options)
     check_options(options, profile)
     started = time.perf_counter()
     history = _history(args, options, checkpoint, chosen.task)
@@ -297,12 +296,12 @@ def check_files(args: argparse.Namespace, checkpoint: Path) -> None:
 
 def _figures(exported: Exported, trained: Trained, task: Task, profile: Profile) -> tuple[dict[str, Any], str]:
     """What the written bundle decides on the held-out objects, and how well it agrees with the model: for scripts, and in words."""
-    from pans.trainer.evaluate.held_out import HeldOut, measure, trials_needed
+    from pans.trainer.evaluate.held_out import HeldOut, as_trained, measure, trials_needed
 
-    bundle = exported.bundle
+    bundle, told = exported.bundle, as_trained(exported.bundle)
     trials, every = trials_needed(bundle), HeldOut(task, task.test, profile)
-    measured = measure(bundle, every, trials=trials)
-    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials)
+    measured = measure(bundle, every, trials=trials, conditions=told)
+    of_first = measure(bundle, HeldOut(task, task.test.first(200), profile), trials=trials, conditions=told)
     light = passive_light(bundle, every)
     figures = {
         "sha256": exported.sha256,

@@ -54,7 +54,19 @@ TAKEN = (
     "spread",
 )
 FOREIGN = (
-    *("features", "order", "estimator", "head", "alpha", "budget", "input_photons", "restarts", "starts", "warm"),
+    *(
+        "features",
+        "order",
+        "bleach",
+        "estimator",
+        "head",
+        "alpha",
+        "budget",
+        "input_photons",
+        "restarts",
+        "starts",
+        "warm",
+    ),
     *(
         "polish",
         "similarity",

@@ -5,11 +5,12 @@ Owns the choice of profile, held-out objects and trials; the figures are those o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
-from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.tasks.remembered import remembered_task
@@ -42,6 +43,18 @@ class Conditions:
     confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
     imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
     bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
+
+
+def trained_bleaching(bundle: Bundle) -> Bleaching:
+    """Return the bleaching that the back end of `bundle` was trained through."""
+    options = bundle.provenance.get("options")
+    told = options.get("bleach") if isinstance(options, Mapping) else None
+    return bleaching_of(told) if isinstance(told, str) else NO_BLEACHING
+
+
+def as_trained(bundle: Bundle) -> Conditions:
+    """Return the conditions that `bundle` was trained for."""
+    return Conditions(bleaching=trained_bleaching(bundle))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

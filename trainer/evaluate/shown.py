@@ -20,6 +20,7 @@ from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.tasks.registry import Objects
 
 from .accuracy import EXACT_OUTCOMES_MAX, light_of, outcome_probabilities
+from .held_out import trained_bleaching
 
 TRAINING_OBJECTS = 20_000  # the first ones, from which words are known
 WORD_BITS_MAX = 12  # whose chances are summed over training objects; beyond, the head's mean clicks
@@ -40,7 +41,8 @@ def patterns_within(bundle: Bundle, cap: float) -> int:
 
 def training_clicks(bundle: Bundle, profile: Profile, training: Objects) -> F64:
     """Return the click probabilities of the first training objects under the patterns of `bundle` as they were trained, (n, d_f)."""
-    return light_of(bundle, profile, training.first(TRAINING_OBJECTS).images, imaging=profile.imaging()).probability
+    images, imaging = training.first(TRAINING_OBJECTS).images, profile.imaging()
+    return light_of(bundle, profile, images, imaging=imaging, bleaching=trained_bleaching(bundle)).probability
 
 
 def word_chances(probability: F64) -> F64:

@@ -19,10 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pans.runtime.imaging import NO_BLEACHING, bleaching_of
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import Options
 
 from .exposure import top_limits
+from .imaging import bleached_patterns
 
 KAIMING_A = 1.2  # paper, appendix on the training procedure
 
@@ -50,6 +52,7 @@ class ActiveIllumination(nn.Module):
         self.log_top = nn.Parameter(torch.tensor(math.log(top_limits[1])))
         self.top_limits = top_limits
         self.levels: int | None = None
+        self.bleaching = NO_BLEACHING  # what the patterns do to the objects, shown in their order
 
     def start_quantising(self, levels: int) -> None:
         """Show whole levels from now on; the top level starts at the brightest pixel, within its limits."""
@@ -88,6 +91,8 @@ class ActiveIllumination(nn.Module):
     def forward(self, transmission: Tensor, floor: float = 0.0) -> Tensor:
         """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""
         patterns = self.patterns()
+        if not self.bleaching.is_none:
+            patterns = bleached_patterns(self.bleaching, patterns)
         if transmission.shape[1] > patterns.shape[1]:
             # a full pixel of the shortest exposure may be brighter than any that the patterns need; dark ones leak a part of it
             full = patterns.max().clamp(min=self.top_limits[0]) if self.levels is None else self.top()
@@ -180,7 +185,9 @@ Encoder = ActiveIllumination | CoherentField | IncoherentIntensity
 def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch.Generator) -> Encoder:
     """Return the untrained encoder that `options` ask for."""
     if options.encoder == "active":
-        return ActiveIllumination(options.features, n_inputs, top_limits(profile), random, options.light)
+        encoder = ActiveIllumination(options.features, n_inputs, top_limits(profile), random, options.light)
+        encoder.bleaching = NO_BLEACHING if options.bleach is None else bleaching_of(options.bleach)
+        return encoder
     shape = options.features, n_inputs
     passive: dict[str, Any] = {"light": options.light, "conserving": options.conserving}
     if options.encoder == "incoherent":

@@ -1,6 +1,7 @@
 """Objects through drawn optics: what the pattern grid meets of every training object on tables that differ within a tolerance.
 
-Owns the draws and the form in which training sees them. Objects are parted at random into groups, each seen through optics of its own.
+Owns the draws, the form in which training sees them, and what bleaching leaves of patterns.
+Objects are parted at random into groups, each seen through optics of its own.
 Light from dark pattern pixels is linear in the object and in the light of a full pixel: it stands in one more column beside the pixels,
 which meets the brightest level of a pattern as a pixel meets its own. Never trains.
 """
@@ -13,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.imaging import Imaging, Tolerance, operator
+from pans.runtime.imaging import Bleaching, Imaging, Tolerance, operator
 
 OPTICS_STREAM = 0x0971C5  # beside the seed, so that no other draw is repeated
 GROUP = 500  # objects seen through the same optics
+SMALL_DOSE = 1e-3  # over D0, below which the third term of the series is the last that float32 holds
 GROUPS_MIN = 40  # of few objects, so that they meet more than a handful of draws
 
 
@@ -52,3 +54,14 @@ def through(imaging: Imaging, transmission: Tensor, shape: tuple[int, int]) -> T
         seen = seen * torch.from_numpy(imaging.flat.copy()).flatten().to(seen.dtype)
     seen = imaging.gain * seen
     return torch.cat([(1.0 - imaging.black) * seen, imaging.black * seen.sum(dim=1, keepdim=True)], dim=1)
+
+
+def bleached_patterns(law: Bleaching, light: Tensor) -> Tensor:
+    """Return patterns as they act on samples that bleach, (d_f, pixels): as `pans.runtime.imaging.bleached`, and differentiable."""
+    received = light.mean(dim=1, keepdim=True) if law.mixed else light
+    dose = received / law.dose
+    left = torch.exp(dose - torch.cumsum(dose, dim=0))  # before each exposure
+    small = dose < SMALL_DOSE
+    safe = torch.where(small, torch.ones_like(dose), dose)
+    mean = torch.where(small, 1 - dose / 2 + dose**2 / 6, -torch.expm1(-safe) / safe)
+    return light * left * mean

@@ -6,9 +6,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.runtime.imaging import Imaging, met, tolerance_of
+from pans.runtime.imaging import Bleaching, Imaging, bleached, met, tolerance_of
 from pans.trainer.model.encoders import ActiveIllumination
-from pans.trainer.model.imaging import DrawnOptics, through
+from pans.trainer.model.imaging import DrawnOptics, bleached_patterns, through
 
 SHAPE = (6, 7)
 FLAT = np.linspace(0.5, 1.5, 42).reshape(SHAPE)
@@ -57,3 +57,14 @@ def test_an_exact_tolerance_is_one_table():
     objects = torch.rand((50, 42), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     wanted = through(Imaging(0.5, -0.25, psf_px=0.5), objects, SHAPE)
     torch.testing.assert_close(drawn.through(objects, 9), wanted)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize("dose", [1e-2, 0.7, 1e5])
+def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bool) -> None:
+    light = torch.from_numpy(np.random.default_rng(3).random((4, 6)) * 2)
+    light[1, 2] = 0.0
+    law = Bleaching(dose, mixed)
+    np.testing.assert_allclose(bleached_patterns(law, light).numpy(), bleached(law, light.numpy()), rtol=1e-9)
+    small = light.float()[:3, :2].double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: bleached_patterns(law, x), (small,), eps=1e-6 * min(1.0, dose), rtol=1e-3)
