@@ -1,11 +1,11 @@
-"""What WELCOME says of a simulated instrument, its scene and its optics, but for what changes while it runs.
+"""What WELCOME says of a simulated instrument, its scene and its optics.
 
 Owns these keys and their values; never sends them.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from pans.firmware_sim.scene.moving import SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene
@@ -29,8 +29,16 @@ def largest_number(profile: Profile) -> int:
     return largest if largest > 1 and not cannot_count(profile, largest + 1) else 1
 
 
-def standing_facts(view: View, extension: Extension | None, number_max: int) -> dict[str, Any]:
-    """Return WELCOME's map without the present tick, the epoch and the buffer; `extension` None: no automata; `number_max` 1: clicks."""
+class Now(NamedTuple):
+    """What changes while the instrument runs."""
+
+    epoch: int
+    tick: int
+    buffer_messages: int
+
+
+def facts_of(view: View, extension: Extension | None, number_max: int, now: Now) -> dict[str, Any]:
+    """Return WELCOME's map; `extension` None: no automata; `number_max` 1: clicks."""
     profile, optics, scene = view.profile, view.optics, view.scene
     projector = profile.projector
     passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
@@ -45,13 +53,16 @@ def standing_facts(view: View, extension: Extension | None, number_max: int) -> 
         | {
             "firmware": FIRMWARE,
             "serial": f"SIM-{view.seed & 0xFFFFFFFF:08X}",
+            "epoch": now.epoch,
             "tick_hz": profile.clock.tick_hz,
+            "tick": now.tick,
             "mode": profile.mode,
             "channels": profile.detector.channels,
             "levels": projector.levels,
             "pattern_memory": projector.pattern_memory,
             "pattern_pixels": min(projector.width_px * projector.height_px, MAX_PATTERN_PIXELS),
             "slot_memory": MAX_SLOTS,
+            "buffer_messages": now.buffer_messages,
             "simulated": True,
             "profile": profile.name,
             "gate_channels": GATE_CHANNELS,

@@ -24,7 +24,7 @@ from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_patt
 from pans.runtime.wire.counts import unpack_count_states, unpack_read_counts
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
-from .facts import largest_number, standing_facts
+from .facts import Now, facts_of, largest_number
 from .gates import Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
 from .states import ShowList, StateMemory, piece_of
@@ -246,8 +246,8 @@ class Instrument:
         self._send_status()
 
     def _facts(self) -> dict[str, Any]:
-        now = {"epoch": self._epoch, "tick": self._tick, "buffer_messages": self.stream.capacity}
-        return standing_facts(self.view, self.extension, self.number_max) | now
+        now = Now(self._epoch, self._tick, self.stream.capacity)
+        return facts_of(self.view, self.extension, self.number_max, now)
 
     def _grant(self, grant: wire.Grant) -> None:
         if self._run is not None and grant.lease_ms:
