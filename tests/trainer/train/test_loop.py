@@ -76,7 +76,8 @@ def test_bars_are_learned_and_repeat_with_the_seed(task, estimator):
     words = torch.tensor([[float(w >> i & 1) for i in range(4)] for w in range(16)])
     decided = trained.head(words).argmax(dim=1)
     right = joint_distribution(p, torch.from_numpy(task.test.labels), 4)[torch.arange(16), decided].sum()
-    assert float(right) > 0.5  # by chance 0.25
+    # by chance 0.25; undamped gradients learn less where photons are few (docs/results/ablations.md)
+    assert float(right) > (0.35 if estimator == "identity" else 0.5)
     assert trained.quantised.pattern_levels.max() < PROFILE.projector.levels
     assert [report.epoch for report in reports] == list(range(1, 11))
     assert reports[-1].loss < reports[0].loss
@@ -257,7 +258,7 @@ def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_
         ({"photons": 0.0}, "--photons"),
         ({"clicks": float("nan")}, "--clicks"),
         ({"clicks": 4.0}, "below 4"),
-        ({"estimator": "magic"}, "ste, exact"),
+        ({"estimator": "magic"}, "ste, identity, exact"),
         ({"encoder": "magic"}, "active, coherent"),
         ({"head": "magic"}, "mlp, conv"),
         ({"dark": -1.0}, "--dark"),
