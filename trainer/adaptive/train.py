@@ -75,9 +75,7 @@ class TrainedAutomaton:
     machine: Machine
     posteriors: Posteriors
     sight: Sight
-    grey: Callable[
-        [Objects], torch.Tensor
-    ]  # grey values of objects as the machine takes them, float64 (objects, pixels)
+    grey: Callable[[Objects], torch.Tensor]  # grey values as the machine takes them, float64 (objects, pixels)
     held_back: Figures
     price: float
     options: AutomatonOptions
@@ -210,17 +208,15 @@ class _Run:
         self.objects.soften(self.answers, weight)
 
     def _taught(self, epoch: int, loss: float) -> None:
-        self.report(
-            Progress(NETWORK, epoch + 1, self.options.teacher_epochs, loss, math.nan, 0.0, 0.0, self.price.value)
-        )
+        epochs = self.options.teacher_epochs
+        self.report(Progress(NETWORK, epoch + 1, epochs, loss, math.nan, 0.0, 0.0, self.price.value))
 
     def grow(self, keep: Callable[[], None]) -> None:
         """Grow levels until there are as many as exposures."""
         if self.stage != "grow":
             return
-        options = GrowOptions(
-            self.states, self.options.grow_epochs, candidates=self.options.candidates, top=self._highest_top()
-        )
+        asked = self.options
+        options = GrowOptions(self.states, asked.grow_epochs, candidates=asked.candidates, top=self._highest_top())
         blocks = self.objects.epoch(0, GROWTH_BLOCK, self.products, plain=True)
         with torch.no_grad():
             growth = Growth(blocks, self.sight(self.products), options, new_generator(self.options.seed))
