@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -125,7 +124,7 @@ class Detector:
     crosstalk_further: tuple[float, ...] = ()
     telegraph_share: float = 0.0
     telegraph_offset_e: float = 0.0
-    telegraph_time_s: float = math.inf
+    telegraph_time_s: float = 0.0
     threshold_drift_e_per_hour: float = 0.0
     timing_jitter_ns: float = 0.0
     photon_number_max: int = 1

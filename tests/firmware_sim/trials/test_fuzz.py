@@ -152,7 +152,9 @@ def test_a_missing_length_check_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(wire, "decode_clicks", trusting)
     _, failure = fuzz(1, 0, 20_000)
-    assert "ValueError" in failure
+    assert (
+        "ValueError" in failure or "tallies" in failure
+    )  # an array too short, or one message more than the compiled steps take
 
 
 def test_pulses_without_a_limit_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
