@@ -19,7 +19,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import system
 from pans.runtime.turn.lasting import LastingCall
-from pans.runtime.turn.shared import HOLD, LEAVE, ask
+from pans.runtime.turn.shared import HOLD, LEAVE, READY, ask
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.frame import unpack_body
 from pans.runtime.wire.messages import (
@@ -79,6 +79,13 @@ def taken(call: LastingCall, turn: Any) -> tuple[list[Any], list[bytes], list[by
     return rows, messages, answers
 
 
+def await_bank(turn: Any) -> None:
+    """Wait until a bank has been published, however slow the machine is."""
+    until = time.monotonic() + 10
+    while ask(turn.control, READY) == turn.control[ring.TAIL] and time.monotonic() < until:
+        time.sleep(0.001)
+
+
 def test_what_is_published_is_what_python_decides(call: LastingCall, ends: tuple[socket.socket, socket.socket]) -> None:
     """Probes and an ordinary STATUS do not end the call; the messages keep their order."""
     streamed, frames, wanted = stream(cycles=60, block=4)
@@ -90,7 +97,7 @@ def test_what_is_published_is_what_python_decides(call: LastingCall, ends: tuple
         if number % 20 == 7:
             ends[1].send(encode_status(RUNNING, SESSION) + encode_pong(PONG, SESSION))
         if number % 10 == 0:
-            time.sleep(0.004)
+            await_bank(turn)
             for had, more in zip((rows, messages, answers), taken(call, turn)):
                 had.extend(more)  # type: ignore[arg-type]
     until = time.monotonic() + 10
