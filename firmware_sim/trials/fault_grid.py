@@ -142,9 +142,7 @@ def run_case(
         host.start(run)
 
     observers = Observers(host.watch, start)
-    driven: dict[str, Any] = {"drive": plan.drive, "confidence": 0.0}
-    driven |= {"photon_number_max": plan.largest} if plan.largest > 1 else {}
-    header = {"config": {"shots": SHOTS, "tick_hz": profile.clock.tick_hz, "backend": backend, **driven}}
+    header = {"config": _recorded(plan, profile.clock.tick_hz, backend)}
 
     def live(recorder: Recorder) -> RunResult:
         return run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
@@ -176,6 +174,12 @@ def run_case(
         faults={name: count for name, count in asdict(device.counters).items() if count},
         violations=checker.violations,
     )
+
+
+def _recorded(plan: Plan, tick_hz: int, backend: str) -> dict[str, Any]:
+    """What a replay needs to know of the run."""
+    told = {"shots": SHOTS, "tick_hz": tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
+    return told | ({"photon_number_max": plan.largest} if plan.largest > 1 else {})
 
 
 def judged(

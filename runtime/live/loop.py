@@ -78,7 +78,6 @@ def run_live(
     `recovery` says how to reconnect when the device is lost; without it the run ends there.
     """
     started_ns = config.started_ns or time.perf_counter_ns()
-
     failed: list[Connection] = []
 
     def prepare(opened: Link) -> Connection:

@@ -98,12 +98,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
     from pans.trainer.tasks.remembered import remembered_task
 
-    if args.objects is not None and args.objects < 1:
-        raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
-    if args.shots < 1 or args.seed < 0:
-        raise UsageError(f"--shots is {args.shots}, --seed is {args.seed}, allowed: from 1, from 0")
-    if args.data_seed is not None and args.data_seed < 0:
-        raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
+    _check_numbers(args)
     if args.pictures is not None:
         with needing("--pictures", "plot"):
             import matplotlib  # noqa: F401 - asked for before the work, not after it
@@ -128,11 +123,11 @@ def _evaluate(args: argparse.Namespace) -> int:
         _check_data_seed(args, held_out)
         assumed = not args.profile and "profile" not in bundle.provenance
         note(f"evaluating {bundle.name} on {held_out.task.name}")
-        if several:
-            return evaluate_tables(args, bundle, digest, held_out, conditions)
-        if dosed:
-            return evaluate_dose(args, bundle, digest, held_out, conditions)
         started = time.perf_counter()
+        if several or dosed:
+            answer, words = (evaluate_tables if several else evaluate_dose)(args, bundle, held_out, conditions)
+            emit(args, answer | _facts(held_out, digest, started), words)
+            return EXIT_FINE
         if bundle.automaton is None:
             measured = measure(bundle, held_out, shots=args.shots, trials=trials, conditions=conditions)
         else:
@@ -147,20 +142,36 @@ def _evaluate(args: argparse.Namespace) -> int:
     payload = {
         **asdict(measured),
         **more,
-        "task": held_out.task.name,
-        "profile": held_out.profile.name,
         "profile_assumed": assumed,
         "optics": imaging_on(held_out, conditions).numbers(),
         "afterpulses": afterpulses_in(bundle, held_out, args.shots, measured.trials),
-        "sha256": digest,
-        "seconds": time.perf_counter() - started,
-        "simulated": True,
+        **_facts(held_out, digest, started),
     }
     if args.pictures:
         payload["pictures"] = _draw(args, bundle, held_out, conditions)
     differences = more.get("expected_differences") or []
     emit(args, payload, "\n".join([words_of(measured, more), _profile_words(bundle, held_out, args), *differences]))
     return EXIT_ALERT if differences else EXIT_FINE
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    if args.objects is not None and args.objects < 1:
+        raise UsageError(f"--objects is {args.objects}, allowed: 1 or more")
+    if args.shots < 1 or args.seed < 0:
+        raise UsageError(f"--shots is {args.shots}, --seed is {args.seed}, allowed: from 1, from 0")
+    if args.data_seed is not None and args.data_seed < 0:
+        raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
+
+
+def _facts(held_out: HeldOut, sha256: str, started: float) -> dict[str, Any]:
+    """What every answer tells besides its figures."""
+    return {
+        "task": held_out.task.name,
+        "profile": held_out.profile.name,
+        "sha256": sha256,
+        "seconds": time.perf_counter() - started,
+        "simulated": True,
+    }
 
 
 def _check_data_seed(args: argparse.Namespace, held_out: HeldOut) -> None:

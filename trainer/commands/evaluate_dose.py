@@ -7,13 +7,11 @@ them are SIMULATED.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.cli import EXIT_FINE, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of
 from pans.runtime.ranges import Range
@@ -66,24 +64,12 @@ def is_dosed(args: argparse.Namespace) -> bool:
 
 
 def evaluate_dose(
-    args: argparse.Namespace, bundle: Bundle, sha256: str, held_out: HeldOut, conditions: Conditions
-) -> int:
-    """Answer for a cap, for samples that bleach, or for both."""
-    started = time.perf_counter()
-    if args.dose_cap == CURVE_WORD:
-        payload, words = _curve(args, bundle, held_out, conditions)
-    else:
-        payload, words = _one(args, bundle, held_out, conditions)
-    facts = {
-        "bleaching": conditions.bleaching.spelled() or None,
-        "task": held_out.task.name,
-        "profile": held_out.profile.name,
-        "sha256": sha256,
-        "seconds": time.perf_counter() - started,
-        "simulated": True,
-    }
-    emit(args, payload | facts, words)
-    return EXIT_FINE
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    """Return the answer for a cap, for samples that bleach, or for both: as JSON and in words."""
+    make = _curve if args.dose_cap == CURVE_WORD else _one
+    payload, words = make(args, bundle, held_out, conditions)
+    return payload | {"bleaching": conditions.bleaching.spelled() or None}, words
 
 
 def _one(

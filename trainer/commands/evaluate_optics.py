@@ -7,13 +7,11 @@ Owns the two answers beside that of one given table: means over drawn tables (`-
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.cli import EXIT_FINE, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Imaging, Tolerance, imaging_of, tolerance_of
 
@@ -62,23 +60,11 @@ def one_table(text: str | None) -> Imaging | None:
 
 
 def evaluate_tables(
-    args: argparse.Namespace, bundle: Bundle, sha256: str, held_out: HeldOut, conditions: Conditions
-) -> int:
-    """Answer for several tables."""
-    started = time.perf_counter()
-    if args.optics == CURVES_WORD:
-        payload, words = _curves(args, bundle, held_out, conditions)
-    else:
-        payload, words = _drawn(args, bundle, held_out, conditions)
-    facts = {
-        "task": held_out.task.name,
-        "profile": held_out.profile.name,
-        "sha256": sha256,
-        "seconds": time.perf_counter() - started,
-        "simulated": True,
-    }
-    emit(args, payload | facts, words)
-    return EXIT_FINE
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    """Return the answer for several tables, as JSON and in words."""
+    make = _curves if args.optics == CURVES_WORD else _drawn
+    return make(args, bundle, held_out, conditions)
 
 
 def _drawn(
