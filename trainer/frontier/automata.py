@@ -30,22 +30,35 @@ def bundle_path(cache: Path, stem: str, seed: int) -> Path:
     return cache / f"{stem}-seed{seed}.pans"
 
 
-def automaton_row(asked: Asked, stem: str, task: Task, budget: Mapping[str, Any], seed: int) -> Row:
-    """Return the figures of an automaton of that budget (see `automaton_recipe`), trained now unless its bundle is in the cache."""
+def automaton_row(
+    asked: Asked, path: Path, task: Task, budget: Mapping[str, Any], seed: int, start: Path | None = None
+) -> Row:
+    """Return the figures of the automaton of that budget (see `automaton_recipe`) in `path`, trained now unless it is there.
+
+    With `start` the automaton in that bundle is trained on instead of one that grows.
+    """
     from pans.trainer.export.automaton import measure_walks
 
-    options = automaton_recipe(task.name, budget, seed)
-    path = bundle_path(asked.cache, stem, seed)
-    seconds = None
-    if _trained(path, options) is None:
-        seconds = _train(asked, path, task, options)
+    train_unless_kept(asked, path, task, budget, seed, start)
     bundle, digest = load_bundle(path)
     assert bundle.automaton is not None
     profile = load_profile(PROFILE)
     whole, first = (asdict(measure_walks(bundle, task.test.first(count), profile)) for count in (None, FIRST_OBJECTS))
     facts: Row = {"sha256": digest, "states": bundle.automaton.n_states, "patterns_shown": len(bundle.pattern_levels)}
-    seconds = bundle.provenance.get("training_seconds") if seconds is None else seconds
+    seconds = bundle.provenance.get("training_seconds")  # not known of one that was interrupted
     return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}
+
+
+def train_unless_kept(
+    asked: Asked, path: Path, task: Task, budget: Mapping[str, Any], seed: int, start: Path | None = None
+) -> None:
+    """Train the automaton of that budget into `path`, unless one of the same recipe (and of the same `start`) is there."""
+    begun = None if start is None else load_bundle(start)
+    options = automaton_recipe(task.name, budget, seed)
+    if begun is not None:
+        options = _going_on(task, budget, seed, *begun)
+    if _trained(path, options) is None:
+        _train(asked, path, task, options, None if begun is None else begun[0])
 
 
 def automaton_recipe(task: str, budget: Mapping[str, Any], seed: int) -> AutomatonOptions:
@@ -55,6 +68,13 @@ def automaton_recipe(task: str, budget: Mapping[str, Any], seed: int) -> Automat
     options = AutomatonOptions(seed=seed, **budget)
     exposures, states = with_defaults(options, load_profile(PROFILE))
     return for_task(replace(options, exposures=exposures, states=states), task)
+
+
+def _going_on(task: Task, budget: Mapping[str, Any], seed: int, start: Bundle, sha256: str) -> AutomatonOptions:
+    from pans.trainer.adaptive.options import AutomatonOptions, for_task, started_from
+
+    options = AutomatonOptions(seed=seed, **budget)
+    return for_task(started_from(options, start, sha256, task, load_profile(PROFILE)), task.name)
 
 
 def _trained(path: Path, options: AutomatonOptions) -> Bundle | None:
@@ -73,10 +93,15 @@ def made_so(wanted: Mapping[str, Any], found: Any) -> bool:
     """
     from pans.trainer.adaptive.options import AutomatonOptions
 
-    return isinstance(found, dict) and wanted.items() <= (asdict(AutomatonOptions()) | OLDER | found).items()
+    if not isinstance(found, dict):
+        return False
+    had, begun = asdict(AutomatonOptions()) | OLDER | found, wanted.get("start")
+    if isinstance(begun, Mapping):  # the recipe of what it was trained on from
+        return made_so(begun, had["start"]) and made_so({**wanted, "start": None}, {**found, "start": None})
+    return wanted.items() <= had.items()
 
 
-def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions) -> float:
+def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions, start: Bundle | None) -> None:
     from pans.trainer.adaptive.train import train_automaton
     from pans.trainer.device import keep_freed_memory
     from pans.trainer.export.automaton import export_automaton
@@ -92,11 +117,10 @@ def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions) -> f
 
     goes_on = checkpoint.is_file()
     trained = train_automaton(
-        task, profile, options, checkpoint=checkpoint, resume=goes_on, report=said, teacher=teacher
+        task, profile, options, checkpoint=checkpoint, resume=goes_on, report=said, teacher=teacher, start=start
     )
     seconds = time.process_time() - started
     provenance: dict[str, Any] = {"command": "pans reproduce frontier", "options": asdict(options)}
     provenance |= {"training_seconds": round(seconds, 1)} if not goes_on else {}
     export_automaton(path, trained, task, profile, name=path.stem, provenance=provenance, force=True)
     checkpoint.unlink(missing_ok=True)
-    return seconds

@@ -14,7 +14,7 @@ from pans.trainer.paper.page import Row, Rows, at
 from pans.trainer.paper.tables import ACTIVE, FIRST
 
 from .fixed import PAPER
-from .ways import AUTOMATA, DIRECT, STOPPING, TASKS, TRAINED
+from .ways import AUTOMATA, AUTOMATON, DIRECT, ON, STOPPING, TASKS, TRAINED
 
 SUMMED = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
 
@@ -91,16 +91,20 @@ def largest(found: Rows) -> Rows:
 def click_budgets(points: Rows) -> Rows:
     """Return the paper's rows, each with `ours`: of the automata with no more clicks on all images, the one that comes nearest to them.
 
-    It is chosen by clicks, not by accuracy. Rows without one have no `ours`.
+    It is chosen by clicks, not by accuracy. An automaton that was trained on stands for the one it began with. Rows without one
+    have no `ours`.
     """
+    automata = [row for row in points if row["way"] in AUTOMATA]
+    finished = {(row["task"], row["level"]) for row in automata if row["way"] == ON}
+    automata = [row for row in automata if row["way"] != AUTOMATON or (row["task"], row["level"]) not in finished]
     found = []
     for name in TASKS:
         for printed in ACTIVE[name]:
             paper = next(
                 row for row in points if (row["task"], row["way"], row["level"]) == (name, PAPER, printed.features)
             )
-            below = [row for row in points if row["task"] == name and row["way"] in AUTOMATA]
-            below = [row for row in below if row["all"]["clicks_mean"] <= printed.clicks]
+            of_task = [row for row in automata if row["task"] == name]
+            below = [row for row in of_task if row["all"]["clicks_mean"] <= printed.clicks]
             line = {"task": name, "features": printed.features, "paper": paper}
             if below:
                 ours = max(below, key=lambda row: float(row["all"]["clicks_mean"]))

@@ -38,7 +38,8 @@ def quick(monkeypatch):
     """The recipe with few exposures and states, so that a training takes a second."""
 
     def of(**given):
-        return AutomatonOptions(exposures=4, states=3, grow_epochs=1, tune_epochs=1, epochs=1, reroutes=0, **given)
+        size = {"exposures": 4, "states": 3, "grow_epochs": 1, "tune_epochs": 1, "epochs": 1, "reroutes": 0}
+        return AutomatonOptions(**(size | given))
 
     monkeypatch.setattr("pans.trainer.adaptive.options.AutomatonOptions", of)  # where recipes are made
     return of
@@ -46,8 +47,8 @@ def quick(monkeypatch):
 
 def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_path, quick, monkeypatch):
     asked = Asked("frontier", tmp_path, report=lambda _: None)
-    row = automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=0)
     path = automata.bundle_path(tmp_path, "frontier-halves-automaton-2", 0)
+    row = automata.automaton_row(asked, path, halves, BUDGET, seed=0)
     bundle, digest = load_bundle(path)
     assert row["sha256"] == digest
     assert row["exposures"] == row["all"]["exposures_mean"] <= 4
@@ -61,9 +62,8 @@ def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_p
         raise AssertionError("trained again")
 
     monkeypatch.setattr(adaptive_train, "train_automaton", never)
-    again = automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=0)
-    assert {**again, "training_seconds": 0} == {**row, "training_seconds": 0}
-    assert again["training_seconds"] > 0
+    assert automata.automaton_row(asked, path, halves, BUDGET, seed=0) == row
+    assert row["training_seconds"] > 0
     point = ways.Point("halves", ways.AUTOMATON, 2.0, tuple(BUDGET.items()))
     assert point.stem == "frontier-halves-automaton-2"
     kept = ways.row_of(asked, point, 0, halves)
@@ -80,9 +80,37 @@ def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_p
     assert ways.row_of(asked, point, 0, None) == kept
     assert ways.row_of(asked, replace(point, recipe=(*point.recipe, ("patterns", 3))), 0, None) is None
     with pytest.raises(AssertionError, match="trained again"):  # another seed, another recipe
-        automata.automaton_row(asked, "frontier-halves-automaton-2", halves, BUDGET, seed=1)
+        automata.automaton_row(asked, path, halves, BUDGET, seed=1)
     with pytest.raises(AssertionError, match="trained again"):
-        automata.automaton_row(asked, "frontier-halves-automaton-2", halves, {"photons": 3.0}, seed=0)
+        automata.automaton_row(asked, path, halves, {"photons": 3.0}, seed=0)
+
+
+def test_an_automaton_is_trained_on_from_the_one_in_the_cache(halves, tmp_path, quick, monkeypatch):
+    asked = Asked("frontier", tmp_path, report=lambda _: None)
+    grown = ways.Point("halves", ways.AUTOMATON, 2.0, tuple(BUDGET.items()))
+    on = ways.Point("halves", ways.ON, 2.0, (("photons", 1.5), ("epochs", 2)), grown)
+    row = ways.row_of(asked, on, 0, halves)
+    assert row is not None
+    start, path = (automata.bundle_path(tmp_path, point.stem, 0) for point in (grown, on))
+    first, trained_on = load_bundle(start)[1], load_bundle(path)[0].provenance["options"]
+    assert (trained_on["start"], trained_on["seed"], trained_on["epochs"]) == (first, 1, 2)
+    assert load_bundle(start)[0].provenance["options"]["seed"] == 0
+    assert row["all"]["photons_mean"] == pytest.approx(1.5, rel=0.1)
+    assert row == ways.row_of(asked, on, 0, None)
+    other = replace(grown, recipe=(*grown.recipe, ("half", 5.0)))  # trained on from another one: another row
+    assert ways.row_of(asked, replace(on, start=other), 0, None) is None
+    assert ways.row_of(asked, on, 1, None) is None
+
+    def never(*_args, **_named):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(adaptive_train, "train_automaton", never)
+    (tmp_path / f"{on.stem}-seed0.json").unlink()
+    assert ways.row_of(asked, on, 0, halves) == row  # measured again, from its bundle
+    start.write_bytes(automata.bundle_path(tmp_path, on.stem, 0).read_bytes())  # not what it began with
+    (tmp_path / f"{on.stem}-seed0.json").unlink()
+    with pytest.raises(AssertionError, match="trained again"):
+        ways.row_of(asked, on, 0, halves)
 
 
 def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(halves, tmp_path, quick):
@@ -90,7 +118,7 @@ def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(halves, tmp_path,
     path = automata.bundle_path(tmp_path, "mine", 0)
     path.write_bytes(b"something of somebody")
     with pytest.raises(Exception, match=r"mine-seed0\.pans"):
-        automata.automaton_row(asked, "mine", halves, BUDGET, seed=0)
+        automata.automaton_row(asked, path, halves, BUDGET, seed=0)
     assert path.read_bytes() == b"something of somebody"
 
 

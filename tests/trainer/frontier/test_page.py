@@ -7,6 +7,7 @@ import argparse
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pans.trainer.commands.baseline import BASELINE
 from pans.trainer.commands.reproduce import REPRODUCE
 from pans.trainer.commands.train import TRAIN
 from pans.trainer.frontier import PAGES, fixed, page, summary, ways
+from pans.trainer.frontier.automata import bundle_path
 from pans.trainer.paper import Asked
 from pans.trainer.paper.page import BEGIN, END, Row, generated
 from pans.trainer.paper.tables import ACTIVE, FIRST
@@ -84,6 +86,9 @@ def test_click_budgets_take_the_automaton_that_spends_most_within_them_and_not_t
     assert found["mnist", 4]["ours"]["level"] == 6  # 2.164 clicks in the paper
     assert found["mnist", 9]["ours"]["way"] == ways.HELD_TO_CLICKS
     assert found["mnist", 9]["ahead"] == pytest.approx(0.8 - 0.8123)
+    rows += [made(ways.ON, 6, 6.0, 0.75, clicks=1.9)]  # of the one of 6, which it takes the place of
+    found = {(row["task"], row["features"]): row for row in summary.click_budgets(summary.by_point(rows))}
+    assert (found["mnist", 4]["ours"]["way"], found["mnist", 4]["ours"]["level"]) == (ways.AUTOMATON, 4)
 
 
 def test_no_photons_give_those_clicks_with_less_than_the_bound():
@@ -172,7 +177,10 @@ def test_every_command_is_one_that_the_parser_takes():
         args = parser.parse_args(words[1:])
         if words[0] == "reproduce":
             continue
-        assert args.seed == 3
+        assert args.seed == 3 + (point.start is not None)
+        if point.start is not None:  # the bundle of a point of its own
+            assert args.start == bundle_path(Path(), point.start.stem, 3)
+            assert point.start in ways.points()
         wanted = args.photons if words[0] == "train" else args.photons[0]
         assert 0.95 * point.level <= (wanted or args.clicks) <= point.level
 
