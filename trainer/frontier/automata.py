@@ -91,14 +91,20 @@ def made_so(wanted: Mapping[str, Any], found: Any) -> bool:
 
     More than that may stand in `found`: `pans train` adds threads and device.
     """
-    from pans.trainer.adaptive.options import AutomatonOptions
+    from pans.trainer.adaptive.options import GREY_EPOCHS, AutomatonOptions
 
     if not isinstance(found, dict):
         return False
-    had, begun = asdict(AutomatonOptions()) | OLDER | found, wanted.get("start")
+    had, wants = asdict(AutomatonOptions()) | OLDER | found, dict(wanted)
+    for options in (had, wants):  # spelt out in older ones
+        if "tune_epochs" in options and options["tune_epochs"] is None:
+            options["tune_epochs"] = GREY_EPOCHS  # without optics, which `PROFILE` does not state
+    begun, found_begun = wants.get("start"), had["start"]
     if isinstance(begun, Mapping):  # the recipe of what it was trained on from
-        return made_so(begun, had["start"]) and made_so({**wanted, "start": None}, {**found, "start": None})
-    return wanted.items() <= had.items()
+        if not made_so(begun, found_begun):
+            return False
+        wants["start"] = found_begun
+    return wants.items() <= had.items()
 
 
 def _train(asked: Asked, path: Path, task: Task, options: AutomatonOptions, start: Bundle | None) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -111,6 +111,15 @@ def test_an_automaton_is_trained_on_from_the_one_in_the_cache(halves, tmp_path, 
     (tmp_path / f"{on.stem}-seed0.json").unlink()
     with pytest.raises(AssertionError, match="trained again"):
         ways.row_of(asked, on, 0, halves)
+
+
+def test_a_default_that_was_spelt_out_is_the_same_recipe():
+    wanted = asdict(automata.automaton_recipe("mnist", {"photons": 6.0}, seed=0))
+    assert wanted["tune_epochs"] is None
+    assert automata.made_so(wanted, wanted | {"tune_epochs": 3})
+    assert automata.made_so(wanted | {"tune_epochs": 3}, wanted)
+    assert not automata.made_so(wanted, wanted | {"tune_epochs": 2})
+    assert not automata.made_so(wanted | {"tune_epochs": 0}, wanted)
 
 
 def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(halves, tmp_path, quick):
