@@ -11,9 +11,11 @@ from typing import Any
 
 from pans.runtime.errors import PlanError, UsageError, as_usage_error
 from pans.runtime.imaging import bleaching_of, tolerance_of
+from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object
+EXACT_WORDS_MAX = 1 << EXACT_FEATURES_MAX
 STRAIGHT_THROUGH = ("ste", "identity")  # from the first epoch to the last
 ESTIMATOR_NAMES = (*STRAIGHT_THROUGH, "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
@@ -65,6 +67,7 @@ class Options:
     copies: int = 0  # distorted copies of every training image, beside itself (distort.py)
     bleach: str | None = None  # what the patterns do to the objects, as `--bleach` spells it
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
+    outcomes: int = 2  # of an exposure; 3: no photon, one, two or more, on a detector that counts
     spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (concentration.py)
 
 
@@ -87,7 +90,9 @@ LIMITS = {
     "shift_px": (0, 65536),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
+    "outcomes": (2, OUTCOMES_MAX),
 }
+COUNTED_ESTIMATORS = ("ste", "exact", "local")  # readings.py
 CHOICES = {"budget": BUDGETS, "encoder": ENCODERS, "head": HEADS, "estimator": ESTIMATOR_NAMES}
 
 
@@ -125,14 +130,15 @@ def _flag(name: str) -> str:
 
 def _check_together(options: Options) -> None:
     """Options that are right by themselves and not beside each other."""
-    if options.clicks is not None and options.clicks >= options.features:
+    if options.clicks is not None and options.clicks >= options.features * (options.outcomes - 1):
         raise UsageError(
-            f"--clicks is {options.clicks}, allowed: below {options.features}, one click per pattern at most"
+            f"--clicks is {options.clicks}, allowed: below {options.features * (options.outcomes - 1)}, "
+            f"{'one click' if options.outcomes == 2 else f'{options.outcomes - 1} photons'} per pattern at most"
         )
-    if options.estimator == "exact" and options.features > EXACT_FEATURES_MAX:
+    most = int(math.log(EXACT_WORDS_MAX, options.outcomes) + 1e-9)
+    if options.estimator == "exact" and options.features > most:
         raise UsageError(
-            f"the exact estimator enumerates 2**{options.features} click words, allowed: at most "
-            f"{EXACT_FEATURES_MAX} patterns",
+            f"the exact estimator enumerates {options.outcomes}**{options.features} click words, allowed: at most {most} patterns",
             remedy="use --estimator local",
         )
     if options.optics is not None:
@@ -144,8 +150,25 @@ def _check_together(options: Options) -> None:
             )
     if options.bleach is not None:
         _check_bleach(options)
+    if options.outcomes > 2:
+        _check_counted(options)
     if options.mix > 0 and options.shots < 2:
         raise UsageError(f"--mix is {options.mix} with --shots {options.shots}", remedy="--shots 2, or more")
+
+
+def _check_counted(options: Options) -> None:
+    """What photon numbers of fixed patterns do not go with."""
+    if options.encoder != "active" or options.head in PICTURE_HEADS or options.bleach is not None:
+        raise UsageError(
+            f"--outcomes {options.outcomes} is for patterns that are shown and classes: not for a passive encoder, pictures or --bleach",
+            remedy="leave --outcomes out, or the other one",
+        )
+    if options.estimator not in COUNTED_ESTIMATORS:
+        raise UsageError(
+            f"--estimator {options.estimator} knows clicks alone, allowed with --outcomes {options.outcomes}: "
+            f"{', '.join(COUNTED_ESTIMATORS)}",
+            remedy="use --estimator local",
+        )
 
 
 def _check_bleach(options: Options) -> None:
@@ -160,15 +183,23 @@ def _check_bleach(options: Options) -> None:
 
 def check_order(order: str | None, options: Options) -> None:
     """Refuse --order where there is none, before anything is trained."""
-    if order and (options.encoder != "active" or options.head != "mlp" or options.bleach is not None):
+    if order and (options.encoder != "active" or options.head != "mlp" or options.bleach or options.outcomes > 2):
         raise UsageError(
-            "--order is for patterns that are sent and the head mlp; trained through bleaching, they have an order already",
+            "--order is for patterns that are sent, clicks and the head mlp; trained through bleaching, they have an order already",
             remedy="leave --order out",
         )
 
 
 def _check_fits(options: Options, profile: Profile) -> None:
     channels = profile.detector.channels
+    if options.outcomes > 2:
+        why = cannot_count(profile, options.outcomes)
+        if why or profile.mode != "sequential":
+            raise PlanError(
+                why
+                or f"--outcomes {options.outcomes}: {profile.name} shows all patterns at once, which no photon numbers are told of",
+                remedy="use a profile whose detector counts: --profile dmd-qcmos",
+            )
     if profile.mode == "parallel" and options.features > channels:
         raise PlanError(
             f"{options.features} patterns at once, {profile.name} has {channels} detector channels",

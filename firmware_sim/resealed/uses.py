@@ -150,7 +150,7 @@ def _use_bundle(path: Path) -> None:
     for shots in (1, 3):
         with suppress(UsageError):  # a table alone answers single shots only
             decider = make_decider(bundle, shots=shots)
-            counts = np.random.default_rng(1).integers(0, shots + 1, (4, bundle.n_features))
+            counts = np.random.default_rng(1).integers(0, shots * bundle.largest + 1, (4, bundle.n_features))
             decider.decide(counts[0], shots)
             if not np.isfinite(decider.scores_batch(counts, shots)).all() and bundle.table is not None and shots == 1:
                 raise ValueError("scores that are not finite from a checked table")

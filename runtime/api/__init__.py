@@ -83,8 +83,8 @@ def load_bundle(path: str | Path) -> Bundle:
 def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = "auto") -> Verdicts:
     """Return `labels`, uint16 (n,), and `probabilities` of the winning classes, float32 (n,), for clicks of n objects.
 
-    `clicks` are integers: words (n,) of one shot, in which bit k is pattern k's click, or counts (n, d_f) of `shots` shots.
-    UsageError for counts outside 0 to `shots` or another shape.
+    `clicks` are integers: words (n,) of one shot, in which bit k is pattern k's click, or counts (n, d_f) of `shots` shots; of a bundle
+    that takes photon numbers, sums of those. UsageError for counts outside 0 to `shots` (times the largest number) or another shape.
 
     >>> bundle = load_bundle("fashion10")
     >>> words, counts = [0b11], [[1, 1, 0, 0, 0, 0, 0, 0, 0, 0]]
@@ -99,6 +99,8 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
 
     found = np.asarray(clicks)
     if found.ndim == 1:
+        if bundle.largest > 1:
+            raise UsageError(f"words of clicks, but {bundle.name} takes photon numbers", remedy="give counts (n, d_f)")
         if bundle.n_features > 63:
             raise UsageError(
                 f"words of one shot hold at most 63 clicks, {bundle.name} has {bundle.n_features}",
@@ -108,7 +110,7 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
             raise UsageError(f"words run from {found.min()} to {found.max()}, allowed: {bundle.n_features} bits")
         found = word_means(found, bundle.n_features).astype(np.int64)
     with as_usage_error():
-        counts = checked_counts(found, shots, bundle.n_features)
+        counts = checked_counts(found, shots * bundle.largest, bundle.n_features)
     return verdicts_of(make_decider(bundle, shots=shots, backend=backend), counts, shots)
 
 

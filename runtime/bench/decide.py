@@ -61,6 +61,10 @@ def bench_decide(options: BenchOptions) -> list[Row]:
         if bundle.automaton is not None:
             rows += decide_rows(bundle, options.quick)
             continue
+        if bundle.largest > 1:
+            raise UsageError(
+                f"{bundle.name} takes photon numbers, the benchmark draws clicks", remedy="name a bundle of clicks"
+            )
         if bundle.picture_shape is not None:
             rows.append(_picture_row(bundle, PICTURES // 10 if options.quick else PICTURES))
             continue

@@ -92,6 +92,11 @@ class Automaton:
         return int(self.successors.shape[1])
 
     @property
+    def largest(self) -> int:
+        """The largest number that a channel can have in one exposure: 1 of clicks."""
+        return self.n_outcomes - 1 if self.counts else 1
+
+    @property
     def channels(self) -> int:
         """Number of channels that are read at once, c; one where photons are counted."""
         return 1 if self.counts else self.n_outcomes.bit_length() - 1

@@ -19,7 +19,7 @@ from pans.runtime.grey_png import levels_png
 from pans.runtime.html_card import html_card
 from pans.runtime.ranges import Range, demand
 
-from .automaton import Automaton
+from .automaton import COUNT_OUTCOMES, Automaton
 from .head import HEAD_MAX_BYTES
 from .layers import STEP_MAX, WEIGHT_MAX, Int8Head
 from .onnx_check import check_head
@@ -38,12 +38,16 @@ LEVELS_MAX = 65536
 CLASSES_MAX = 65534  # a label is a u16, and 0xFFFF means "abstained"
 OUTPUTS_MAX = 1 << 18  # pixels of a picture that a head returns
 TEXT_MAX_CHARACTERS = 200
-TABLE_FEATURES_MAX = 20  # beyond it a table is larger than a file may be
+TABLE_ROWS_MAX = 1 << 20  # beyond it a table is larger than a file may be
 GOLDEN_MAX = 4096
 GOLDEN_MEANS_MAX, GOLDEN_SCORES_MAX = 1 << 20, 1 << 22  # numbers
 LAYERS_MAX = 16
 # Numbers of the header; docs/reference/formats.md states the same.
-RANGES = {"levels": Range(2, LEVELS_MAX, whole=True), "photons_per_level": LIGHT_RANGE}
+RANGES = {
+    "levels": Range(2, LEVELS_MAX, whole=True),
+    "photons_per_level": LIGHT_RANGE,
+    "outcomes": Range(2, COUNT_OUTCOMES[1], whole=True),
+}
 GOLDEN_WORK_MAX = 1 << 36  # multiply-adds for all golden vectors together: about ten seconds
 AFFINE_MAX = 1e20  # of an int8 head: its sums, below 2**31, stay finite in float32
 GOLDEN_TOLERANCE = 1e-5  # of a score, times max(1, |score|)
@@ -74,6 +78,7 @@ class Bundle:
     automaton: Automaton | None = None  # decides by itself: no head and no table beside it
     golden_walks: NDArray[np.uint32] | None = None  # (g, n_slots + 1) nodes that each golden click word passes
     expected: Mapping[str, Any] | None = None  # of an automaton: its exact expectation, walks.EXPECTED_KEYS
+    outcomes: int = 2  # of fixed patterns: readings of an exposure; 3: no photon, one, two or more
 
     @property
     def n_features(self) -> int:
@@ -94,6 +99,11 @@ class Bundle:
     def n_classes(self) -> int:
         """Number of classes; 0 where a picture is given back."""
         return len(self.classes)
+
+    @property
+    def largest(self) -> int:
+        """The largest number that an exposure can have: 1 of clicks, more where the detector counts photons."""
+        return self.outcomes - 1 if self.automaton is None else self.automaton.largest
 
     @property
     def n_outputs(self) -> int:
@@ -183,9 +193,12 @@ def _decision_violation(found: NDArray[np.float32], golden: NDArray[np.float32],
     return f"the decision for vector {first + row} is {int(found[row].argmax())}, expected {int(golden[row].argmax())}"
 
 
-def row_index(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Table rows of means that are all 0 or 1."""
-    return means.astype(np.int64) @ (1 << np.arange(means.shape[1], dtype=np.int64))
+def words_among(means: NDArray[np.float32], outcomes: int = 2) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return which of `means` (g, d_f) are readings of one shot, bool (g,), and the table rows of those."""
+    largest = np.float32(outcomes - 1)
+    numbers = np.rint(means * largest)
+    single = np.asarray((numbers / largest == means).all(axis=1))
+    return single, numbers[single].astype(np.int64) @ outcomes ** np.arange(means.shape[1], dtype=np.int64)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
@@ -199,10 +212,13 @@ def _check_text(text: Any, what: str) -> None:
     demand(fine, f"{what} is {ascii(text)[:80]}, allowed: 1 to {TEXT_MAX_CHARACTERS} printable characters")
 
 
-def check_table_shape(shape: Sequence[int], n_features: int, n_classes: int) -> None:
-    demand(n_features <= TABLE_FEATURES_MAX, f"a table for {n_features} patterns, allowed at most {TABLE_FEATURES_MAX}")
-    wanted = (1 << n_features, n_classes)
-    demand(tuple(shape) == wanted, f"the table has shape {tuple(shape)}, allowed: (2**d_f, classes) = {wanted}")
+def check_table_shape(shape: Sequence[int], n_features: int, n_classes: int, outcomes: int = 2) -> None:
+    most = int(math.log(TABLE_ROWS_MAX, outcomes) + 1e-9)
+    demand(n_features <= most, f"a table for {n_features} patterns, allowed at most {most} of {outcomes} readings each")
+    wanted = (outcomes**n_features, n_classes)
+    demand(
+        tuple(shape) == wanted, f"the table has shape {tuple(shape)}, allowed: ({outcomes}**d_f, classes) = {wanted}"
+    )
 
 
 def _check_facts(bundle: Bundle) -> None:
@@ -210,6 +226,8 @@ def _check_facts(bundle: Bundle) -> None:
     _check_text(bundle.task, "task")
     demand(bundle.encoder in ENCODERS, f"encoder is {ascii(bundle.encoder)[:80]}, allowed: {', '.join(ENCODERS)}")
     _check_outputs(bundle)
+    counted = bundle.outcomes > 2 and (bundle.encoder != "active" or bundle.picture_shape is not None)
+    demand(not counted, f"{bundle.outcomes} outcomes per exposure, allowed where fixed patterns decide among classes")
     shown = bundle.encoder in ("active", "automaton")
     demand(shown == (bundle.analyser is None), f"{bundle.encoder} optics, and an analyser or none")
     decides_by_itself = bundle.automaton is not None
@@ -220,8 +238,8 @@ def _check_facts(bundle: Bundle) -> None:
             "a passive sensor has no projector: levels and photons_per_level are 0",
         )
         return
-    for name in ("levels", "photons_per_level"):
-        RANGES[name].checked(getattr(bundle, name), name)
+    for name, allowed in RANGES.items():
+        allowed.checked(getattr(bundle, name), name)
 
 
 def _check_outputs(bundle: Bundle) -> None:
@@ -285,7 +303,7 @@ def _check_back_ends(bundle: Bundle) -> None:
     if bundle.int8_head is not None:
         _check_int8(bundle.int8_head, d_f, bundle.n_outputs)
     if bundle.table is not None:
-        check_table_shape(bundle.table.shape, d_f, bundle.n_outputs)
+        check_table_shape(bundle.table.shape, d_f, bundle.n_outputs, bundle.outcomes)
         demand(_finite(bundle.table), "the table holds scores that are not finite")
 
 
@@ -365,7 +383,6 @@ def _check_golden(bundle: Bundle) -> None:
     if bundle.automaton is not None:
         _check_golden_walks(bundle.automaton, bundle)
     if bundle.table is not None:
-        binary = ((means == 0) | (means == 1)).all(axis=1)
-        found = bundle.table[row_index(means[binary])]
-        difference = golden_violation(found, scores[binary])
+        single, rows = words_among(means, bundle.outcomes)
+        difference = golden_violation(bundle.table[rows], scores[single])
         demand(not difference, f"the table does not answer the golden vectors: {difference}")

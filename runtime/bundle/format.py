@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 
 from pans.runtime.container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.ranges import demand
+from pans.runtime.ranges import Range, demand
 
 from . import automaton_file
+from .automaton import COUNT_OUTCOMES
 from .facts import LEVELS_MAX, Bundle, check_bundle, frozen
 from .layers import Int8Head
 from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
-VERSIONS = (1, 2, 3, 4)  # a bundle is written in the lowest that can say it
+VERSIONS = (1, 2, 3, 4, 5)  # a bundle is written in the lowest that can say it
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
@@ -39,7 +40,10 @@ _KEYS_OF_VERSION: dict[int, set[str]] = {
     2: {"sensor", "picture_shape"},
     3: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
     4: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
+    5: {"outcomes"},
 }
+_OF_AUTOMATA = (3, 4)
+_OUTCOMES = Range(*COUNT_OUTCOMES, whole=True)
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
 _MATRIX_PARTS = {"<f4": "matrix", "<c8": "matrix_complex"}  # of a passive sensor, in place of the patterns: one of them
@@ -115,7 +119,7 @@ def _optics_part(bundle: Bundle) -> tuple[str, NDArray[Any]]:
 
 
 def _new_facts(bundle: Bundle) -> dict[str, Any]:
-    """What version 1 cannot say: a passive sensor, a picture instead of classes, an automaton."""
+    """What version 1 cannot say: a passive sensor, a picture instead of classes, an automaton, photon numbers."""
     if bundle.automaton is not None:
         return automaton_file.facts_of(bundle, bundle.automaton)
     facts: dict[str, Any] = {}
@@ -123,6 +127,8 @@ def _new_facts(bundle: Bundle) -> dict[str, Any]:
         facts["sensor"] = {name: getattr(bundle.analyser, name) for name in _SENSOR_KEYS}
     if bundle.picture_shape is not None:
         facts["picture_shape"] = list(bundle.picture_shape)
+    if bundle.outcomes > 2:
+        facts["outcomes"] = bundle.outcomes
     return facts
 
 
@@ -130,7 +136,7 @@ def _version_of(facts: Mapping[str, Any]) -> int:
     """The lowest version that can say `facts`, those that version 1 has not."""
     if "automaton" in facts:
         return 4 if automaton_file.counts_photons(facts) else 3
-    return 2 if facts else 1
+    return 5 if "outcomes" in facts else 2 if facts else 1
 
 
 def parse_bundle(data: bytes, where: str) -> Bundle:
@@ -230,13 +236,13 @@ def _what_changed(source: _Source, header: bytes, header_end: int) -> str:
 def _read_parts(header: Mapping[str, Any], version: int, source: _Source, header_end: int) -> dict[str, Any]:
     """Return the parts by name, after checking that they fill the file without gap, overlap or rest; models are bytes."""
     new_keys = set(header) & _KEYS_OF_VERSION[version]
-    if version >= 3:
+    if version in _OF_AUTOMATA:
         new_keys |= automaton_file.HEADER_KEYS
     keys = _HEADER_KEYS | new_keys
     demand(set(header) == keys, f"the header has the keys {_quoted(header)}, allowed: {_quoted(keys)}")
     least = _version_of({key: header[key] for key in new_keys})
     demand(version == least, f"a bundle of format version {version} that says no more than {least}")
-    known = automaton_file.PARTS if version >= 3 else _PARTS
+    known = automaton_file.PARTS if version in _OF_AUTOMATA else _PARTS
     rows = header["parts"]
     demand(isinstance(rows, list) and len(rows) <= len(known), "the header's parts are not a short list")
     parts: dict[str, Any] = {}
@@ -248,7 +254,7 @@ def _read_parts(header: Mapping[str, Any], version: int, source: _Source, header
         parts[row["name"]] = _read_part(row, source, header_end + offset)
         offset += row["length"]
     demand(offset == room, f"{room - offset} bytes after the last part, allowed: none")
-    if version < 3:
+    if version not in _OF_AUTOMATA:
         _demand_fixed_parts(header, parts)
     return parts
 
@@ -335,6 +341,7 @@ def _with_automaton(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]
 
 
 def _with_back_end(header: Mapping[str, Any], parts: Mapping[str, Any], facts: dict[str, Any]) -> Bundle:
+    outcomes = _OUTCOMES.checked(header["outcomes"], "outcomes") if "outcomes" in header else 2
     picture = header.get("picture_shape")
     good_picture = isinstance(picture, list) and len(picture) == 2 and all(_is_count(n) for n in picture)
     demand(picture is None or good_picture, f"picture_shape is {ascii(picture)[:80]}, allowed: [height, width]")
@@ -351,6 +358,7 @@ def _with_back_end(header: Mapping[str, Any], parts: Mapping[str, Any], facts: d
         int8_onnx=parts.get("int8_onnx"),
         analyser=analyser,
         picture_shape=None if picture is None else (picture[0], picture[1]),
+        outcomes=outcomes,
     )
 
 

@@ -30,12 +30,13 @@ from .facts import (
     GOLDEN_SCORES_MAX,
     GOLDEN_WORK_MAX,
     LEVELS_MAX,
+    RANGES,
     Bundle,
     check_bundle,
     check_table_shape,
     frozen,
     golden_violation,
-    row_index,
+    words_among,
 )
 from .format import bundle_bytes, parse_bundle, read_bundle
 from .head import OnnxHead, open_head
@@ -58,7 +59,7 @@ __all__ = [
     "write_bundle",
 ]
 
-TABLE_BUILD_FEATURES_MAX = 12
+TABLE_BUILD_ROWS_MAX = 1 << 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,12 +76,17 @@ class Shown:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BackEnd:
-    """What decides: a head, a table (2**d_f, classes) of floats, or both, which must agree; and the head in eight bits."""
+    """What decides: a head, a table (outcomes**d_f, classes) of floats, or both, which must agree; and the head in eight bits.
+
+    With `outcomes` above 2 every exposure is a photon number from 0 to `outcomes` - 1, which stands for that many or more: the head is
+    given mean numbers over the largest.
+    """
 
     head_onnx: bytes | None = None
     table: ArrayLike | None = None
     int8_head: Int8Head | None = None
     int8_onnx: bytes | None = None
+    outcomes: int = 2
 
 
 def make_bundle(
@@ -95,11 +101,11 @@ def make_bundle(
     picture_shape: tuple[int, int] | None = None,
     automaton: Automaton | None = None,
 ) -> Bundle:
-    """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where d_f <= 12.
+    """Return a checked bundle with golden vectors, and, among classes, with a table made from the head where it has at most 4096 rows.
 
     `optics` are the patterns of an active sensor or the analyser of a passive one. The head decides among `classes`, or gives back a
-    picture of `picture_shape`; an `automaton` decides by itself (no `back_end`) and brings golden walks. UsageError
-    says what does not fit, DamagedFileError what is wrong with the head.
+    picture of `picture_shape`; an `automaton` decides by itself (no `back_end`) and brings golden walks. UsageError says what does not
+    fit, DamagedFileError what is wrong with the head.
 
     >>> shown = Shown(levels=2, pattern_levels=[[1, 0], [0, 1]], photons_per_level=3.0)
     >>> table = BackEnd(table=[[0, 0], [1, 0], [0, 1], [1, 1]])
@@ -117,7 +123,9 @@ def make_bundle(
         n_outputs = len(classes) if picture_shape is None else math.prod(picture_shape)
         decided = BackEnd() if back_end is None else back_end
         if automaton is None:
-            golden = _evaluate_back_end(decided, len(quantised), n_outputs, decides=picture_shape is None)
+            RANGES["outcomes"].checked(decided.outcomes, "outcomes")
+            words = _Words(len(quantised), decided.outcomes)
+            golden = _evaluate_back_end(decided, words, n_outputs, decides=picture_shape is None)
         else:
             golden = _golden_of(automaton, decided)
         bundle = Bundle(
@@ -140,6 +148,7 @@ def make_bundle(
             picture_shape=picture_shape,
             automaton=automaton,
             golden_walks=None if golden.walks is None else frozen(golden.walks),
+            outcomes=decided.outcomes,
         )
         check_bundle(bundle)
     except (ValueError, TypeError) as error:
@@ -159,10 +168,16 @@ def with_expected(bundle: Bundle, expected: Mapping[str, Any]) -> Bundle:
     return replace(bundle, expected=parse_json_object(canonical_json(dict(expected)), "expected"))
 
 
-def word_means(words: ArrayLike, n_features: int) -> NDArray[np.float32]:
-    """Return click words (n,) as the head's input (n, d_f), float32: bit i becomes feature i; d_f <= 63."""
-    bits = np.asarray(words, dtype=np.int64)[:, None] >> np.arange(n_features, dtype=np.int64)
-    return (bits & 1).astype(np.float32)
+def word_means(words: ArrayLike, n_features: int, outcomes: int = 2) -> NDArray[np.float32]:
+    """Return words (n,) of single shots as the head's input (n, d_f), float32: bit i becomes feature i; d_f <= 63.
+
+    Of photon numbers a word is their number in base `outcomes`, feature 0 the lowest digit, and a feature is its digit over the largest.
+    """
+    if outcomes == 2:
+        bits = np.asarray(words, dtype=np.int64)[:, None] >> np.arange(n_features, dtype=np.int64)
+        return (bits & 1).astype(np.float32)
+    digits = np.asarray(words, dtype=np.int64)[:, None] // outcomes ** np.arange(n_features, dtype=np.int64) % outcomes
+    return digits.astype(np.float32) / np.float32(outcomes - 1)
 
 
 def _encoder(analyser: Analyser | None, automaton: Automaton | None) -> str:
@@ -190,25 +205,41 @@ class _Golden(NamedTuple):
     walks: NDArray[np.uint32] | None = None
 
 
-def _evaluate_back_end(back_end: BackEnd, n_features: int, n_outputs: int, *, decides: bool) -> _Golden:
+class _Words(NamedTuple):
+    """What words of one shot are made of: so many patterns, so many outcomes of each."""
+
+    n_features: int
+    outcomes: int
+
+    @property
+    def number(self) -> int:
+        return self.outcomes**self.n_features
+
+    def means(self) -> NDArray[np.float32]:
+        """All words as the head's input."""
+        return word_means(np.arange(self.number), self.n_features, self.outcomes)
+
+
+def _evaluate_back_end(back_end: BackEnd, words: _Words, n_outputs: int, *, decides: bool) -> _Golden:
     """Return the golden vectors and the table, if any; the head answers where there is one, else the table."""
+    n_features, largest = words.n_features, words.outcomes - 1
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused later
         table = None if back_end.table is None else np.array(back_end.table, dtype=np.float32)
     if table is not None:
-        check_table_shape(table.shape, n_features, n_outputs)
+        check_table_shape(table.shape, n_features, n_outputs, words.outcomes)
     if back_end.head_onnx is None:
         if table is None:
             raise ValueError("neither a head nor a table was given, allowed: either or both")
-        means = _golden_words(n_features)
-        return _Golden(means, table[row_index(means)], table)
+        means = _golden_words(n_features, largest)
+        return _Golden(means, table[words_among(means, words.outcomes)[1]], table)
     head = open_head(back_end.head_onnx, n_features, n_outputs, "head")
-    means = np.concatenate([_golden_words(n_features), _golden_shots(n_features)])
+    means = np.concatenate([_golden_words(n_features, largest), _golden_shots(n_features, largest)])
     means = means[:: -(-len(means) * n_outputs // GOLDEN_SCORES_MAX)]  # fewer of very large pictures
-    affordable = head.cost.operations << min(n_features, TABLE_BUILD_FEATURES_MAX) <= GOLDEN_WORK_MAX
-    if table is None and decides and n_features <= TABLE_BUILD_FEATURES_MAX and affordable:
-        table = head.scores(word_means(np.arange(1 << n_features), n_features))
+    affordable = head.cost.operations * min(words.number, TABLE_BUILD_ROWS_MAX) <= GOLDEN_WORK_MAX
+    if table is None and decides and words.number <= TABLE_BUILD_ROWS_MAX and affordable:
+        table = head.scores(words.means())
     elif table is not None:
-        _demand_agreement(head, table, n_features)
+        _demand_agreement(head, table, words)
     return _Golden(means, head.scores(means), table)
 
 
@@ -226,26 +257,33 @@ def _golden_of(automaton: Automaton, beside: BackEnd) -> _Golden:
     return _Golden(words, log_scores(automaton.posteriors[walks[:, -1]]), None, walks)
 
 
-def _demand_agreement(head: OnnxHead, table: NDArray[np.float32], n_features: int) -> None:
-    difference = golden_violation(table, head.scores(word_means(np.arange(1 << n_features), n_features)))
+def _demand_agreement(head: OnnxHead, table: NDArray[np.float32], words: _Words) -> None:
+    difference = golden_violation(table, head.scores(words.means()))
     if difference:
         raise ValueError(f"head and table disagree: {difference} (vector = click word; found = table, expected = head)")
 
 
-def _golden_words(n_features: int) -> NDArray[np.float32]:
-    """No click, all clicks, single clicks (at most 64, evenly spread), 64 random words with a fixed seed."""
+def _golden_words(n_features: int, largest: int = 1) -> NDArray[np.float32]:
+    """No click, all clicks, single clicks (at most 64, evenly spread), 64 random words with a fixed seed.
+
+    With `largest` above 1 a click is that photon number, and 64 random words of all numbers follow.
+    """
     singles = np.unique(np.linspace(0, n_features - 1, min(n_features, 64)).round().astype(np.int64))
     rows = np.zeros((2 + len(singles) + 64, n_features), dtype=np.float32)
     rows[1] = 1.0
     rows[2 + np.arange(len(singles)), singles] = 1.0
     rows[2 + len(singles) :] = np.random.default_rng(20250101).integers(0, 2, size=(64, n_features))
-    return rows
+    if largest == 1:
+        return rows
+    drawn = np.random.default_rng(20250103).integers(0, largest + 1, size=(64, n_features))
+    return np.concatenate([rows, drawn.astype(np.float32) / np.float32(largest)])
 
 
-def _golden_shots(n_features: int) -> NDArray[np.float32]:
-    """Means of 2, 3, 5 and 8 shots, four rows each, divided as a decider divides: float32 counts by float32 shots."""
+def _golden_shots(n_features: int, largest: int = 1) -> NDArray[np.float32]:
+    """Means of 2, 3, 5 and 8 shots, four rows each, divided as a decider divides: float32 counts by float32 shots (times `largest`)."""
     rng = np.random.default_rng(20250102)
-    rows = [rng.integers(0, k + 1, size=(4, n_features)).astype(np.float32) / np.float32(k) for k in (2, 3, 5, 8)]
+    most = [k * largest for k in (2, 3, 5, 8)]
+    rows = [rng.integers(0, k + 1, size=(4, n_features)).astype(np.float32) / np.float32(k) for k in most]
     return np.concatenate(rows)
 
 

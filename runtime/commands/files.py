@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # the help of a command must not load what it works with
 DEFAULT_LEVELS = 124
 _VALUE_CHARACTERS = 200
 PHOTONS_AT_WHITE = Range(1e-9, 1e9)
+OUTCOMES = Range(2, 16, whole=True)
 
 
 # ---- verify ----
@@ -149,6 +150,13 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--table", type=Path, metavar="T.npy", help="scores (2**d_f, classes); bit i of a row is pattern i"
     )
+    parser.add_argument(
+        "--outcomes",
+        type=OUTCOMES.option,
+        default=2,
+        metavar="K",
+        help="what head or table take of an exposure: K photon numbers, 0 to K - 1 or more (default 2: no click and a click)",
+    )
     parser.add_argument("--classes", required=True, metavar="a,b,...", help="class names in the order of the scores")
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
@@ -207,6 +215,7 @@ def _bundle(args: argparse.Namespace) -> int:
         back_end=BackEnd(
             head_onnx=read_file(args.head) if args.head else None,
             table=_load_array(args.table) if args.table else None,
+            outcomes=args.outcomes,
         ),
         provenance={**provenance, "quantisation": {**_quantisation_facts(quantised), "dithered": dithered}},
     )

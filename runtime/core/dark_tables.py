@@ -52,6 +52,11 @@ def make_adapter(bundle: Bundle, shots: int) -> Adapter:
             f"{bundle.name} is an automaton: a dark click has already led to another pattern, so that no table mends it afterwards",
             remedy="use --on-dark abstain, or train for the present dark rate",
         )
+    if bundle.largest > 1:
+        raise UsageError(
+            f"{bundle.name} takes photon numbers: no other decisions are made for dark counts of another rate",
+            remedy="use --on-dark abstain",
+        )
     if bundle.picture_shape is not None:
         raise UsageError("a bundle that gives pictures decides nothing", remedy="use --on-dark abstain")
     if shots == 1 and bundle.table is not None:

@@ -49,6 +49,7 @@ class Plan:
         None  # what chooses the patterns of adaptive slots, ADAPTIVE_PATTERN in `slot_pattern`
     )
     drive: str = ""  # of an automaton: "device" if the device follows it, "host" if the host names each state
+    largest: int = 1  # the largest number that an exposure can have: 1 of clicks
 
     @property
     def slots_per_cycle(self) -> int:
@@ -64,11 +65,6 @@ class Plan:
     def shots_per_object(self) -> int:
         """How often each pattern is exposed on one object: the K of a decision."""
         return self.shots_per_cycle * self.cycles_per_object
-
-    @property
-    def largest(self) -> int:
-        """The largest number that an exposure can have: 1 of clicks, more of an automaton over photon numbers."""
-        return self.automaton.n_outcomes - 1 if self.automaton is not None and self.automaton.counts else 1
 
     @property
     def tick_us(self) -> float:

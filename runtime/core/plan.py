@@ -85,18 +85,37 @@ def build_plan(
         return _walks(profile, bundle, chosen, drive, shots_per_object, dark_slots_per_cycle, ticks)
     if drive != "auto":
         raise PlanError(f"{bundle.name} has fixed patterns, found drive {drive}", remedy="leave --drive out")
+    if bundle.largest > 1:
+        demand_counting(profile, bundle.outcomes, bundle.name)
+    plan = _fixed(profile, bundle.n_features, order, shots_per_object, dark_slots_per_cycle, ticks)
+    return replace(plan, largest=bundle.largest)
+
+
+def demand_counting(profile: Profile, outcomes: int, who: str) -> None:
+    """Raise PlanError unless the detector of `profile` tells `outcomes` readings of one exposure apart, pattern after pattern."""
+    why = cannot_count(profile, outcomes)
+    if not why and profile.mode != "sequential":
+        why = f"photon numbers of one pattern after the other, {profile.name} measures in {profile.mode} mode"
+    if why:
+        raise PlanError(
+            f"{who} has {why}",
+            remedy=f"choose a profile whose detector counts, or retrain: pans train --profile {profile.name}",
+        )
+
+
+def _fixed(profile: Profile, n: int, order: str, shots: int, dark: int, ticks: Ticks) -> Plan:
+    """`n` patterns that do not depend on clicks, in the `order` that is asked for or takes the shorter time."""
     if profile.mode == "parallel":
         if order != "auto":
             raise PlanError(f"order must be auto in parallel mode, found {order}", remedy="leave --order out")
-        return _parallel(profile, bundle.n_features, shots_per_object, dark_slots_per_cycle, ticks)
+        return _parallel(profile, n, shots, dark, ticks)
     makers = {"shot-major": _shot_major, "pattern-major": _pattern_major}
     if order != "auto":
-        return makers[order](profile, bundle.n_features, shots_per_object, dark_slots_per_cycle, ticks)
-    plan = _shot_major(profile, bundle.n_features, shots_per_object, dark_slots_per_cycle, ticks)
-    displays = bundle.n_features + dark_slots_per_cycle
-    if displays * shots_per_object > MAX_SLOTS or displays * _hold(shots_per_object, ticks) >= plan.object_ticks:
+        return makers[order](profile, n, shots, dark, ticks)
+    plan, displays = _shot_major(profile, n, shots, dark, ticks), n + dark
+    if displays * shots > MAX_SLOTS or displays * _hold(shots, ticks) >= plan.object_ticks:
         return plan
-    return _pattern_major(profile, bundle.n_features, shots_per_object, dark_slots_per_cycle, ticks)
+    return _pattern_major(profile, n, shots, dark, ticks)
 
 
 def exposure_us(profile: Profile, bundle: Bundle) -> float:
@@ -244,16 +263,13 @@ def _walks(
     check_slots(len(slots), "fewer dark slots")
     block = 1 if drive == "host" else block_exposures(len(slots), period, ticks, MAX_BLOCK_EXPOSURES)
     plan = lay_out(profile, len(bundle.pattern_levels), _single_shots(slots, period, walks, block), ticks)
-    return replace(plan, automaton=automaton, drive=drive)
+    return replace(plan, automaton=automaton, drive=drive, largest=automaton.largest)
 
 
 def _checked_drive(profile: Profile, automaton: Automaton, drive: str) -> str:
     """Return "device" or "host", whichever is asked for and possible; PlanError says what is not, in numbers."""
-    if automaton.counts and (why := cannot_count(profile, automaton.n_outcomes)):
-        raise PlanError(
-            f"the automaton has {why}",
-            remedy=f"choose a profile whose detector counts, or retrain: pans train --encoder automaton --profile {profile.name}",
-        )
+    if automaton.counts:
+        demand_counting(profile, automaton.n_outcomes, "the automaton")
     if profile.mode != "sequential" or automaton.channels != 1:
         raise PlanError(
             f"the automaton reads {automaton.channels} detectors at once, {profile.name} measures in {profile.mode} mode; "

@@ -125,8 +125,11 @@ def plan_from_chunks(
     tick_hz: int,
     automaton: Automaton | None = None,
     states: Sequence[StateChunk | CountStateChunk] = (),
+    largest: int = 1,
 ) -> Plan:
     """Invert `plan_chunks` and `state_chunks`: the plan that a device was sent, with the `automaton` that it was made for.
+
+    `largest` is the largest number of an exposure of fixed patterns.
 
     MalformedMessage when slots or states are missing, or the states are not those of `automaton`.
     """
@@ -170,6 +173,7 @@ def plan_from_chunks(
         exposure_us=head.exposure_ticks * 1e6 / tick_hz,
         automaton=automaton,
         drive="" if automaton is None else "device" if states else "host",
+        largest=largest if automaton is None else automaton.largest,
     )
 
 

@@ -62,10 +62,10 @@ class WindowArrays(NamedTuple):
 
 @outer
 def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen, tallies):  # type: ignore[no-untyped-def]
-    """Add exposures `relative`... of a visit to its windows; see tests/naive_window.py for the meaning in plain loops.
+    """Add exposures `relative`... of a visit to its windows; see tests/oracles/naive_window.py for the meaning in plain loops.
 
-    patterns uint16 (n,), bits uint8 (n,), feature_at int32 and window_at int32 (visit,), counts int64 (windows, d_f),
-    seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
+    patterns uint16 (n,), bits uint8 (n,) clicks or photon numbers, feature_at int32 and window_at int32 (visit,), counts int64
+    (windows, d_f), seen int64 (windows, 2) right and wrong exposures, tallies int64 (3,).
     """
     for i in range(patterns.shape[0]):
         feature = feature_at[relative + i]
@@ -73,7 +73,7 @@ def add_exposures(relative, patterns, bits, feature_at, window_at, counts, seen,
         if feature < 0:
             if shown == DARK_PATTERN:
                 tallies[DARK_EXPOSURES] += 1
-                tallies[DARK_CLICKS] += bits[i]
+                tallies[DARK_CLICKS] += bits[i] != 0
             else:
                 tallies[WRONG_PATTERNS] += 1
             continue

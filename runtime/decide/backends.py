@@ -23,6 +23,7 @@ from .names import backend_names, offered_backends
 from .offered import CLICKS_SEED, OfferedDecider
 from .onnx import OnnxDecider as OnnxDecider
 from .onnx import PictureDecider
+from .photons import PhotonDecider
 from .table import CountTableDecider, fits_count_table
 from .table import TableDecider as TableDecider
 from .verdict import Decider as Decider
@@ -63,6 +64,13 @@ def make_decider(
         if backend not in ("auto", PictureDecider.name):
             raise UsageError(f"back end {backend!r}: pictures come from the head alone", remedy="use the back end onnx")
         return PictureDecider(bundle)
+    if bundle.largest == 1:
+        return _fixed_decider(bundle, shots, backend)
+    return PhotonDecider(_fixed_decider(bundle, shots * bundle.largest, backend), bundle.largest)
+
+
+def _fixed_decider(bundle: Bundle, shots: int, backend: str) -> Decider:
+    """The back end of fixed patterns that answers counts of 0 to `shots`: of photon numbers `shots` is times the largest of them."""
     if backend == "auto":
         return _choose(bundle, shots)
     if backend in BACKENDS:
@@ -103,13 +111,13 @@ def _make(bundle: Bundle, shots: int, backend: str) -> Decider:
 
 def _choose(bundle: Bundle, shots: int) -> Decider:
     """One look-up needs no measurement; otherwise every exact back end that can be made is timed on clicks as they come."""
-    if shots == 1 and bundle.table is not None:
+    if shots == bundle.largest and bundle.table is not None:
         table = TableDecider(bundle)
         table.choice = {"chosen": table.name, "why": "one look-up per decision"}
         return table
     if bundle.head_onnx is None:
         raise UsageError(
-            f"{bundle.name} has only a table of single clicks, which cannot answer {shots} shots",
+            f"{bundle.name} has only a table of single shots, which cannot answer {shots // bundle.largest} shots",
             remedy="use --shots 1, or a bundle with an ONNX head",
         )
     onnx = OnnxDecider(bundle)
@@ -140,6 +148,9 @@ def median_us(decider: Decider, shots: int, calls: int = MEASURED_CALLS) -> floa
 def _table_decider(bundle: Bundle, shots: int) -> TableDecider:
     if bundle.table is None:
         raise UsageError(f"{bundle.name} has no table ({bundle.n_features} patterns)", remedy="use the back end onnx")
-    if shots != 1:
-        raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx, or one shot")
+    if shots != bundle.largest:
+        raise UsageError(
+            f"the table answers single shots, not {shots // bundle.largest}",
+            remedy="use the back end onnx, or one shot",
+        )
     return TableDecider(bundle)

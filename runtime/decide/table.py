@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pans.runtime.bundle.facts import words_among
 from pans.runtime.bundle.head import open_head
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import UsageError
@@ -73,19 +74,25 @@ class TableDecider(CountTable):
     def __init__(self, bundle: Bundle) -> None:
         if bundle.table is None:
             raise UsageError(f"{bundle.name} has no table")
-        super().__init__(bundle.table, 1, {})
-        binary = ((bundle.golden_means == 0) | (bundle.golden_means == 1)).all(axis=1)
-        found = self.scores_batch(bundle.golden_means[binary].astype(np.int64), 1)
-        demand_golden(self.name, found, bundle.golden_scores[binary], bundle)
+        super().__init__(bundle.table, bundle.largest, {})
+        single, rows = words_among(bundle.golden_means, bundle.outcomes)
+        demand_golden(self.name, self.scores[rows], bundle.golden_scores[single], bundle)
 
     def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """Decide from single clicks, int64 (d_f,); UsageError for anything but zeros and ones of one shot."""
-        if shots != 1 or int(counts @ counts) != int(counts.sum()):  # c * c == c only for 0 and 1
+        """Decide from single clicks, int64 (d_f,); UsageError for anything but zeros and ones of one shot.
+
+        Of photon numbers `shots` is the largest of them (photons.py), and they are 0 to that many.
+        """
+        if shots != 1 or self.shots != 1:
+            self._check(shots)
+            if int(counts.min()) < 0 or int(counts.max()) > shots:
+                raise UsageError(f"the table answers numbers of 0 to {shots}, not {counts.tolist()}")
+        elif int(counts @ counts) != int(counts.sum()):  # c * c == c only for 0 and 1
             raise UsageError(f"the table answers single shots of 0 or 1, not {counts.tolist()} of {shots}")
         return self.decide_word(int(counts @ self.radix))
 
     def decide_word(self, word: int) -> Verdict:
-        """Decide from a packed click word (bit i is pattern i), 0 <= word < 2**d_f; IndexError beyond."""
+        """Decide from a packed click word (bit i is pattern i), a row of the table; IndexError beyond."""
         return Verdict(int(self.labels[word]), float(self.probabilities[word]))
 
     def decide_words(self, words: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -100,12 +107,14 @@ class TableDecider(CountTable):
 
         bad = label_words(self.labels, words, result)
         if bad >= 0:
-            raise ValueError(f"click word {int(words[bad])} at {bad}, allowed: below {1 << self.n_features}")
+            raise ValueError(f"click word {int(words[bad])} at {bad}, allowed: below {len(self.labels)}")
         return result
 
     def _check(self, shots: int) -> None:
-        if shots != 1:
-            raise UsageError(f"the table answers single shots, not {shots}", remedy="use the back end onnx")
+        if shots != self.shots:
+            raise UsageError(
+                f"the table answers single shots, not {shots / self.shots:g}", remedy="use the back end onnx"
+            )
 
 
 class CountTableDecider(CountTable):

@@ -56,6 +56,8 @@ def plan_flow(
     profile: Profile, bundle: Bundle, decider: Decider, settings: FlowSettings, shots: int, seconds: float
 ) -> tuple[Plan, FlowCore, int]:
     """Return plan, core and number of cycles (0: until stopped) of a flow that lasts `seconds`."""
+    if bundle.largest > 1:
+        raise UsageError(f"{bundle.name} takes photon numbers, a flow measures clicks", remedy="leave --flow out")
     plan = build_flow_plan(profile, bundle, block_us=settings.block_us, dark_every=settings.dark_every)
     dark = float(click_probability(click_law(profile, plan.exposure_us), 0.0))
     cycles = math.ceil(seconds * 1e6 / plan.cycle_us * (1 - 1e-12)) if seconds else 0

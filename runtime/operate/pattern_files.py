@@ -58,6 +58,7 @@ def about(bundle: Bundle) -> dict[str, Any]:
         "levels": bundle.levels,
         "photons_per_level": bundle.photons_per_level,
         "photons_at_white": bundle.photons_per_level * max(bundle.levels - 1, 0),
+        **({"photon_number_max": bundle.largest} if bundle.largest > 1 else {}),
     }
 
 

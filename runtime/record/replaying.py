@@ -146,7 +146,7 @@ def _rebuilt(
         automaton, confidence = automaton_of(config, bundle), float(config.get("confidence", 0.0))
         backend = str(config.get("backend", "auto"))
         decider = make_decider(bundle, shots=shots, backend=backend, confidence=confidence, dose=walk_dose(config))
-        plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton))
+        plan = sent.plan(tick_hz, getattr(decider, "automaton", automaton), bundle.largest)
         if pictures is not None:
             decider = pictures.over(decider)
         core = _core(config, plan, decider, bundle, shots, next(iter(sent.arms.values())).n_cycles)

@@ -18,6 +18,7 @@ from pans.runtime.ranges import Range
 from pans.runtime.wire.automata import StateChunk, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
 from pans.runtime.wire.counts import CountStateChunk, unpack_count_states, unpack_read_counts
+from pans.runtime.wire.fields import MAX_PHOTON_NUMBER
 from pans.runtime.wire.messages import (
     CommandMessage,
     Frame,
@@ -31,6 +32,7 @@ from pans.runtime.wire.messages import (
 from .recording import Recording
 
 TICK_HZ = Range(1000, 10_000_000_000, whole=True)
+PHOTON_NUMBER = Range(1, MAX_PHOTON_NUMBER, whole=True)
 
 
 def never_armed(recording: Recording) -> bool:
@@ -58,10 +60,12 @@ class Sent:
     arms: dict[int, Arm] = field(default_factory=dict)
     read: list[int] = field(default_factory=list)  # the largest photon number of each READ_COUNTS
 
-    def plan(self, tick_hz: int, automaton: Automaton | None) -> Plan:
-        """Return the plan, which ran `automaton`; MalformedMessage when it is not whole, or another one was sent."""
+    def plan(self, tick_hz: int, automaton: Automaton | None, largest: int) -> Plan:
+        """Return the plan, which ran `automaton`, or fixed patterns read as numbers up to `largest`; MalformedMessage when it is not
+        whole, or another one was sent."""
         chunks = [self.chunks[first] for first in sorted(self.chunks)]
-        plan = plan_from_chunks(chunks, tick_hz, automaton, [self.states[first] for first in sorted(self.states)])
+        states = [self.states[first] for first in sorted(self.states)]
+        plan = plan_from_chunks(chunks, tick_hz, automaton, states, largest)
         if set(self.read) != ({plan.largest} if plan.largest > 1 else set()):
             raise MalformedMessage(
                 f"photon numbers up to {sorted(set(self.read))} were asked for, needed: {plan.largest}"
@@ -134,6 +138,7 @@ def recorded_plan(recording: Recording) -> Plan:
         config = recording.header["config"]
         bundle = recording.bundle() if recording.bundle_data() else None
         sent, automaton = sent_to_device(recording), automaton_of(config, bundle)
-        return sent.plan(TICK_HZ.checked(config["tick_hz"], "tick_hz"), automaton)
+        largest = PHOTON_NUMBER.checked(config.get("photon_number_max", 1), "photon_number_max")
+        return sent.plan(TICK_HZ.checked(config["tick_hz"], "tick_hz"), automaton, largest)
     except (KeyError, TypeError, ValueError, AttributeError, MalformedMessage) as error:
         raise DamagedFileError(f"{recording.path}: its plan cannot be rebuilt: {error}") from error

@@ -53,9 +53,8 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
         leaves = walk_nodes(bundle.automaton, clicks.counts)[:, -1].astype(np.int64)
         return _rows(log_scores(bundle.automaton.posteriors), None, leaves, clicks, own_posteriors=True)
     if bundle.table is not None and clicks.shots == 1:
-        words = clicks.counts @ (1 << np.arange(bundle.n_features, dtype=np.int64))
-        bits = word_means(np.arange(len(bundle.table)), bundle.n_features)
-        return _rows(bundle.table, bits, words, clicks, own_posteriors=_layers(bundle) is None)
+        words = clicks.counts @ bundle.outcomes ** np.arange(bundle.n_features, dtype=np.int64)
+        return _rows(bundle.table, _table_means(bundle), words, clicks, own_posteriors=_layers(bundle) is None)
     layers = _layers(bundle)
     if layers is None:
         raise UsageError(
@@ -63,9 +62,12 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
             remedy="refit a bundle with a table, on recordings of --shots 1",
         )
     vectors, row = np.unique(clicks.counts, axis=0, return_inverse=True)
-    means = vectors / clicks.shots
+    means = vectors / (clicks.shots * bundle.largest)
     scores = reference_scores(layers, means)
-    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing, clicks.shots)
+    shots = (
+        clicks.shots if bundle.largest == 1 else 1
+    )  # the noise of several shots is known of clicks, not of photon numbers
+    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing, shots)
     return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
 
 
@@ -101,7 +103,9 @@ def rebuilt(bundle: Bundle, rows: Rows, found: Refitted, clicks: Labelled, prove
             if bundle.head_onnx is None
             else ("only the table is refitted: the head is no plain chain, and left out",)
         )
-        return Rebuilt(_made(bundle, facts, BackEnd(table=_table(bundle, rows, found))), 0, notes)
+        return Rebuilt(
+            _made(bundle, facts, BackEnd(table=_table(bundle, rows, found), outcomes=bundle.outcomes)), 0, notes
+        )
     return _with_head(bundle, facts, layers, found)
 
 
@@ -117,7 +121,7 @@ def _with_head(bundle: Bundle, facts: dict[str, Any], layers: tuple[Layer, ...],
             notes.append(f"the head in eight bits is left out: {error}")
     if bundle.int8_onnx is not None:
         notes.append("the quantised ONNX model is left out: only the trainer writes it")
-    made = _made(bundle, facts, BackEnd(head_onnx=chain_onnx(new), int8_head=int8))
+    made = _made(bundle, facts, BackEnd(head_onnx=chain_onnx(new), int8_head=int8, outcomes=bundle.outcomes))
     return Rebuilt(made, 0, tuple(notes))
 
 
@@ -137,14 +141,19 @@ def _made(
     )
 
 
+def _table_means(bundle: Bundle) -> F64:
+    """What each pattern says in each row of the table, over the largest that it can say, (rows, d_f)."""
+    assert bundle.table is not None
+    return word_means(np.arange(len(bundle.table)), bundle.n_features, bundle.outcomes).astype(np.float64)
+
+
 def _table(bundle: Bundle, rows: Rows, found: Refitted) -> F64:
     """All rows by the correction; those that were seen as they were found."""
     assert found.correction is not None
     assert bundle.table is not None
     wide = bundle.table.astype(np.float64)
     centred = wide - wide.mean(axis=1, keepdims=True)
-    means = word_means(np.arange(len(wide)), bundle.n_features).astype(np.float64)
-    scores = found.correction.apply(centred, means)
+    scores = found.correction.apply(centred, _table_means(bundle))
     scores[rows.number] = found.scores
     return scores
 

@@ -67,6 +67,7 @@ def _bundle_facts(bundle: Bundle) -> dict[str, Any]:
         "levels": bundle.levels,
         "photons_per_level": bundle.photons_per_level,
         "illumination": bundle.illumination(),
+        "photon_number_max": bundle.largest,
         "back_ends": back_ends,
         "head_bytes": 0 if bundle.head_onnx is None else len(bundle.head_onnx),
         "table_rows": 0 if bundle.table is None else len(bundle.table),

@@ -176,8 +176,8 @@ def _table_differences(bundle: Bundle) -> list[str]:
     chosen = np.arange(count) * n_words // count
     for start in range(0, count, at_once):
         words = chosen[start : start + at_once]
-        clicks = word_means(words, bundle.n_features).astype(np.int64)
-        difference = golden_violation(bundle.table[words], decider.scores_batch(clicks, 1))
+        numbers = np.rint(word_means(words, bundle.n_features, bundle.outcomes) * bundle.largest).astype(np.int64)
+        difference = golden_violation(bundle.table[words], decider.scores_batch(numbers, bundle.largest))
         if difference:
             return [f"table and head disagree from word {int(words[0])} on: {difference}"]
     return []

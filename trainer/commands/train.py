@@ -19,7 +19,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.trainer.options import (
     DEFAULT_ALPHA,
-    EXACT_FEATURES_MAX,
+    EXACT_WORDS_MAX,
     PICTURE_HEADS,
     Options,
     check_options,
@@ -167,7 +167,7 @@ def _options(args: argparse.Namespace, task: Task, profile: Profile) -> Options:
         )
     if encoder == "active" and task.optics != "none":
         raise UsageError(f"--encoder active: {task.name} lies behind a fibre", remedy="use --encoder coherent")
-    best = "exact" if args.features <= EXACT_FEATURES_MAX else "local"
+    best = "exact" if min(args.outcomes or 2, 16) ** args.features <= EXACT_WORDS_MAX else "local"
     estimator = args.estimator or ("ste" if is_picture else best)
     alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
     given: dict[str, Any] = {"optics": stated_tolerance(profile) if encoder == "active" else None}

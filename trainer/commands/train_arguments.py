@@ -57,11 +57,11 @@ NUMBERS = (
     ("dark", "R", "dark photoelectrons per exposure in training, instead of the profile's"),
 )
 OF_AUTOMATA = (
-    *("exposures", "states", "patterns", "grey", "strength", "decide", "outcomes", "exposure_price", "soft", "teacher"),
+    *("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher"),
     *("start", "rate", "reroutes"),
 )
 AS_GIVEN = (
-    *("features", "photons", "budget", "complex_field", "optics", "bleach"),
+    *("features", "photons", "budget", "complex_field", "optics", "bleach", "outcomes"),
     *(name for name, _, _ in NUMBERS if name not in OF_AUTOMATA),
 )
 
@@ -128,7 +128,7 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
         "--outcomes",
         type=int,
         metavar="K",
-        help="of an automaton: outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
+        help="outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
     )
     parser.add_argument(
         "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"

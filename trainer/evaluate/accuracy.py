@@ -22,11 +22,12 @@ from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, cannot_count, counting
+from pans.runtime.instrument.count_law import CountLaw, cannot_count, count_chances, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 
 from .chain import Chain
+from .numbers import Numbers, vector_chances
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
 _CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small
@@ -53,17 +54,21 @@ class Measured:
 class Light:
     """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks.
 
-    `probability` holds afterpulses in the mean, where the profile states them; word by word they are in chain.py.
+    `probability` holds afterpulses in the mean, where the profile states them; word by word they are in chain.py. Of photon numbers it is
+    the mean number.
     """
 
     photoelectrons: F64
     probability: F64
-    law: ClickLaw
+    law: ClickLaw | CountLaw
     illumination: float  # of one shot
     chain: Chain | None = None  # what links exposures: None without afterpulses
+    numbers: Numbers | None = None  # of a bundle that takes photon numbers
 
     def counts(self, shots: int, rng: np.random.Generator, rows: slice = slice(None)) -> NDArray[np.int64]:
         """Draw the clicks of `shots` exposures of every pattern, int64 (objects, d_f), for the objects in `rows`."""
+        if self.numbers is not None:
+            return self.numbers.counts(shots, rng, rows)
         if self.chain is None:
             return rng.binomial(shots, self.probability[rows])
         return self.chain.counts(shots, rng, rows)
@@ -89,7 +94,7 @@ def light_of(
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if bundle.automaton is not None:
         raise ValueError(f"{bundle.name} has an automaton: what it shows depends on the clicks (walks.walks_of)")
-    law = law_of(bundle, profile, eta, dark)
+    law = outcome_law_of(bundle, profile, eta, dark)
     if bundle.analyser is not None:
         if not (imaging.is_identity and bleaching.is_none):
             raise ValueError(f"{bundle.name} is passive: it shows no patterns that could miss or bleach the object")
@@ -112,8 +117,11 @@ def light_of(
     return _lit(light, law, illumination, profile, bundle)
 
 
-def _lit(light: F64, law: ClickLaw, illumination: float, profile: Profile, bundle: Bundle) -> Light:
+def _lit(light: F64, law: ClickLaw | CountLaw, illumination: float, profile: Profile, bundle: Bundle) -> Light:
     """Passive detectors click at once, each with traps of its own, which objects pass one after the other: as without afterpulses."""
+    if isinstance(law, CountLaw):
+        numbers = Numbers(np.moveaxis(count_chances(law, light), 0, -1))
+        return Light(light, numbers.mean(), law, illumination, numbers=numbers)
     first = click_probability(law, light)
     afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
     if not afterpulses or profile.mode == "parallel":
@@ -151,21 +159,21 @@ def exposure_of(bundle: Bundle, profile: Profile) -> float:
 def outcome_law_of(
     bundle: Bundle, profile: Profile, eta: float = 1.0, dark: float | None = None
 ) -> ClickLaw | CountLaw:
-    """Return the law of what the automaton of `bundle` is told of an exposure: of clicks as `law_of`, or of photon numbers.
+    """Return the law of what `bundle` is told of an exposure: of clicks as `law_of`, or of photon numbers.
 
     ValueError for what `law_of` refuses, and for a profile that cannot tell so many photon numbers apart.
     """
-    law, automaton = law_of(bundle, profile, eta, dark), bundle.automaton
-    if automaton is None or not automaton.counts:
+    law, outcomes = law_of(bundle, profile, eta, dark), bundle.largest + 1
+    if outcomes == 2:
         return law
-    why = cannot_count(profile, automaton.n_outcomes)
+    why = cannot_count(profile, outcomes)
     if why:
         raise ValueError(f"{bundle.name} needs {why}")
-    return counting(law, automaton.n_outcomes)
+    return counting(law, outcomes)
 
 
 def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *, shots: int = 1) -> Measured:
-    """Enumerate all (shots + 1)**d_f count vectors: the expected accuracy without trials.
+    """Enumerate all count vectors, (shots + 1)**d_f of clicks: the expected accuracy without trials.
 
     `accuracy_std` is then the exact spread that trials over these objects would show.
     """
@@ -176,22 +184,25 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
 
 
 def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
-    """Return P(decided class | object), float64 (n, classes), by enumeration of all (shots + 1)**d_f count vectors."""
-    outcomes = (shots + 1) ** bundle.n_features
+    """Return P(decided class | object), float64 (n, classes), by enumeration of all count vectors, (shots + 1)**d_f of clicks."""
+    base = shots * bundle.largest + 1
+    outcomes = base**bundle.n_features
     if outcomes > EXACT_OUTCOMES_MAX:
         raise ValueError(
             f"{shots} shots of {bundle.n_features} patterns have {outcomes} outcomes, allowed: {EXACT_OUTCOMES_MAX} "
             "(sample trials instead)"
         )
-    digits = (shots + 1) ** np.arange(bundle.n_features)
-    counts = (np.arange(outcomes)[:, None] // digits) % (shots + 1)
+    digits = base ** np.arange(bundle.n_features)
+    counts = (np.arange(outcomes)[:, None] // digits) % base
     decided = make_decider(bundle, shots=shots).decide_batch(counts, shots)
     of_class = np.eye(bundle.n_classes)[decided]
     shares = np.empty((len(light.probability), bundle.n_classes))
     step = max(1, _CHUNK_NUMBERS // outcomes)
     for start in range(0, len(shares), step):
         part = slice(start, start + step)
-        if light.chain is not None and shots == 1:
+        if light.numbers is not None:
+            shares[part] = vector_chances(light.numbers.sums(shots, part)) @ of_class
+        elif light.chain is not None and shots == 1:
             shares[part] = light.chain.word_chances(part) @ of_class
         else:  # of several shots, afterpulses are in the mean
             shares[part] = outcome_probabilities(light.probability[part], shots) @ of_class
@@ -210,15 +221,10 @@ def sampled_shares(bundle: Bundle, light: Light, *, shots: int = 1, trials: int,
 
 def outcome_probabilities(probability: F64, shots: int) -> F64:
     """Return P(count vector | object), (n, (shots + 1)**d_f), from click probabilities (n, d_f); pattern 0 varies fastest."""
-    n, d_f = probability.shape
-    chance = np.ones((n, 1))
-    for i in range(d_f):
-        p = probability[:, i : i + 1]
-        k = np.arange(shots + 1)
-        ways = np.array([math.comb(shots, int(j)) for j in k], dtype=np.float64)
-        of_pattern = ways * p**k * (1 - p) ** (shots - k)
-        chance = (of_pattern[:, :, None] * chance[:, None, :]).reshape(n, -1)
-    return chance
+    k = np.arange(shots + 1)
+    ways = np.array([math.comb(shots, int(j)) for j in k], dtype=np.float64)
+    p = probability[:, :, None]
+    return vector_chances(ways * p**k * (1 - p) ** (shots - k))
 
 
 def evaluate_sampled(

@@ -29,6 +29,9 @@ from .walks import MeasuredWalks, Walks, measured_walks, walks_of
 DEFAULT_PROFILE = "oled-qcmos"
 DEFAULT_TRIALS = 30  # as many as the paper's experiment repeats
 PICTURE_TRIALS = 3  # a picture is hundreds of numbers
+EXACT_NUMBERS_MAX = (
+    1 << 16
+)  # vectors of photon numbers that are gone through unasked: ten thousand objects in half a minute
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,4 +210,5 @@ def trials_needed(bundle: Bundle, shots: int = 1) -> int | None:
         return 1
     if bundle.automaton is not None:
         return None
-    return DEFAULT_TRIALS if (shots + 1) ** bundle.n_features > EXACT_OUTCOMES_MAX else None
+    most = EXACT_OUTCOMES_MAX if bundle.largest == 1 else EXACT_NUMBERS_MAX
+    return DEFAULT_TRIALS if (shots * bundle.largest + 1) ** bundle.n_features > most else None

@@ -69,14 +69,22 @@ def marginal_scores(table: NDArray[Any], chances: F64, count: int) -> F64:
     return np.asarray(np.log(seen) - np.log(seen.sum(axis=1, keepdims=True)))
 
 
+def demand_click_patterns(bundle: Bundle) -> None:
+    """Raise ValueError unless `bundle` shows fixed patterns and decides among classes by their clicks."""
+    fixed = bundle.automaton is None and bundle.analyser is None and bundle.picture_shape is None
+    if not fixed or bundle.largest > 1:
+        raise ValueError(
+            f"{bundle.name} has no fixed patterns that decide among classes by clicks, allowed: bundles that have"
+        )
+
+
 def of_first(bundle: Bundle, count: int, probability: F64) -> Bundle:
     """Return the bundle of the first `count` patterns of `bundle`, whose back end has summed over the others.
 
     `probability` (n, d_f) are `training_clicks`. ValueError for a bundle without fixed patterns or with pictures, and for a head that
     is no plain chain of layers.
     """
-    if bundle.automaton is not None or bundle.analyser is not None or bundle.picture_shape is not None:
-        raise ValueError(f"{bundle.name} has no fixed patterns that decide among classes, allowed: bundles that have")
+    demand_click_patterns(bundle)
     if not 1 <= count <= bundle.n_features:
         raise ValueError(f"{count} patterns of {bundle.n_features}")
     if count == bundle.n_features:

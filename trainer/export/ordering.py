@@ -19,6 +19,7 @@ from pans.runtime.instrument.click_law import click_probability, object_transmis
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.evaluate.accuracy import demand_sequence, law_of, outcome_probabilities
 from pans.trainer.evaluate.information import mutual_information_bits
+from pans.trainer.evaluate.shown import demand_click_patterns
 from pans.trainer.tasks.registry import Objects
 
 EXACT_PATTERNS_MAX = 12  # 4096 click words per object
@@ -47,10 +48,7 @@ class _Clicks:
     """Click probabilities of the patterns that are not chosen yet, on objects that the chosen ones have bleached."""
 
     def __init__(self, bundle: Bundle, profile: Profile, objects: Objects, bleaching: Bleaching) -> None:
-        if bundle.automaton is not None or bundle.analyser is not None or bundle.picture_shape is not None:
-            raise ValueError(
-                f"{bundle.name} has no order of patterns that decide among classes, allowed: fixed patterns, and classes"
-            )
+        demand_click_patterns(bundle)
         demand_sequence(profile)
         imaging = profile.imaging()
         self.light = bundle.patterns()

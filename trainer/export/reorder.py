@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.layers import Int8Head, Layer, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.refit.onnx_chain import chain_onnx
+from pans.trainer.evaluate.shown import demand_click_patterns
 
 from .ordering import Order
 
@@ -25,8 +26,7 @@ def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) ->
     ValueError for what is no order of its patterns, for a bundle without fixed patterns, and for a head that is no plain chain of layers.
     """
     places = [int(place) for place in order]
-    if bundle.automaton is not None or bundle.analyser is not None or bundle.picture_shape is not None:
-        raise ValueError(f"{bundle.name} has no fixed patterns that decide among classes, allowed: bundles that have")
+    demand_click_patterns(bundle)
     if sorted(places) != list(range(bundle.n_features)):
         raise ValueError(f"{places[:20]} is no order of {bundle.n_features} patterns")
     return make_bundle(

@@ -37,7 +37,7 @@ from .ordering import information_order
 from .reorder import order_facts, reordered
 from .tolerance import with_tolerance
 
-ALL_WORDS_MAX = 12  # 4096 words; a bundle holds a table up to here too
+ALL_WORDS_MAX = 1 << 12  # a bundle holds a table up to here too
 RANDOM_WORDS = 10_000  # beyond it
 COMPARED_OBJECTS = 200
 
@@ -67,6 +67,7 @@ class Description:
     classes: tuple[str, ...]
     image_shape: tuple[int, int]
     provenance: Mapping[str, Any]
+    outcomes: int = 2  # of an exposure, as `BackEnd` has it
 
 
 def export(
@@ -100,7 +101,7 @@ def export(
         picture_shape=picture_shape,
         image_shape=about.image_shape,
         optics=optics,
-        back_end=BackEnd(graph, int8_head=int8, int8_onnx=None if int8 is None else int8_onnx(int8)),
+        back_end=BackEnd(graph, None, int8, None if int8 is None else int8_onnx(int8), about.outcomes),
         provenance={**about.provenance, "trained_with": programs()},
     )
     places = list(range(bundle.n_features))
@@ -157,7 +158,7 @@ def export_trained(
     else:
         optics = Shown(profile.projector.levels, quantised.pattern_levels, quantised.photons_per_level)
     facts = origin(task, profile) | {"validation_losses": list(trained.validation_losses), **provenance}
-    about = Description(name, task.name, task.classes, task.image_shape, facts)
+    about = Description(name, task.name, task.classes, task.image_shape, facts, trained.options.outcomes)
 
     def check(bundle: Bundle) -> None:
         compare_optics(bundle, trained, task, profile)
@@ -213,16 +214,18 @@ def compare_optics(bundle: Bundle, trained: Trained, task: Task, profile: Profil
 
 
 def compare(bundle: Bundle, head: Heads, click_mean: F64, places: Sequence[int] | None = None) -> tuple[int, float]:
-    """Hold every back end of `bundle` against the torch head: all click words up to d_f = 12, else 10 000 random ones.
+    """Hold every back end of `bundle` against the torch head: all words where there are at most 4096, else 10 000 random ones.
 
     Pattern i of the bundle is pattern `places[i]` of the head (None: i). Returns the number of words and the largest score difference
     over max(1, |score|). PansError where it exceeds 1e-5 or a decision differs whose margin is clear of that (pictures have only
     scores, their pixels).
     """
-    if bundle.n_features <= ALL_WORDS_MAX:
-        means = word_means(np.arange(1 << bundle.n_features), bundle.n_features)
+    largest = bundle.largest
+    if bundle.outcomes**bundle.n_features <= ALL_WORDS_MAX:
+        means = word_means(np.arange(bundle.outcomes**bundle.n_features), bundle.n_features, bundle.outcomes)
     else:
-        means = np.random.default_rng(0).integers(0, 2, (RANDOM_WORDS, bundle.n_features)).astype(np.float32)
+        drawn = np.random.default_rng(0).integers(0, bundle.outcomes, (RANDOM_WORDS, bundle.n_features))
+        means = drawn.astype(np.float32) / np.float32(largest)
     as_trained = np.empty_like(means)
     as_trained[:, list(places or range(bundle.n_features))] = means
     wanted = reference_scores(head, click_mean, as_trained)
@@ -232,7 +235,7 @@ def compare(bundle: Bundle, head: Heads, click_mean: F64, places: Sequence[int] 
     worst = 0.0
     for backend in ("onnx", "table") if bundle.table is not None else ("onnx",):
         decider = make_decider(bundle, backend=backend)
-        found = decider.scores_batch(means.astype(np.int64), 1).astype(np.float64)
+        found = decider.scores_batch(np.rint(means * largest).astype(np.int64), 1).astype(np.float64)
         difference = float((np.abs(found - wanted) / scale).max())
         clear &= bundle.picture_shape is None
         changed = int((clear & (found.argmax(axis=1) != wanted.argmax(axis=1))).sum())

@@ -47,6 +47,9 @@ class Head(Protocol):
     def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
         """Scores (n, d_f, out): column i is that of the same clicks with click i inverted."""
 
+    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
+        """Scores (n, d_f, out): column i is that of the same clicks with `by` (n, d_f) added to click i alone."""
+
 
 Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator], Tensor]
 
@@ -113,14 +116,19 @@ def identity(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: tor
 
 def exact(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator) -> Tensor:
     """All click words, each once: no sampling noise in loss or gradient."""
-    words = word_probabilities(p)
-    scores = head(click_words(p.shape[1]), p.mean(dim=0))
-    if not target.is_floating_point():  # the same as below, by a matrix product instead of n * 2**d_f losses
+    return word_loss(word_probabilities(p), head(click_words(p.shape[1]), p.mean(dim=0)), target, loss_of)
+
+
+def word_loss(words: Tensor, scores: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
+    """Return the mean loss over objects of which each shows every word, with `scores` (words, out), with chances `words` (n, words)."""
+    if not target.is_floating_point():  # the same as below, by a matrix product instead of n * words losses
         n_classes = scores.shape[1]
         of_class = torch.nn.functional.one_hot(target, n_classes).to(words.dtype)
-        losses = loss_of(scores.unsqueeze(1), torch.arange(n_classes, device=p.device).unsqueeze(0))  # (words, classes)
-        return ((words.T @ of_class) * losses).sum() / len(p)
-    return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p)
+        losses = loss_of(
+            scores.unsqueeze(1), torch.arange(n_classes, device=words.device).unsqueeze(0)
+        )  # (words, classes)
+        return ((words.T @ of_class) * losses).sum() / len(words)
+    return (words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(words)
 
 
 def local_expectation(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
@@ -130,7 +138,7 @@ def local_expectation(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, ra
     with torch.no_grad():
         change = loss_of(head.flipped(clicks, mean), target.unsqueeze(1)) - loss.unsqueeze(1)
         slope = (1 - 2 * clicks) * change
-    return loss.mean() + _gradient_only(p, slope)
+    return loss.mean() + gradient_only(p, slope)
 
 
 def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
@@ -142,7 +150,7 @@ def disarm(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch
     with torch.no_grad():
         rarer = torch.minimum(p, 1 - p).clamp(min=_P_MIN)
         slope = 0.5 * (losses[0] - losses[1]).unsqueeze(1) * (first - second) / rarer
-    return 0.5 * (losses[0] + losses[1]).mean() + _gradient_only(p, slope)
+    return 0.5 * (losses[0] + losses[1]).mean() + gradient_only(p, slope)
 
 
 def leave_one_out(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator) -> Tensor:
@@ -154,15 +162,15 @@ def leave_one_out(p: Tensor, target: Tensor, head: Head, loss_of: LossOf, random
         excess = (losses - losses.mean(dim=0)) * (LOO_SAMPLES / (LOO_SAMPLES - 1))
         variance = (p * (1 - p)).clamp(min=_P_MIN)
         slope = torch.stack([e.unsqueeze(1) * (c - p) / variance for e, c in zip(excess, drawn)]).mean(dim=0)
-    return losses.mean() + _gradient_only(p, slope)
+    return losses.mean() + gradient_only(p, slope)
 
 
 def _draw(p: Tensor, random: torch.Generator) -> Tensor:
     return (torch.rand(p.shape, generator=random, dtype=torch.float64) < p).to(p.dtype)
 
 
-def _gradient_only(p: Tensor, slope: Tensor) -> Tensor:
-    """Value 0; gradient `slope` / n in p."""
+def gradient_only(p: Tensor, slope: Tensor) -> Tensor:
+    """Return a scalar of value 0 whose gradient in p (n, ...) is `slope` / n."""
     weighted = (slope * p).sum() / len(p)
     return weighted - weighted.detach()
 

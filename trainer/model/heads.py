@@ -1,7 +1,7 @@
 """Heads: from clicks to scores, with batch normalisation right after the detection.
 
 Owns the digital back end in torch; never samples. A head takes click means (n, d_f) in [0, 1] and returns scores
-(n, classes), or pixels (n, height * width); `flipped` gives them for every word that differs in one click.
+(n, classes), or pixels (n, height * width); `changed` gives them for every word that differs in one click.
 
 - `MlpHead`: one hidden layer, the paper's (512 units).
 - `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
@@ -73,23 +73,27 @@ class _Head(nn.Module):
 
     def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
         """Return the outputs (n, d_f, out): in column i click i is inverted."""
+        return self.changed(clicks, mean, 1 - 2 * clicks)
+
+    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
+        """Return the outputs (n, d_f, out): in column i `by` (n, d_f) is added to click i alone."""
         outputs = []
         for i in range(clicks.shape[1]):
             other = clicks.clone()
-            other[:, i] = 1 - other[:, i]
+            other[:, i] += by[:, i]
             outputs.append(self(other, mean))
         return torch.stack(outputs, dim=1)
 
 
 class _DenseHead(_Head):
-    """A head whose first layer sees the clicks: with one of them inverted, its sums are corrected instead of made anew."""
+    """A head whose first layer sees the clicks: with one of them changed, its sums are corrected instead of made anew."""
 
-    def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
-        """Return the outputs (n, d_f, out): in column i click i is inverted."""
+    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
+        """Return the outputs (n, d_f, out): in column i `by` (n, d_f) is added to click i alone."""
         scale = self.norm.gain / torch.sqrt(mean * (1 - mean) + EPSILON)
         sums = self.hidden((clicks - mean) * scale + self.norm.bias)
         columns = (self.hidden.weight * scale).T  # (d_f, hidden)
-        changed = torch.addcmul(sums.unsqueeze(1), (1 - 2 * clicks).unsqueeze(2), columns.unsqueeze(0))
+        changed = torch.addcmul(sums.unsqueeze(1), by.unsqueeze(2), columns.unsqueeze(0))
         return self.rest(changed.relu_())
 
 

@@ -13,23 +13,27 @@ import math
 import torch
 from torch import Tensor
 
-from pans.trainer.model.detection import click_words, sample_clicks, word_probabilities
 from pans.trainer.model.estimators import LossOf, cross_entropy
 from pans.trainer.model.heads import Heads, PictureHead
-from pans.trainer.options import EXACT_FEATURES_MAX
+from pans.trainer.model.readings import Clicks, Readings
+from pans.trainer.options import EXACT_WORDS_MAX
 
 SHOTS = (2, 3, 5, 8, 13, 21, 34, 55)  # numbers of shots that are fitted beside one, up to the largest wanted
 SHARE_OF_SHOTS = 0.3  # of the loss, for all numbers of shots beside one
+CLICKS = Clicks()
 CHUNK = 2000  # objects per pass where no gradient is needed
 STEPS = 1500
 RATE = 2e-3
 
 
-def joint_distribution(p: Tensor, labels: Tensor, n_classes: int) -> Tensor:
-    """Return P(word, class) over objects with click probabilities `p` (n, d_f), float64 (2**d_f, classes); sums to 1."""
-    joint = torch.zeros(1 << p.shape[1], n_classes, dtype=torch.float64)
+def joint_distribution(p: Tensor, labels: Tensor, n_classes: int, readings: Readings = CLICKS) -> Tensor:
+    """Return P(word, class) over objects with click probabilities `p` (n, d_f), float64 (2**d_f, classes); sums to 1.
+
+    Of other `readings` p are their chances, and there are outcomes**d_f words.
+    """
+    joint = torch.zeros(readings.outcomes ** p.shape[1], n_classes, dtype=torch.float64)
     for start in range(0, len(p), CHUNK):
-        words = word_probabilities(p[start : start + CHUNK].double())
+        words = readings.word_chances(p[start : start + CHUNK].double())
         of_class = torch.nn.functional.one_hot(labels[start : start + CHUNK], n_classes).double()
         joint += words.T @ of_class
     return joint / len(p)
@@ -42,12 +46,13 @@ def fit_head_exactly(
     rate: float = RATE,
     *,
     more: _Shots | None = None,
+    readings: Readings = CLICKS,
 ) -> None:
-    """Fit the head to `joint` (2**d_f, classes): the whole training set at every step, with a falling rate.
+    """Fit the head to `joint` (words, classes): the whole training set at every step, with a falling rate.
 
     `more` adds the loss of several shots, by sampling.
     """
-    words, target = click_words(head.norm.gain.numel()), joint.float()
+    words, target = readings.words(head.norm.gain.numel()), joint.float()
     optimiser = torch.optim.Adam(head.parameters(), lr=rate)
     head.eval()  # the normalisation stays: its mean is exact
     for step in range(steps):
@@ -71,6 +76,7 @@ def fit_head_by_samples(
     batch: int = 512,
     rate: float = 1e-3,
     more: _Shots | None = None,
+    readings: Readings = CLICKS,
 ) -> None:
     """Fit the head to sampled clicks of objects with click probabilities `p` (n, d_f), with a falling rate."""
     optimiser = torch.optim.Adam(head.parameters(), lr=rate)
@@ -79,7 +85,7 @@ def fit_head_by_samples(
         optimiser.param_groups[0]["lr"] = rate * (1 - epoch / epochs)
         for which in torch.randperm(len(p), generator=random).split(batch):
             optimiser.zero_grad()
-            loss = loss_of(head(sample_clicks(p[which], random).float()), target[which]).mean()
+            loss = loss_of(head(readings.sample(p[which], random).float()), target[which]).mean()
             if more is not None:
                 loss = (1 - SHARE_OF_SHOTS) * loss + SHARE_OF_SHOTS * more.loss(head)
             loss.backward()
@@ -90,8 +96,16 @@ class _Shots:
     """Losses of mean clicks of several shots, each of a batch of objects and a number of shots drawn at random."""
 
     def __init__(
-        self, p: Tensor, target: Tensor, loss_of: LossOf, random: torch.Generator, shots: int, batch: int = 512
+        self,
+        p: Tensor,
+        target: Tensor,
+        loss_of: LossOf,
+        random: torch.Generator,
+        shots: int,
+        readings: Readings,
+        batch: int = 512,
     ) -> None:
+        self.readings = readings
         self.p, self.target, self.loss_of, self.random, self.batch = p, target, loss_of, random, batch
         self.numbers = [number for number in SHOTS if number <= shots] or [shots]
 
@@ -100,7 +114,7 @@ class _Shots:
         which = torch.randint(len(self.p), (self.batch,), generator=self.random)
         shots = self.numbers[int(torch.randint(len(self.numbers), (1,), generator=self.random))]
         p = self.p[which]
-        counts = torch.stack([sample_clicks(p, self.random) for _ in range(shots)]).sum(dim=0)
+        counts = torch.stack([self.readings.sample(p, self.random) for _ in range(shots)]).sum(dim=0)
         return self.loss_of(head((counts / shots).float()), self.target[which]).mean()
 
 
@@ -114,17 +128,19 @@ def fit_head(
     shots: int = 1,
     batch: int = 512,
     rate: float = 1e-3,
+    readings: Readings = CLICKS,
 ) -> None:
-    """Fit `head` to click probabilities `p` (n, d_f) of all training objects, for 1 to `shots` shots.
+    """Fit `head` to click probabilities `p` (n, d_f) of all training objects, for 1 to `shots` shots; of `readings` p are their chances.
 
     The words of one shot are enumerated where they are few enough and a class is asked for by cross-entropy. The normalisation is set
     to the exact mean before.
     """
-    head.norm.running_mean.copy_(p.mean(dim=0))
-    more = _Shots(p, target, loss_of, random, shots) if shots > 1 else None
-    if p.shape[1] <= EXACT_FEATURES_MAX and loss_of is cross_entropy:
+    head.norm.running_mean.copy_(readings.mean(p).mean(dim=0))
+    more = _Shots(p, target, loss_of, random, shots, readings) if shots > 1 else None
+    if readings.outcomes ** p.shape[1] <= EXACT_WORDS_MAX and loss_of is cross_entropy:
         assert not isinstance(head, PictureHead), "pictures have no cross-entropy"
-        fit_head_exactly(head, joint_distribution(p, target, head.output.out_features), more=more)
+        joint = joint_distribution(p, target, head.output.out_features, readings)
+        fit_head_exactly(head, joint, more=more, readings=readings)
     else:
-        fit_head_by_samples(head, p, target, loss_of, random, batch=batch, rate=rate, more=more)
+        fit_head_by_samples(head, p, target, loss_of, random, batch=batch, rate=rate, more=more, readings=readings)
     head.eval()

@@ -26,17 +26,19 @@ from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import as_usage_error
 from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.count_law import CountLaw, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.afterpulses import trained_through, with_mean_memory
 from pans.trainer.model.concentration import concentration
-from pans.trainer.model.detection import Law, click_probability, click_words, sample_clicks, word_probabilities
+from pans.trainer.model.detection import Law
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
-from pans.trainer.model.estimators import ESTIMATORS, LossOf, cross_entropy, similarity_loss
+from pans.trainer.model.estimators import LossOf, cross_entropy, similarity_loss
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.model.field_basis import in_pixels
 from pans.trainer.model.heads import Heads, new_head
-from pans.trainer.options import BUDGETS, EXACT_FEATURES_MAX, Options, check_options
+from pans.trainer.model.readings import readings_of
+from pans.trainer.options import BUDGETS, EXACT_WORDS_MAX, Options, check_options
 from pans.trainer.tasks.registry import Task
 
 from . import schedule
@@ -76,8 +78,8 @@ class Trained:
     float_patterns: Any  # float32 (d_f, pixels) numpy: the patterns before they became whole levels; None likewise
     encoder: Encoder
     head: Heads
-    click_mean: Tensor  # mean click probability of every pattern over the training objects, float64 (d_f,)
-    law: Law
+    click_mean: Tensor  # mean of what the head is given of every pattern over the training objects, float64 (d_f,)
+    law: Law | CountLaw
     validation_loss: float
     validation_losses: tuple[float, ...]  # of all restarts
     options: Options
@@ -143,7 +145,7 @@ class Run:
     def __init__(
         self, data: TrainingData, profile: Profile, options: Options, restart: int, law: Law | None = None
     ) -> None:
-        self.own_law = law
+        self.own_law, self.readings = law, readings_of(options.outcomes)
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
         self.random = new_generator(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
@@ -165,7 +167,7 @@ class Run:
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
         if self.epoch == schedule.whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
-        loss_of_clicks = ESTIMATORS[schedule.estimator(options, self.epoch)]
+        readings, loss_of_clicks = self.readings, self.readings.estimator(schedule.estimator(options, self.epoch))
         law, traps = self.law(), self.afterpulses()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
@@ -177,12 +179,12 @@ class Run:
             light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
             slope, clamp = schedule.slope_and_clamp(options, now)
-            p = with_mean_memory(click_probability(light.clamp(max=clamp), law, slope), traps)
+            p = with_mean_memory(readings.chances(light.clamp(max=clamp), law, slope), traps)
             loss_of = schedule.loss_at(options, now, data.picture_shape)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
             if options.mix > 0 and self.epoch >= schedule.second_stage(options):
                 loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
-            clicks = p.sum(dim=1).mean()
+            clicks = readings.mean(p).sum(dim=1).mean() * (readings.outcomes - 1)
             illumination = self.encoder.illumination()
             total = loss + self._penalty(clicks, photons, illumination)
             for group, rate in zip(self.optimiser.param_groups, schedule.rates(options, now)):
@@ -203,15 +205,16 @@ class Run:
     def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
         """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
         shots = 2 + int(torch.randint(self.options.shots - 1, (1,), generator=self.random))
-        clicks = torch.stack([sample_clicks(p, self.random) for _ in range(shots)]).mean(dim=0)
-        return loss_of(self.head(clicks, p.mean(dim=0)), target).mean()
+        clicks = torch.stack([self.readings.sample(p, self.random) for _ in range(shots)]).mean(dim=0)
+        return loss_of(self.head(clicks, self.readings.mean(p).mean(dim=0)), target).mean()
 
-    def law(self) -> Law:
-        """The click law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
+    def law(self) -> Law | CountLaw:
+        """The law at the exposure that the present brightest pixel needs; of passive sensing, at the shortest one."""
         if self.own_law is not None:
             return self.own_law
         law = click_law(self.profile, self._exposure_us())
-        return law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
+        law = law if self.options.dark is None else replace(law, dark_per_exposure=self.options.dark)
+        return law if self.options.outcomes == 2 else counting(law, self.options.outcomes)
 
     def afterpulses(self) -> Afterpulses | None:
         """What the clicks before add to a click at the same exposure, where that is trained through."""
@@ -245,7 +248,7 @@ class Run:
     # ---- after the last epoch ----
 
     def probabilities(self, start: int, stop: int, draw: int = 0) -> Tensor:
-        """Click probabilities, float64 (n, d_f), of the training objects start..stop through the whole instrument.
+        """Click probabilities, float64 (n, d_f), or chances of readings.py, of the training objects start..stop through the instrument.
 
         `draw` counts draws of optics that no epoch has seen.
         """
@@ -254,7 +257,7 @@ class Run:
         with torch.no_grad():
             for first in range(start, stop, CHUNK):
                 which = torch.arange(first, min(first + CHUNK, stop))
-                parts.append(click_probability(self.encoder(shown[which], floor).double(), law))
+                parts.append(self.readings.chances(self.encoder(shown[which], floor).double(), law))
         return with_mean_memory(torch.cat(parts), traps)
 
     def validation_loss(self) -> float:
@@ -268,9 +271,10 @@ class Run:
         random = new_generator(self.options.seed)
         self.head.eval()
         with torch.no_grad():
-            if self.options.features <= EXACT_FEATURES_MAX and not self.data.is_image:
-                scores = self.head(click_words(self.options.features)).double()
-                one = float((word_probabilities(p) * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
+            readings = self.readings
+            if readings.outcomes**self.options.features <= EXACT_WORDS_MAX and not self.data.is_image:
+                scores, words = self.head(readings.words(self.options.features)).double(), readings.word_chances(p)
+                one = float((words * loss_of(scores.unsqueeze(0), target.unsqueeze(1))).sum() / len(p))
             else:
                 one = self._mean_loss(p, loss_of, 1, random)
             if self.options.mix == 0:
@@ -283,7 +287,7 @@ class Run:
         """Return the mean loss of the validation objects over `VALIDATION_SAMPLES` draws of mean clicks of `shots` shots."""
         target, losses = self.data.target[self.data.n_fit :], []
         for _ in range(VALIDATION_SAMPLES):
-            clicks = torch.stack([sample_clicks(p, random) for _ in range(shots)]).mean(dim=0)
+            clicks = torch.stack([self.readings.sample(p, random) for _ in range(shots)]).mean(dim=0)
             losses.append(loss_of(self.head(clicks.float()), target).mean())
         return float(torch.stack(losses).mean())
 
@@ -310,8 +314,9 @@ class Run:
             shots=self.options.shots,
             batch=self.options.batch,
             rate=self.options.head_rate,
+            readings=self.readings,
         )
-        mean, law = p.mean(dim=0).cpu(), self.law()
+        mean, law = self.readings.mean(p).mean(dim=0).cpu(), self.law()
         self.encoder.cpu()  # what follows is export and judgement
         self.head.cpu()
         return Trained(quantised, floats, self.encoder, self.head, mean, law, min(losses), losses, self.options)

@@ -119,7 +119,7 @@ def test_the_altered_part_is_named() -> None:
         parse_bundle(bytes(data), "x")
 
 
-@pytest.mark.parametrize("version", [0, 5, 0xFFFFFFFF])
+@pytest.mark.parametrize("version", [0, 6, 0xFFFFFFFF])
 def test_unknown_versions_are_refused_by_name(version: int) -> None:
     data = bundle_bytes(small_bundle())
     with pytest.raises(DamagedFileError, match=f"version {version}, allowed: 1"):
@@ -204,7 +204,7 @@ BUDGETS = {  # of the format: a limit that a sound bundle is just beyond, and wh
     ("FEATURES_MAX", 1): (HEADED, "2 patterns, allowed: 1 to 1"),
     ("PIXELS_MAX", 2): (HEADED, "3 pixels, allowed: 1 to 2"),
     ("CLASSES_MAX", 1): (HEADED, "2 classes, allowed: 2 to 1"),
-    ("TABLE_FEATURES_MAX", 1): (small_bundle(), "a table for 2 patterns, allowed at most 1"),
+    ("TABLE_ROWS_MAX", 2): (small_bundle(), "a table for 2 patterns, allowed at most 1"),
     ("HEAD_MAX_BYTES", 50): (HEADED, r"the head has \d+ bytes, allowed: 1 to 50"),
     ("GOLDEN_MAX", 3): (HEADED, r"\d+ golden vectors, allowed: 1 to 3"),
     ("GOLDEN_MEANS_MAX", 7): (HEADED, r"golden_means holds \d+ numbers, allowed at most 7"),

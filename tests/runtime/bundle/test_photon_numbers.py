@@ -1,0 +1,112 @@
+"""Bundles of fixed patterns that take photon numbers: format version 5, its table in base `outcomes`, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from automata import random_automaton
+from bundles import automaton_bundle, made_bundle
+from heads import affine_head
+
+from pans.runtime.bundle.model import bundle_bytes, parse_bundle, word_means
+from pans.runtime.errors import DamagedFileError, UsageError
+
+OUTCOMES, D_F = 4, 3
+WEIGHTS = np.random.default_rng(1).normal(size=(D_F, 2)).astype(np.float32)
+BIAS = np.array([0.1, -0.2], np.float32)
+
+
+def counted(**facts: Any) -> Any:
+    return made_bundle(D_F, 2, **{"outcomes": OUTCOMES} | facts)
+
+
+def resealed(data: bytes, version: int, change: Any = lambda header: None) -> bytes:
+    """The file with another version and a changed header, its closing checksum made to fit again."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[16 : 16 + length])
+    change(header)
+    text = json.dumps(header).encode()
+    body = data[:8] + struct.pack("<II", version, len(text)) + text + data[16 + length : -32]
+    return body + hashlib.sha256(body).digest()
+
+
+def test_a_head_gives_the_table_of_all_numbers() -> None:
+    made = counted(head_onnx=affine_head(WEIGHTS, BIAS))
+    assert (made.largest, made.table.shape) == (3, (OUTCOMES**D_F, 2))
+    for number, word in enumerate(product(range(OUTCOMES), repeat=D_F)):
+        means = np.array(word[::-1]) / 3  # pattern 0 is the lowest digit
+        assert made.table[number].tolist() == pytest.approx((means @ WEIGHTS + BIAS).tolist(), abs=1e-5)
+        assert word_means([number], D_F, OUTCOMES)[0].tolist() == pytest.approx(means.tolist(), abs=1e-7)
+    middle = (made.golden_means > 0) & (made.golden_means < 1)
+    assert middle.any(axis=1).sum() > 60  # golden vectors are numbers, not clicks alone
+
+
+def test_version_5_is_read_back_whole_and_clicks_stay_version_1() -> None:
+    made = counted(table=np.random.default_rng(2).normal(size=(64, 2)))
+    data = bundle_bytes(made)
+    assert struct.unpack_from("<I", data, 8) == (5,)
+    read = parse_bundle(data, "x")
+    assert (read.outcomes, read.largest, read.n_features) == (4, 3, 3)
+    assert np.array_equal(read.table, made.table)
+    assert bundle_bytes(read) == data
+    clicks = made_bundle(D_F, 2, table=np.zeros((8, 2)))
+    assert struct.unpack_from("<I", bundle_bytes(clicks), 8) == (1,)
+    assert clicks.largest == 1
+
+
+def test_largest_of_an_automaton_is_that_of_its_exposures() -> None:
+    assert automaton_bundle(random_automaton(0, outcomes=3)).largest == 2
+    assert automaton_bundle(random_automaton(0)).largest == 1
+
+
+FILE = bundle_bytes(counted(table=np.arange(128.0).reshape(64, 2)))
+
+
+@pytest.mark.parametrize(
+    ("version", "changes", "words"),
+    [
+        (5, {"outcomes": 2}, "outcomes is 2, allowed: a whole number from 3 to 16"),
+        (5, {"outcomes": 17}, "outcomes is 17, allowed"),
+        (5, {"outcomes": True}, "outcomes is True, allowed"),
+        (5, {"outcomes": 4.0}, "outcomes is 4.0, allowed"),
+        (5, {"outcomes": 5}, r"table has shape \(64, 2\), allowed: \(5\*\*d_f, classes\) = \(125, 2\)"),
+        (5, {"outcomes": None}, "version 5 that says no more than 1"),
+        (1, {}, "header has the keys"),
+        (2, {}, "header has the keys"),
+        (4, {}, "header has the keys"),
+        (5, {"picture_shape": [1, 1]}, "header has the keys"),
+    ],
+)
+def test_what_version_5_cannot_say_is_refused(version: int, changes: dict[str, Any], words: str) -> None:
+    def change(header: dict[str, Any]) -> None:
+        header.update(changes)
+        if changes.get("outcomes", 0) is None:
+            del header["outcomes"]
+
+    with pytest.raises(DamagedFileError, match=words):
+        parse_bundle(resealed(FILE, version, change), "x")
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({"outcomes": 17, "table": np.zeros((17**3, 2))}, "outcomes is 17, allowed"),
+        ({"table": np.zeros((8, 2))}, "table has shape"),
+        ({"table": np.zeros((64, 2)), "head_onnx": affine_head(WEIGHTS, BIAS)}, "head and table disagree"),
+        ({"head_onnx": affine_head(WEIGHTS, BIAS), "classes": [], "picture_shape": (1, 2)}, "4 outcomes per exposure"),
+    ],
+)
+def test_what_makes_no_sense_is_not_made(facts: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        counted(**facts)
+
+
+def test_a_large_table_is_refused_before_it_is_looked_at() -> None:
+    with pytest.raises(UsageError, match="a table for 6 patterns, allowed at most 5 of 16 readings each"):
+        made_bundle(6, 2, outcomes=16, table=np.zeros((4, 2)))

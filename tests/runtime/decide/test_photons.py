@@ -1,0 +1,126 @@
+"""Photon numbers through every back end: as the head in plain numpy, and refused beyond the largest."""
+
+from __future__ import annotations
+
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from bundles import made_bundle
+from heads import onnx_chain, random_layers
+
+from pans.runtime.api import decide
+from pans.runtime.bundle.layers import quantise_head
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.core.dark_tables import make_adapter
+from pans.runtime.decide import backends, make_decider
+from pans.runtime.decide.verdict import choice_of
+from pans.runtime.errors import UsageError
+from pans.runtime.report.verify import _verify_bundle
+
+LAYERS = random_layers([3, 8, 4], seed=3)
+BACKENDS = ("table", "onnx", "sparse", "float64", "count-table")
+
+
+@pytest.fixture(scope="module")
+def counted() -> Bundle:
+    return made_bundle(3, 4, head_onnx=onnx_chain(LAYERS), int8_head=quantise_head(LAYERS), outcomes=3)
+
+
+def scores_of(sums: Any, shots: int) -> np.ndarray:
+    """The head by hand: mean numbers over the largest, 2."""
+    x = np.asarray(sums, np.float64) / (2 * shots)
+    for layer in LAYERS:
+        x = x @ layer.weights.astype(np.float64) + layer.bias.astype(np.float64)
+        x = np.maximum(x, 0) if layer.relu else x
+    return x
+
+
+def words(shots: int) -> np.ndarray:
+    return np.array(list(product(range(2 * shots + 1), repeat=3)))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_number_is_decided_as_by_hand(backend: str, counted: Bundle) -> None:
+    decider = make_decider(counted, backend=backend)
+    assert (decider.name, decider.n_features, decider.n_classes) == (backend, 3, 4)
+    sums, wanted = words(1), scores_of(words(1), 1)
+    np.testing.assert_allclose(decider.scores_batch(sums, 1), wanted, atol=1e-5)
+    assert decider.decide_batch(sums, 1).tolist() == wanted.argmax(axis=1).tolist()
+    for row, scores in zip(sums, wanted):
+        label, probability = decider.decide(row, 1)
+        assert label == scores.argmax()
+        assert probability == pytest.approx(1 / np.exp(scores - scores.max()).sum(), abs=1e-5)
+    if backend in ("table", "onnx"):
+        for wrong in (sums + 1, sums - 1):
+            with pytest.raises(ValueError, match="allowed: 0 to 2"):
+                decider.decide_batch(wrong, 1)
+
+
+@pytest.mark.parametrize("backend", ["onnx", "sparse", "float64", "count-table", "auto"])
+def test_sums_of_several_shots_are_means(backend: str, counted: Bundle) -> None:
+    decider = make_decider(counted, shots=3, backend=backend)
+    np.testing.assert_allclose(decider.scores_batch(words(3), 3), scores_of(words(3), 3), atol=1e-5)
+
+
+def test_int8_decides_nearly_as_the_head(counted: Bundle) -> None:
+    found = make_decider(counted, backend="int8").scores_batch(words(1), 1)
+    assert np.abs(found - scores_of(words(1), 1)).max() < 0.1
+
+
+def test_one_shot_is_looked_up_and_its_choice_told(counted: Bundle) -> None:
+    decider = make_decider(counted)
+    assert (decider.name, choice_of(decider)["why"]) == ("table", "one look-up per decision")
+    for wrong in ([0, 0, 3], [-1, 0, 0]):
+        with pytest.raises(UsageError, match="numbers of 0 to 2"):
+            decider.decide(np.array(wrong), 1)
+    with pytest.raises(UsageError, match="answers single shots, not 2"):
+        make_decider(counted, shots=2, backend="table")
+    table = made_bundle(2, 2, outcomes=3, table=np.arange(18.0).reshape(9, 2))
+    with pytest.raises(UsageError, match="a table of single shots, which cannot answer 2 shots"):
+        make_decider(table, shots=2)
+
+
+def test_a_guest_is_told_numbers_over_shots_times_the_largest(counted: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[list[int], int]] = []
+
+    class Guest:
+        def __init__(self, point: Any, bundle: Bundle, shots: int) -> None:
+            self.name, self.n_features, self.n_classes = "guest", 3, 4
+
+        def decide(self, counts: np.ndarray, shots: int) -> SimpleNamespace:
+            asked.append((counts.tolist(), shots))
+            return SimpleNamespace(label=1, probability=1.0)
+
+    monkeypatch.setattr(backends, "OfferedDecider", Guest)
+    monkeypatch.setattr(backends, "offered_backends", lambda: {"guest": None})
+    make_decider(counted, shots=5, backend="guest").decide(np.array([10, 0, 3]), 5)
+    assert asked == [([10, 0, 3], 10)]
+
+
+def test_numbers_in_the_library_and_what_takes_clicks_alone(counted: Bundle) -> None:
+    found = decide(counted, [[2, 1, 0], [0, 0, 2]])
+    assert found.labels.tolist() == scores_of([[2, 1, 0], [0, 0, 2]], 1).argmax(axis=1).tolist()
+    with pytest.raises(UsageError, match="takes photon numbers"):
+        decide(counted, [0b11])
+    with pytest.raises(UsageError, match="0 to 2"):
+        decide(counted, [[3, 0, 0]])
+    with pytest.raises(UsageError, match="takes photon numbers"):
+        make_adapter(counted, 1)
+
+
+def test_verify_compares_table_and_head_on_all_numbers(counted: Bundle) -> None:
+    told = SimpleNamespace(violations=[], alerts=[])
+    _verify_bundle(counted, told)
+    assert not told.violations
+    assert counted.table is not None
+    wrong = counted.table.copy()
+    wrong[17] += 1.0  # a word that is no golden one, perhaps: the comparison goes through all
+    other = object.__new__(Bundle)
+    for name in Bundle.__slots__:
+        object.__setattr__(other, name, wrong if name == "table" else getattr(counted, name))
+    told = SimpleNamespace(violations=[], alerts=[])
+    _verify_bundle(other, told)
+    assert told.violations
