@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
+from pans.runtime.instrument.count_law import CountLaw
 from pans.runtime.instrument.dead_time import INTERVALS, STEP, DeadTime, counted_table
 
 _MU_MAX = 100.0  # beyond it no detector of a profile stays dark, and high powers of mu leave float64
@@ -43,12 +44,14 @@ class ThermalLaw:
 Law = ClickLaw | Callable[[Tensor], Tensor]  # a user's own: photoelectrons (float64) -> p, differentiable
 
 
-def click_probability(photoelectrons: Tensor, law: Law, slope: float = 1.0) -> Tensor:
+def click_probability(photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
     """Return p (same shape, dtype of the input) for `photoelectrons` per exposure; `slope` scales the light only.
 
     For a `ClickLaw` the same as `pans.runtime.instrument.click_law.click_probability`, in float64 inside and differentiable; any other law
-    is called with the photoelectrons in float64.
+    is called with the photoelectrons in float64. ValueError for a law of photon numbers, which have chances (readings.py).
     """
+    if isinstance(law, CountLaw):
+        raise ValueError(f"a law of {law.outcomes} photon numbers, allowed: of a click or none")
     if not isinstance(law, ClickLaw):
         return law(photoelectrons.double() * slope).to(photoelectrons.dtype)
     mu, _ = counted_mean((photoelectrons.double() * slope + law.dark_per_exposure).clamp(max=_MU_MAX), law.dead_time)

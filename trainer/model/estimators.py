@@ -47,9 +47,6 @@ class Head(Protocol):
     def flipped(self, clicks: Tensor, mean: Tensor) -> Tensor:
         """Scores (n, d_f, out): column i is that of the same clicks with click i inverted."""
 
-    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
-        """Scores (n, d_f, out): column i is that of the same clicks with `by` (n, d_f) added to click i alone."""
-
 
 Estimator = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator], Tensor]
 

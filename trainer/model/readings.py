@@ -21,7 +21,16 @@ from .detection import Law, click_probability, click_words, sample_clicks, word_
 from .estimators import ESTIMATORS, Head, LossOf, gradient_only, word_loss
 
 _MU_MAX = 100.0  # beyond it every reading is the largest one
-Estimate = Callable[[Tensor, Tensor, Head, LossOf, torch.Generator], Tensor]
+
+
+class NumberHead(Head, Protocol):
+    """A head that knows what one other number would change."""
+
+    def changed(self, clicks: Tensor, mean: Tensor, by: Tensor) -> Tensor:
+        """Scores (n, d_f, out): column i is that of the same clicks with `by` (n, d_f) added to click i alone."""
+
+
+Estimate = Callable[[Tensor, Tensor, NumberHead, LossOf, torch.Generator], Tensor]
 
 
 class Readings(Protocol):
@@ -55,7 +64,6 @@ class Clicks:
 
     def chances(self, photoelectrons: Tensor, law: Law | CountLaw, slope: float = 1.0) -> Tensor:
         """See `Readings`."""
-        assert not isinstance(law, CountLaw)
         return click_probability(photoelectrons, law, slope)
 
     def mean(self, chances: Tensor) -> Tensor:
@@ -151,14 +159,14 @@ def outcome_chances(mu: Tensor, law: CountLaw) -> Tensor:
 
 
 def _straight_through(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator
+    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, random: torch.Generator
 ) -> Tensor:
     """The gradient of a sampled number is given to the mean."""
     return loss_of(head(numbers.sample(chances, random), None), target).mean()
 
 
 def _exact(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: Head, loss_of: LossOf, _random: torch.Generator
+    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, _random: torch.Generator
 ) -> Tensor:
     """All words, each once."""
     scores = head(numbers.words(chances.shape[1]), numbers.mean(chances).mean(dim=0))
@@ -166,7 +174,7 @@ def _exact(
 
 
 def _local_expectation(
-    numbers: Numbers, chances: Tensor, target: Tensor, head: Head, loss_of: LossOf, random: torch.Generator
+    numbers: Numbers, chances: Tensor, target: Tensor, head: NumberHead, loss_of: LossOf, random: torch.Generator
 ) -> Tensor:
     """Every exposure with each of its numbers, the others as sampled: unbiased."""
     drawn, mean = numbers.sample(chances, random).detach(), numbers.mean(chances).mean(dim=0)

@@ -25,7 +25,6 @@ from torch import Tensor
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import make_folder, write_file
 from pans.trainer.figures import new_figure, save_figure
-from pans.trainer.model.detection import click_probability, sample_clicks
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.options import Options
 from pans.trainer.tasks.registry import Task
@@ -231,5 +230,5 @@ def _right(run: Run, shown: Tensor, labels: Tensor, random: torch.Generator) -> 
     law = run.law()
     run.head.eval()
     with torch.no_grad():
-        p = torch.cat([click_probability(run.encoder(part, run.data.floor), law) for part in shown.split(CHUNK)])
-        return (run.head(sample_clicks(p, random).float()).argmax(dim=1) == labels).double()
+        p = torch.cat([run.readings.chances(run.encoder(part, run.data.floor), law) for part in shown.split(CHUNK)])
+        return (run.head(run.readings.sample(p, random).float()).argmax(dim=1) == labels).double()
