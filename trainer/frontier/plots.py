@@ -21,7 +21,7 @@ from .ways import AUTOMATON, DIRECT, EARLY, HADAMARD, HELD_TO_CLICKS, MASKS, ON,
 
 STYLES: dict[str, dict[str, Any]] = {
     AUTOMATON: {"color": "C3", "marker": "o", "lw": 2.2, "zorder": 5},
-    ON: {"color": "C3", "marker": "*", "ms": 11, "ls": "", "zorder": 6},
+    ON: {"color": "C3", "marker": "*", "ms": 10, "mfc": "w", "ls": "", "zorder": 6},
     SMALL: {"color": "C3", "marker": "o", "mfc": "w", "lw": 1.2, "ls": "--", "zorder": 4},
     HELD_TO_CLICKS: {"color": "C3", "marker": "^", "lw": 1.0, "ls": ":", "zorder": 4},
     EARLY: {"color": "C6", "marker": "o", "mfc": "w", "lw": 1.0, "ls": ":", "zorder": 4},
