@@ -90,6 +90,11 @@ class BulkSteps:
         return bool(self.tables.labels.size)
 
     @property
+    def block_rows(self) -> int:
+        """Most decisions of one block."""
+        return min(self.windows.n_windows, CLICKS_MAX)
+
+    @property
     def stamps(self) -> npt.NDArray[np.uint16]:
         """The patterns shown of the latest CLICKS block that a kernel looked at, and whatever stood behind them before."""
         return self._windows.stamps

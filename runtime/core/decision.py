@@ -5,12 +5,13 @@ Owns the vocabulary that cores, recordings, reports and the live run share, and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, overload
 
 import numpy as np
+import numpy.typing as npt
 
 from pans.runtime.decide.verdict import NO_LABEL as NO_LABEL
 
@@ -65,6 +66,29 @@ class Decision(NamedTuple):
     probability: float
     counts_crc: int
     exposures: int = 0
+
+
+class RowDecisions(Sequence[Decision]):
+    """Decisions that stand in rows, DECISION_DTYPE (n,), valid until the next call, of which each is made when somebody asks for it."""
+
+    def __init__(self, rows: npt.NDArray[np.void]) -> None:
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Decision]:
+        return iter([Decision(*row) for row in self.rows.tolist()])
+
+    @overload
+    def __getitem__(self, at: int) -> Decision: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> list[Decision]: ...
+
+    def __getitem__(self, at: int | slice) -> Decision | list[Decision]:
+        found = self.rows[at].tolist()
+        return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
 class Action(NamedTuple):
@@ -140,3 +164,16 @@ def joined(first: Output, then: Output, block_end_tick: int | None = None) -> Ou
         first.passages + then.passages,
         first.actions + then.actions,
     )
+
+
+class Rows:
+    """What one call gathers of objects in flow."""
+
+    def __init__(self) -> None:
+        self.decisions: list[Decision] = []
+        self.passages: list[Passage] = []
+        self.actions: list[Action] = []
+
+    def output(self) -> Output:
+        """Return it as a core's output."""
+        return Output(self.decisions, [], None, tuple(self.passages), tuple(self.actions))

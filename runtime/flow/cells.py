@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pans.runtime.core.decision import DecisionFlag, Output, Passage
+from pans.runtime.core.decision import DecisionFlag, Output, Passage, Rows
 from pans.runtime.core.plan import Plan
 
 from . import kernels
-from .core import NO_FLAGS, FlowCore, Rows
+from .core import NO_FLAGS, FlowCore
 
 
 class CellCore(FlowCore):

@@ -11,13 +11,14 @@ A cell's row of the decision log says: `object` the number of the passage, `expo
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.dark_guard import DarkGuard
-from pans.runtime.core.decision import NO_LABEL, Action, Decision, DecisionFlag, Output, Passage, joined
+from pans.runtime.core.decision import NO_LABEL, Action, Decision, DecisionFlag, Output, Passage, Rows, joined
 from pans.runtime.core.follower import Follower
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES
@@ -29,21 +30,19 @@ from pans.runtime.wire import walk as stream
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock, Mark, Status
 
-from . import kernels
+from . import columns, kernels
 from . import walk as walking
+from .arrays import FlowArrays, NewMarks
 from .matching import PassageMatcher
-from .settings import FlowLimits, FlowSettings
+from .settings import WATCHED_FRAMES, FlowLimits, FlowSettings
 
 MAX_CHANNELS = 64  # bits of a ring word
 MAX_PASSAGES = 64  # of one call of the kernel; it is called again
 MAX_MARKS_AT_ONCE = 64
 NO_FLAGS = DecisionFlag(0)
-# the same as plain integers: an enumeration's operators cost a microsecond each
 _GAP, _ABSTAINED, _NOT_FINITE, _AMBIGUOUS = (
     int(flag) for flag in (DecisionFlag.GAP, DecisionFlag.ABSTAINED, DecisionFlag.NOT_FINITE, DecisionFlag.AMBIGUOUS)
-)
-WATCHED_FRAMES = 256  # empty frames that the guard is told of at once
-Q = 32  # bits after the point of a bar's alignment, in exposures
+)  # plain integers: an enumeration's operators cost a microsecond each
 
 I64 = npt.NDArray[np.int64]
 
@@ -71,17 +70,15 @@ class FlowCore(Follower):
         self.settings, self.limits, self.shots = settings, limits, shots
         self.frames = shots * settings.pool  # of a decision
         self.guard: DarkGuard | None = None  # of the dark counts; None: they are only added up
-        self._watched: tuple[int, I64] = (
-            0,
-            np.zeros(decider.n_features, np.int64),
-        )  # empty frames that it has been told of
+        self.watched_frames = 0  # empty ones that it has been told of
+        self._watched_channels: I64 = np.zeros(decider.n_features, np.int64)
         self.matcher = PassageMatcher(decider.n_classes, gated, self._lag(), touching=settings.kind == "tape")
         self.n_passages = 0
         self.dark_probability = 0.0  # of a click, that the limits were worked out with
         self.dark_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in dark frames
         self.empty_channels: I64 = np.zeros(decider.n_features, np.int64)  # clicks in frames without an object
-        self._decider = decider
-        self._gated = gated
+        self.decider = decider
+        self.gated = gated  # classes for which a pulse is asked
         self._cycles_before = 0  # in streams that have ended
         self._state: I64 = np.zeros(kernels.N_STATE, np.int64)
         self._words = np.zeros(limits.ring, np.uint64)
@@ -91,15 +88,15 @@ class FlowCore(Follower):
         self._dark_cycle = plan.slots_per_cycle if plan.slot_pattern[-1] == DARK_PATTERN else 0
         self._period_ticks = plan.slot_period_ticks
         self._max_block = plan.block_exposures
-        self._facts: I64 = np.zeros(walking.N_FACTS, np.int64)
+        self._facts = self.new_facts()
         self._slot_offsets = plan.slot_offset_ticks.astype(np.int64)
-        self._new = walking.NewMarks(
+        self._new = NewMarks(
             np.zeros((MAX_MARKS_AT_ONCE, walking.N_MARK), np.int64), np.zeros(MAX_MARKS_AT_ONCE, np.float32)
         )
         self._limits: I64 = np.zeros(0, np.int64)  # of what looks for passages; none where their times are known
         self._passages: I64 = np.zeros((MAX_PASSAGES, kernels.N_COLUMNS), np.int64)
         self._prepare(plan)
-        self._arrays = walking.FlowArrays(
+        self.arrays = FlowArrays(
             self._words,
             self._counts,
             self._limits,
@@ -139,6 +136,34 @@ class FlowCore(Follower):
         """Return how many of `n_cycles` cycles stand out: those that have not begun."""
         return n_cycles - self._cycles_before - -(-self.tracker.next_exposure // self._slots_per_cycle)
 
+    def new_facts(self) -> I64:
+        """Return the facts of a stream that has not begun, int64 (columns.N_FACTS,)."""
+        return walking.facts_of(self._plan, self.n_classes, self._dark_cycle)
+
+    @property
+    def watches_empty(self) -> bool:
+        """Whether the guard is told of the empty field: there are no dark frames."""
+        return self.guard is not None and not self._dark_cycle
+
+    # -- the compiled turn ---------------------------------------------------------------------------------------------
+
+    @property
+    def excluded(self) -> str:
+        """Why no compiled turn can be taken, for people; "" where it can."""
+        if self.guard is not None and self.guard.policy != "warn":
+            return "--on-dark changes decisions while they are made"
+        if self.settings.pool > 1:
+            return "the evidence of windows side by side is added in Python"
+        return (
+            "" if getattr(self.decider, "radix", None) is not None else "the back end is no table: it decides in Python"
+        )
+
+    def lend(self, state: I64) -> None:
+        """Put what this kind of flow knows besides into `state`, int64 (columns.N_FACTS,)."""
+
+    def take_back(self, state: Sequence[int]) -> None:
+        """Go on from `state`."""
+
     def warm_up(self) -> None:
         """Run every compiled kernel of the hot path once, before arming, on state of its own."""
         block = np.frombuffer(bytes(8 * 2), np.uint8).reshape(2, 8)
@@ -147,7 +172,7 @@ class FlowCore(Follower):
         kernels.put_frames(block, 0, words, counts, self._dark_cycle, state, spare, self._channel_mask)
         kernels.skip_frames(2, 3, words, counts, state)
         kernels.window_clicks(words, counts, 0, 1, spare)
-        self._decider.decide(np.zeros(len(spare), np.int64), self.shots)
+        self.decider.decide(np.zeros(len(spare), np.int64), self.shots)
         self._walk(Messages(np.zeros(8, np.uint8), np.zeros((0, 2), np.int64)), 0)
         if self.guard is not None:
             self.guard.warm_up(empty=True)
@@ -175,8 +200,8 @@ class FlowCore(Follower):
     def _came(self, stop: int, end_tick: int, found: int) -> Output:
         """Decide on what exposures up to `stop` - 1, now in the ring, settle; `found` passages stand in `_passages` already."""
         output = self._settle(stop, end_tick, found)
-        if self.guard is not None and not self._dark_cycle:
-            news = self._watch_empty(self.guard)
+        if self.guard is not None and self.watches_empty:
+            news = self.watch_empty(self.guard, self.empty_frames, self.empty_channels)
             output = joined(output, Output([], news, None)) if news else output
         self.matcher.settle(stop)
         return output
@@ -188,7 +213,7 @@ class FlowCore(Follower):
         if not taken:
             return super().step_messages(messages, place)
         facts = self._facts.tolist()
-        n_marks, n_messages = facts[walking.MARKS], facts[stream.MESSAGES]
+        n_marks, n_messages = facts[columns.MARKS], facts[stream.MESSAGES]
         position = facts[stream.NEXT_SEQ], facts[stream.NEXT_EXPOSURE]
         self.tracker.advance(position, n_messages, facts[stream.EXPOSURES])
         if n_marks:
@@ -196,33 +221,30 @@ class FlowCore(Follower):
                 self.remember(Mark._make([*mark[: walking.M_HALF], photons, mark[walking.M_HALF]]))
         if n_messages == n_marks:
             return taken, Output([], [], None)
-        self.last_tick, self.jitter_ticks = facts[walking.END_TICK], facts[walking.JITTER_TICKS]
-        came = self._came(position[1], self.last_tick, facts[walking.PASSAGES])
+        self.last_tick, self.jitter_ticks = facts[columns.END_TICK], facts[columns.JITTER_TICKS]
+        came = self._came(position[1], self.last_tick, facts[columns.PASSAGES])
         return taken, Output(came.decisions, came.events, self.last_tick, came.passages, came.actions)
 
     def _walk(self, messages: Messages, place: int) -> int:
         """Bring the kernel's facts up to date and let it take messages; return how many it took."""
         facts = self._facts
-        watch_at = 1 << 62 if self.guard is None else self._watched[0] + WATCHED_FRAMES
+        watch_at = 1 << 62 if self.guard is None else self.watched_frames + WATCHED_FRAMES
         facts[: stream.MESSAGES] = (*self.tracker.position, min(self.end_exposure, 1 << 62))
-        facts[walking.START_TICK : walking.MARKS] = (
-            self.start_tick, self._exposure_ticks, self._period_ticks, self._max_block, self._plan.cycle_ticks, self._dark_cycle,
-            watch_at, self._decider.n_classes,
-        )  # fmt: skip
-        facts[walking.JITTER_TICKS] = self.jitter_ticks
+        facts[columns.START_TICK], facts[columns.WATCH_AT] = self.start_tick, watch_at
+        facts[columns.JITTER_TICKS] = self.jitter_ticks
         buffer, spans = messages
         taken = walking.walk(
-            buffer, spans, place, facts, self._slot_offsets, self._arrays, self._channel_mask, self._new
+            buffer, spans, place, facts, self._slot_offsets, self.arrays, self._channel_mask, self._new
         )
         return int(taken)
 
-    def _watch_empty(self, guard: DarkGuard) -> list[Finding]:
-        """Without dark slots, the frames in which no object was found tell the dark rates."""
-        frames = self.empty_frames - self._watched[0]
+    def watch_empty(self, guard: DarkGuard, empty_frames: int, empty_channels: I64) -> list[Finding]:
+        """Without dark slots, the frames in which no object was found, so many with these clicks, tell the dark rates."""
+        frames = empty_frames - self.watched_frames
         if frames < WATCHED_FRAMES:
             return guard.news()
-        clicks = self.empty_channels - self._watched[1]
-        self._watched = (self.empty_frames, self.empty_channels.copy())
+        clicks = empty_channels - self._watched_channels
+        self.watched_frames, self._watched_channels = empty_frames, empty_channels.copy()
         return guard.take_empty(frames, np.minimum(clicks, frames))
 
     def _skip_to(self, exposure_index: int, tick: int) -> Output:
@@ -334,9 +356,13 @@ class FlowCore(Follower):
         )  # fmt: skip
         self.n_decisions += 1
         self.n_passages = (self.n_passages + 1) & 0xFFFFFFFF
+        self.put_row(decision, passage, out)
+
+    def put_row(self, decision: Decision, passage: Passage, out: Rows) -> None:
+        """Say a decision, ask for its pulse, and compare it with the truth."""
         out.decisions.append(decision)
         out.passages.append(passage)
-        gated = label in self._gated
+        gated = decision.label in self.gated
         if gated:
             pulse_tick = passage.leave_tick + self.limits.gate_delay_ticks
             action = Action(decision.number, pulse_tick, self.limits.gate_ticks, self.settings.gate_channel)
@@ -352,7 +378,7 @@ class FlowCore(Follower):
         return unlit
 
     def _verdict(self) -> Verdict:
-        decider = self._decider
+        decider = self.decider
         if self.guard is not None:
             decider = self.guard.decider(decider)
             for counts in self._clicks:
@@ -361,16 +387,3 @@ class FlowCore(Follower):
             return decider.decide(self._clicks[0], self.shots)
         scores = decider.scores_batch(self._clicks, self.shots)
         return softmax_winner(log_evidence(scores).sum(axis=0))
-
-
-class Rows:
-    """What one call gathers."""
-
-    def __init__(self) -> None:
-        self.decisions: list[Decision] = []
-        self.passages: list[Passage] = []
-        self.actions: list[Action] = []
-
-    def output(self) -> Output:
-        """Return it as a core's output."""
-        return Output(self.decisions, [], None, tuple(self.passages), tuple(self.actions))

@@ -265,7 +265,8 @@ class PassageMatcher:
             accuracy_labelled=share(right, int(self.confusion.sum())),
             missed=share(counts["missed"], counts["alone"]),
             doubled=share(counts["doubled"], counts["alone"]),
-            yield_=share(counts["pulses_on_target"], counts["targets"]),
+            # of an object that was decided twice both pulses count: never more than all
+            yield_=share(min(counts["pulses_on_target"], counts["targets"]), counts["targets"]),
             purity=share(counts["pulses_pure"], counts["pulses"]),
             aborted=dict(sorted(self.aborted.items())),
             passages={name: counts[name] for name in COUNTED},

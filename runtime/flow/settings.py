@@ -22,6 +22,8 @@ KINDS = ("cells", "tape")
 MAX_FILE_BYTES = 1 << 16
 MAX_RING = 1 << 18  # frames that are remembered
 BACKGROUND_BITS = 16  # after the point, of the clicks that the background gives per frame
+WATCHED_FRAMES = 256  # empty frames that the guard of the dark counts is told of at once
+Q = 32  # bits after the point of a bar's alignment, in exposures
 QUIET_QUANTILE = 0.05  # the empty field may exceed the release level that often
 
 

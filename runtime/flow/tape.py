@@ -10,18 +10,22 @@ is the edge. Each edge moves the next window by 2^-track of what it is off and t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from pans.runtime.core.decision import DecisionFlag, Output, Passage
+from pans.runtime.core.decision import DecisionFlag, Output, Passage, Rows
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import UsageError
 
-from . import kernels
-from .core import NO_FLAGS, FlowCore, Rows
+from . import columns, kernels
+from .core import NO_FLAGS, FlowCore
+from .settings import Q
 
-Q = 32  # bits after the point of a bar's alignment, in exposures
+_PART = (1 << Q) - 1
+_LARGEST = 1 << 61  # of a bar's ticks, in 2^-Q
 
 
 class TapeCore(FlowCore):
@@ -54,6 +58,28 @@ class TapeCore(FlowCore):
         self._middle = self._origin + self._position * self._pitch
         self._before = -1  # first exposure of the window before, whose bars are known; -1: there is none
         self._before_middle = 0
+
+    def lend(self, state: npt.NDArray[np.int64]) -> None:
+        """See FlowCore."""
+        state[columns.MIDDLE], state[columns.MIDDLE_PART] = self._middle >> Q, self._middle & _PART
+        state[columns.PITCH], state[columns.NOMINAL_PITCH] = self._pitch, self._nominal_pitch
+        state[columns.TRACK], state[columns.POSITION] = self.settings.track, self._position
+        state[columns.BEFORE], state[columns.BEFORE_MIDDLE] = self._before, self._before_middle >> Q
+        state[columns.BEFORE_PART] = self._before_middle & _PART
+
+    def take_back(self, state: Sequence[int]) -> None:
+        """See FlowCore."""
+        self._middle = (state[columns.MIDDLE] << Q) + state[columns.MIDDLE_PART]
+        self._pitch, self._position = state[columns.PITCH], state[columns.POSITION]
+        self._before = state[columns.BEFORE]
+        self._before_middle = (state[columns.BEFORE_MIDDLE] << Q) + state[columns.BEFORE_PART]
+
+    @property
+    def excluded(self) -> str:
+        """See FlowCore."""
+        if self._nominal_pitch * self._period_ticks >= _LARGEST:
+            return "a bar takes longer than compiled code can count"
+        return super().excluded
 
     @property
     def bars_per_s(self) -> float:

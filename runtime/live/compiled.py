@@ -7,15 +7,15 @@ it would have them, so that either goes on where the other stopped. What is not 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.bulk_steps import BulkSteps
-from pans.runtime.core.decision import Decision, Output
+from pans.runtime.core.decision import Decision, Output, RowDecisions
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream_arrays import MarkArrays
 from pans.runtime.errors import LinkError
@@ -26,7 +26,7 @@ from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import settling as kernels
-from pans.runtime.turn.engine import Limits, Turn
+from pans.runtime.turn.engine import Limits, Steps, Turn
 from pans.runtime.turn.kernels import QUIET_NS, unpack_blocks
 from pans.runtime.turn.watching import FrameWatch
 from pans.runtime.wire.frame import Messages
@@ -35,6 +35,8 @@ from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
 if TYPE_CHECKING:
+    from pans.runtime.flow.core import FlowCore
+
     from .run import LiveRun
 
 I64 = npt.NDArray[np.int64]
@@ -53,18 +55,19 @@ class CompiledTurns:
     With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts.
     """
 
-    def __init__(self, run: LiveRun, core: Core, *, prompt: bool) -> None:
-        self._run, self._core, self._prompt = run, core, prompt
+    def __init__(self, run: LiveRun, core: Core | FlowCore, *, prompt: bool) -> None:
+        self._run, self._prompt = run, prompt
+        self._core: Core | FlowCore = core
         self._turn: Turn | None = None
         self._attached: Connection | None = None
-        self._steps: BulkSteps | None = None
         self._fd: int | None = None
-        exposures = (
-            ring.KEPT_BYTES // 2 if core.guard is not None and not core.windows.parallel else 0
-        )  # two bytes each
-        self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
-        watched = core.guard is not None and core.windows.parallel
-        self._frames = FrameWatch(core) if watched else None
+        self._stamps, self._bits = np.ones(0, np.uint16), np.ones(0, np.uint8)
+        self._frames: FrameWatch | None = None
+        if isinstance(core, Core) and core.guard is not None and core.windows.parallel:
+            self._frames = FrameWatch(core)
+        elif isinstance(core, Core) and core.guard is not None:
+            exposures = ring.KEPT_BYTES // 2  # two bytes each
+            self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
         self._judged = Judged(run)
         self._error: LinkError | None = None  # met while something is left to take
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
@@ -105,19 +108,24 @@ class CompiledTurns:
             return
         self._attached = run.connection
         nonce = run.connection.session.nonce
-        steps, bulk = self._core.bulk_steps(nonce), run.connection.decoder.bulk
-        assert steps is not None
+        steps, bulk = self._steps(nonce), run.connection.decoder.bulk
         assert bulk is not None
         drive = None if run.driver is None else run.driver.arrays(nonce)
-        self._steps, self._turn = steps, Turn(steps, bulk, drive)
+        self._turn = Turn(steps, bulk, drive)
         self._turn.warm_up()
-        unpack_blocks(self._turn.kept, self._turn.messages, self._stamps, self._bits)
-        run.tally.warm_up(steps.walk.marks, self._core.windows.n_windows)
-        self._judged.take(self._turn.blocks[:0], self._turn.rows[:0])
-        if self._frames is not None:
-            self._frames.warm_up()
+        self._warm_up(self._turn)
         link = run.connection.link
         self._fd = None if link.virtual else descriptor_of(link)
+
+    def _warm_up(self, turn: Turn) -> None:
+        """Compile or load what takes over what a call brought."""
+        steps = turn.steps
+        assert isinstance(steps, BulkSteps)
+        unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
+        self._run.tally.warm_up(steps.walk.marks, steps.windows.n_windows)
+        self._judged.take(turn.blocks[:0], turn.rows[:0])
+        if self._frames is not None:
+            self._frames.warm_up()
 
     def turn(self, poll_s: float) -> list[Output]:
         """Wait for bytes, decide on them and answer until something is due; return what came of it."""
@@ -174,7 +182,14 @@ class CompiledTurns:
         control[ring.BLOCK_NS : ring.OLDEST_NS + 1] = (run.lateness.block_ns, next_id, oldest_id, oldest_ns)
         if driver is not None:
             control[ring.SENT_EXPOSURE : ring.SENT_STATE + 1] = driver.sent
-        self._core.bulk_steps(run.connection.session.nonce)
+        self._steps(run.connection.session.nonce)
+
+    def _steps(self, nonce: int) -> Steps:
+        """Return the compiled steps of the core, ready for messages of session `nonce`."""
+        assert isinstance(self._core, Core)
+        steps = self._core.bulk_steps(nonce)
+        assert steps is not None
+        return steps
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
@@ -183,7 +198,8 @@ class CompiledTurns:
         run = self._run
         connection, link = run.connection, run.connection.link
         chunks = connection.chunks(poll_s)
-        if not (link.virtual and self._core.windows.parallel and chunks) or self._prompt:
+        gathers = isinstance(self._core, Core) and self._core.windows.parallel
+        if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
         left = run.messages_granted - chunks[0].data.count(0)
         n_bytes = 0
@@ -269,12 +285,10 @@ class CompiledTurns:
         connection.delivered += counts.messages
         connection.answers += counts.answers
         run.taken_here += counts.messages
-        if counts.shows or counts.answers:
+        if turn.reported[ring.DRIVES] and (counts.shows or counts.answers):
             self._settle_commands(turn)
         if counts.messages > counts.steps:
-            for mark in turn.marks():
-                self._core.remember(mark)
-                turn.steps.told(mark)
+            self._settle_marks(turn)
         recorder = run.recorder
         if recorder is not None:
             recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
@@ -286,6 +300,13 @@ class CompiledTurns:
             self._settle_blocks(turn, outputs)
         if self.settled is not None:
             self.settled(turn, outputs[-1] if counts.steps else NOTHING)
+
+    def _settle_marks(self, turn: Turn) -> None:
+        """Let the core know of the marks of a call."""
+        assert isinstance(turn.steps, BulkSteps)
+        for mark in turn.marks():
+            self._core.remember(mark)
+            turn.steps.told(mark)
 
     def _settle_commands(self, turn: Turn) -> None:
         """Bring the session and the driver to where the kernel has them."""
@@ -305,14 +326,15 @@ class CompiledTurns:
 
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
         """Account for the blocks of a call and their decisions."""
-        run, blocks, rows = self._run, turn.blocks, turn.rows
+        run, blocks, rows, steps = self._run, turn.blocks, turn.rows, turn.steps
+        assert isinstance(steps, BulkSteps)
         if run.connection.link.virtual:
             blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
         events = self._watch(turn, rows)
         for event in events:
             run.journal.take(event)
         runs, marked = self._judged.take(blocks, rows)
-        decisions = account_rows(run, turn.steps.walk.marks, runs, rows)
+        decisions = account_rows(run, steps.walk.marks, runs, rows)
         for step, end_ns, uncertainty_ns, look in marked.tolist():
             arrival_ns, decoded_ns, decided_ns, recorded_ns, end_tick, stop = blocks[step, : ring.ROWS + 1].tolist()
             if look & kernels.IS_LATE:
@@ -326,8 +348,8 @@ class CompiledTurns:
 
     def _watch(self, turn: Turn, rows: Rows) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
-        guard, core = self._core.guard, self._core
-        if guard is None:
+        core = self._core
+        if not isinstance(core, Core) or core.guard is None:
             return []
         if not core.windows.parallel:
             n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
@@ -336,29 +358,6 @@ class CompiledTurns:
 
 
 # -- decisions in rows ------------------------------------------------------------------------------------------------------
-
-
-class RowDecisions(Sequence[Decision]):
-    """Decisions that stand in rows, DECISION_DTYPE (n,), valid until the next call, of which each is made when somebody asks for it."""
-
-    def __init__(self, rows: Rows) -> None:
-        self.rows = rows
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __iter__(self) -> Iterator[Decision]:
-        return iter([Decision(*row) for row in self.rows.tolist()])
-
-    @overload
-    def __getitem__(self, at: int) -> Decision: ...
-
-    @overload
-    def __getitem__(self, at: slice) -> list[Decision]: ...
-
-    def __getitem__(self, at: int | slice) -> Decision | list[Decision]:
-        found = self.rows[at].tolist()
-        return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
 
 
 class Judged:

@@ -1,17 +1,32 @@
-"""A run with passing objects: core and gates joined, and what came of both.
+"""A run with passing objects: core and gates joined, what compiled turns brought of it, and what came of it all.
 
-Owns the actuator while the run lasts and the flow's part of the summary; the order of a run is loop.py's.
+Owns the actuator while the run lasts, what is settled of a flow behind a compiled turn (compiled.py, lasting.py own the rest of these), and
+the flow's part of the summary; the order of a run is loop.py's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.decision import Output
+from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.matching import PassageFigures
+from pans.runtime.flow.steps import FlowSteps
+from pans.runtime.link.reader import Chunk
+from pans.runtime.turn import rings as ring
+from pans.runtime.turn.engine import Turn
+from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
+from pans.runtime.wire.schema import HEADER
 
+from .compiled import CompiledTurns
 from .gates import Actuator
+from .lasting import LastingTurns
 from .second_device import SecondInstrument
 
 if TYPE_CHECKING:
@@ -77,3 +92,103 @@ class FlowRun:
         }
         gates = {} if self._run is None else self._run.gates.summary()
         return FlowFigures(flow, core.matcher.figures(core.frames), gates, second)
+
+
+# -- behind compiled turns -------------------------------------------------------------------------------------------------
+
+
+class _FlowSettling(CompiledTurns):
+    """What is settled of a flow: block by block where something came, in the order in which Python's turn would have seen it.
+
+    A pulse is sent here, once its decision is on record.
+    """
+
+    _lent: FlowSteps | None = None
+
+    def _steps(self, nonce: int) -> FlowSteps:
+        if self._lent is None:
+            assert isinstance(self._core, FlowCore)
+            self._lent = FlowSteps(self._core, self._run.plan)
+        self._lent.begin(nonce)
+        return self._lent
+
+    def _warm_up(self, turn: Turn) -> None:
+        _blocks_behind(turn)
+
+    def _gathered(self, poll_s: float) -> list[Chunk]:
+        return self._run.connection.chunks(poll_s)
+
+    def _settle_marks(self, turn: Turn) -> None:
+        if not turn.counts.steps:
+            for mark in turn.marks():
+                self._core.remember(mark)
+
+    def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
+        run, blocks = self._run, turn.blocks
+        if run.connection.link.virtual:
+            blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
+        for block, output in settled_blocks(turn):
+            arrival_ns, decoded_ns, decided_ns = blocks[block, : ring.DECIDED + 1].tolist()
+            run.book(output, (arrival_ns, decoded_ns, decided_ns), outputs)
+        try:
+            run.take([])
+        except LinkError as error:  # met while pulses were sent
+            self._error = self._error or error
+
+
+class FlowTurns(_FlowSettling):
+    """The compiled turns of a flow, one call after the other; where pulses are asked for, a call ends with the first bytes."""
+
+    def __init__(self, run: LiveRun, core: FlowCore, *, prompt: bool) -> None:
+        super().__init__(run, core, prompt=prompt or bool(core.gated))
+
+
+class LastingFlowTurns(_FlowSettling, LastingTurns):
+    """The compiled turns of a flow in a thread of their own; what asks for a pulse wakes the run's thread at once."""
+
+    def __init__(self, run: LiveRun, core: FlowCore) -> None:
+        super().__init__(run, core)
+        self._prompt = self._wakes = bool(core.gated)
+
+
+def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output]]:
+    """Let the core of a flow see what a call brought; yield, with its number, each block of which something came."""
+    steps, blocks = turn.steps, turn.blocks
+    assert isinstance(steps, FlowSteps)
+    core = steps.core
+    by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
+    behind, first_row, row = _blocks_behind(turn), turn.place.start, 0
+    empty = {told[0]: told for told in steps.told(turn.state)}
+    marks = _marks_of(turn)
+    some = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
+    some |= np.isin(behind, list(empty)) | by_block
+    some[-1] = True
+    for block in np.flatnonzero(some).tolist():
+        end_tick, stop, place = blocks[block, ring.END_TICK : ring.MESSAGES + 1].tolist()
+        while marks and marks[-1][0] < place:
+            core.remember(marks.pop()[1])
+        frames = decode_frames(_payload(turn, place - 1)) if by_block else None
+        following = int(behind[block])
+        rows = slice(first_row + row, first_row + stop)
+        yield block, steps.settle(rows, following, end_tick, empty.get(following), frames)
+        row = stop
+    while marks:
+        core.remember(marks.pop()[1])
+
+
+def _blocks_behind(turn: Turn) -> npt.NDArray[np.int64]:
+    """Return the exposure that follows each block of a call, int64 (n,)."""
+    begins = turn.rings.messages[turn.blocks[:, ring.MESSAGES] - 1, ring.BEGIN] + HEADER.size
+    first = turn.kept[begins[:, None] + np.arange(16, 24)].view("<u8")[:, 0]
+    count = turn.kept[begins[:, None] + np.arange(28, 30)].view("<u2")[:, 0]
+    return first.astype(np.int64) + count
+
+
+def _marks_of(turn: Turn) -> list[tuple[int, Mark]]:
+    """Return the marks of a call, the first one last, each with its place among the ring's messages."""
+    places = np.flatnonzero(turn.messages[:, ring.WHAT] == int(MessageType.MARK)) + turn.first.messages
+    return [(place, decode_mark(_payload(turn, place))) for place in places[::-1].tolist()]
+
+
+def _payload(turn: Turn, place: int) -> bytes:
+    return turn.bytes_of(turn.rings.messages[place])[HEADER.size :]

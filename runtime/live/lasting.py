@@ -20,6 +20,8 @@ from pans.runtime.wire.messages import MessageType, decode_status
 from .compiled import CompiledTurns
 
 if TYPE_CHECKING:
+    from pans.runtime.flow.core import FlowCore
+
     from .run import LiveRun
 
 LEAST_LOOK_S, LOOK_S = 0.001, 0.005  # how long the run's thread waits for what is published
@@ -29,8 +31,9 @@ _PONG, _ACK, _STATUS = (int(kind) for kind in (MessageType.PONG, MessageType.ACK
 class LastingTurns(CompiledTurns):
     """The compiled turns of `run` over a link with a descriptor; where a call cannot go on, they are CompiledTurns'."""
 
-    def __init__(self, run: LiveRun, core: Core) -> None:
+    def __init__(self, run: LiveRun, core: Core | FlowCore) -> None:
         super().__init__(run, core, prompt=False)
+        self._wakes = False  # whether what is published at once must be taken at once
         self._call: LastingCall | None = None
         self.held_up = 0  # calls that ended because what they had published was not taken
 
@@ -38,7 +41,7 @@ class LastingTurns(CompiledTurns):
         """See Turns: the thread begins here, with the priority and on the cores that the run has by now."""
         super().attach()
         if self._call is None:
-            self._call = LastingCall()
+            self._call = LastingCall(wakes=self._wakes)
         turn = self._turn
         assert turn is not None
         self._call.begin(turn, -1, 0)  # the thread's stack is touched

@@ -37,7 +37,7 @@ from pans.runtime.timing.page_faults import ThreadCounts
 from pans.runtime.turn.eligible import excluded
 
 from .compiled import CompiledTurns
-from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice
+from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice, Turns
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .lasting import LastingTurns
 from .reconnect import Recovery, Refusals, reconnect_run
@@ -93,11 +93,8 @@ def run_live(
     try:
         core.warm_up()
         run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
-        if run.turn_choice.taken == COMPILED and isinstance(core, Core):
-            prompt = observers.acts and observers.watch is not None
-            lasts = not link.virtual and not prompt
-            run.compiled = LastingTurns(run, core) if lasts else CompiledTurns(run, core, prompt=prompt)
-            core.leave_steps()
+        if run.turn_choice.taken == COMPILED:
+            run.compiled = _compiled_turns(run, core, prompt=observers.acts and observers.watch is not None)
             run.compiled.prepare()  # before the heap is touched: loading kernels takes memory
         elif isinstance(core, Core):
             core.warm_up_steps()
@@ -132,6 +129,20 @@ def run_live(
         if run.compiled is not None:
             run.compiled.close()
         run.connection.close()
+
+
+def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> Turns:
+    """Return the compiled turns of `core`; with `prompt` a watcher acts."""
+    lasts = not run.connection.link.virtual and not prompt
+    if isinstance(core, Core):
+        core.leave_steps()
+        return LastingTurns(run, core) if lasts else CompiledTurns(run, core, prompt=prompt)
+    from pans.runtime.flow.core import FlowCore
+
+    from .flow_run import FlowTurns, LastingFlowTurns
+
+    assert isinstance(core, FlowCore)  # nothing else is eligible
+    return LastingFlowTurns(run, core) if lasts else FlowTurns(run, core, prompt=prompt)
 
 
 def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoice:

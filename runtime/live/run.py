@@ -280,7 +280,7 @@ class LiveRun(Reconciled):
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self.recorder is not None:
                 self.recorder.add_message(arrival_ns, pack_body(what))
-            self._book(output, arrival_ns, decoded_ns, outputs)
+            self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
             if what.type == MessageType.STATUS:
                 with suppress(MalformedMessage):  # counted where it was taken
                     status = decode_status(what.payload)  # the session may know a later one, where the host was held up
@@ -302,7 +302,7 @@ class LiveRun(Reconciled):
             self.lateness.stepped(decoded_ns, self.now_ns())
             if self.recorder is not None:
                 self.recorder.add_messages(arrival_ns, messages, place, taken)
-            self._book(output, arrival_ns, decoded_ns, outputs)
+            self.book(output, (arrival_ns, decoded_ns, self.now_ns()), outputs)
             place += taken
 
     def _drive(self, arrival_ns: int) -> None:
@@ -313,12 +313,12 @@ class LiveRun(Reconciled):
             except LinkError as error:
                 self._broken = error
 
-    def _book(self, output: Output, arrival_ns: int, decoded_ns: int, outputs: list[Output]) -> None:
-        """Account for what a step brought."""
-        self._account(output, (arrival_ns, decoded_ns, self.now_ns()))
+    def book(self, output: Output, times_ns: tuple[int, int, int], outputs: list[Output]) -> None:
+        """Account for what a step brought: `times_ns` when it arrived, was decoded and decided."""
+        self._account(output, times_ns)
         if output.block_end_tick is not None:
-            self.check_tick(output.block_end_tick, arrival_ns)
-            self.block_came(arrival_ns)
+            self.check_tick(output.block_end_tick, times_ns[0])
+            self.block_came(times_ns[0])
         if output.actions and self._broken is None:
             try:
                 self._act(self.now_ns())

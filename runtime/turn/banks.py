@@ -51,7 +51,7 @@ def publish(walk, rings, control, now):  # type: ignore[no-untyped-def]
     bank = head % _BANKS
     for column in range(ring.N_CONTROL):
         rings.heads[bank, column] = control[column]
-    for column in range(core.N_STATE):
+    for column in range(walk.state.size):
         rings.states[bank, column] = walk.state[column]
     walk.state[stream.MESSAGES], walk.state[stream.EXPOSURES] = 0, 0
     store(control, ring.HEAD, head + 1)

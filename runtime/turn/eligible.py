@@ -16,19 +16,24 @@ from .system import offered
 
 def excluded(core: Any, link: Link, *, drives: bool) -> str:
     """Return why no compiled turn can be taken with `core`, once warmed up, over `link`; "" where it can."""
-    if not isinstance(core, Core):
-        return "objects in flow have a turn of their own"
-    if core.counts_photons:
-        return "the detector counts photons: COUNTS are taken in Python"
-    if not core.compiles:
-        return "--on-dark changes decisions while they are made"
+    why = (
+        _excluded_still(core) if isinstance(core, Core) else getattr(core, "excluded", "the core has no compiled steps")
+    )
+    if why:
+        return str(why)
     if link.virtual:
         return "in virtual time, the host names each state in a turn of its own" if drives else ""
     if missing := offered():
         return missing
-    if not core.decides_compiled:
+    if isinstance(core, Core) and not core.decides_compiled:
         return "the back end is no table and no automaton: it decides in Python"
     if descriptor_of(link) is None:
         return "the link has no descriptor that compiled code could read"
     before_ns, there_ns = time.perf_counter_ns(), link.now_ns()
     return "" if before_ns <= there_ns <= time.perf_counter_ns() else "the link stamps with a clock of its own"
+
+
+def _excluded_still(core: Core) -> str:
+    if core.counts_photons:
+        return "the detector counts photons: COUNTS are taken in Python"
+    return "" if core.compiles else "--on-dark changes decisions while they are made"

@@ -8,13 +8,13 @@ is begun by `lasting`; the properties then show one bank at a time, `show_bank`,
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as core_kernels
-from pans.runtime.core.bulk_steps import CLICKS_MAX, BulkSteps
+from pans.runtime.core.follower import Follower
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.messages import Mark, MessageType, decode_mark
 from pans.runtime.wire.schema import HEADER
@@ -50,6 +50,32 @@ class Counts(NamedTuple):
     kept: int
 
 
+class Steps(Protocol):
+    """The compiled steps of a core (core.bulk_steps.BulkSteps, flow.steps.FlowSteps): they lend its state to kernels and take it back.
+
+    `walk` is a tuple of arrays of its own class, for which kinds.py has the kernels; its `state` begins with the columns of
+    core/stream_kernels.py, its `rows` are decisions. `block_rows` are most of one block; `decides`: kernels give each label at once.
+    """
+
+    @property
+    def core(self) -> Follower: ...
+
+    @property
+    def walk(self) -> Any: ...
+
+    @property
+    def decides(self) -> bool: ...
+
+    @property
+    def block_rows(self) -> int: ...
+
+    def load(self) -> None: ...
+
+    def store(self, reported: I64 | None = None) -> None: ...
+
+    def labelled(self, n: int, first: int = 0) -> npt.NDArray[np.void]: ...
+
+
 NO_LIMITS = Limits()
 _NOTHING = Counts(*[0] * len(Counts._fields))
 _FIRST = 3  # of the counts, the first that says up to where a ring is used
@@ -58,20 +84,21 @@ _FIRST = 3  # of the counts, the first that says up to where a ring is used
 class Turn:
     """The turns of `steps` on what `decoder` decodes; all memory is allocated here, before arming."""
 
-    def __init__(self, steps: BulkSteps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
+    def __init__(self, steps: Steps, decoder: BulkDecoder, drive: Drive | None = None) -> None:
         from .kernels import turn  # numba is loaded only by who decides in bulk
 
         self.steps, self.decoder = steps, decoder
-        self.rings: Rings = make_rings(core_kernels.N_STATE)
-        self.counts = self._first = _NOTHING  # how much there is, and where in the rings it begins
+        self.rings: Rings = make_rings(len(steps.walk.state))
+        self.counts = self.first = _NOTHING  # how much there is, and where in the rings it begins
         self._row, self._n_rows = 0, 0
         self._kernel = turn
         self._fed = self._nothing = (np.zeros(0, np.uint8), np.zeros((0, 2), np.int64))
         self._drive = no_drive() if drive is None else drive
         self.control: I64 = np.zeros(ring.N_CONTROL, np.int64)
         self.reported = self.control  # what it was when what is shown was all that had come
-        self.control[ring.FD] = -1
-        self.control[ring.BLOCK_ROWS] = min(steps.windows.n_windows, CLICKS_MAX)
+        self.state: I64 = steps.walk.state  # of the walk, likewise
+        self.control[ring.FD] = self.control[ring.WAKE_FD] = -1
+        self.control[ring.BLOCK_ROWS] = steps.block_rows
         self.control[ring.SENT_EXPOSURE] = self.control[ring.SENT_STATE] = -1
         self._scratch: I64 = np.zeros(4, np.int64)
         self._decoder = Decoder(*decoder.arrays)
@@ -95,7 +122,7 @@ class Turn:
     def _call(self, fed: tuple[U8, I64], fd: int, limits: Limits) -> int:
         self._prepare(fd, limits)
         ended = self._kernel(*fed, self._decoder, self._walk, self._drive, self.rings, self.control, self._scratch)
-        self._show(0, 1, self.control, self.steps.walk.state)
+        self._show(0, 1, self.control, self._walk.state)
         return int(ended)
 
     def _prepare(self, fd: int, limits: Limits) -> None:
@@ -106,18 +133,19 @@ class Turn:
         control[ring.FLOOR_NS] = limits.floor_ns
         control[ring.OPEN] = steps.core.tracker.open
         control[ring.LASTING : ring.TAIL + 1] = 0
+        control[ring.URGENT] = 0
         steps.load()
 
     def _show(self, bank: int, banks: int, reported: I64, state: I64) -> None:
         """Let the properties show `bank` of `banks`, and bring the core to where its `state` is."""
-        self.reported = reported
+        self.reported, self.state = reported, state
         self._row = len(self._walk.rows) // banks * bank
         self._n_rows = int(state[core_kernels.N_ROWS]) - self._row
         counts = reported[ring.ERRNO :].tolist()
         first = [0] * len(counts)
         if bank:
             first[_FIRST:] = [len(part) // banks * bank for part in self._parts]
-        self._first = Counts(*first)
+        self.first = Counts(*first)
         self.counts = Counts(*[count - begin for count, begin in zip(counts, first)])
         if self.counts.messages:
             self.steps.store(state)
@@ -148,7 +176,7 @@ class Turn:
     def show_rest(self) -> None:
         """Show the bank that a call, now ended, has not published; all others have been taken."""
         bank = int(self.control[ring.HEAD]) % ring.N_BANKS
-        self._show(bank, ring.N_BANKS, self.control, self.steps.walk.state)
+        self._show(bank, ring.N_BANKS, self.control, self._walk.state)
         self.control[ring.STOP] = 0
 
     def feed(self, data: U8, reads: I64) -> int:
@@ -196,34 +224,39 @@ class Turn:
         return self.steps.labelled(self._n_rows, self._row)
 
     @property
+    def place(self) -> slice:
+        """Where `rows` stand in the walk's, and what the walk has beside them."""
+        return slice(self._row, self._row + self._n_rows)
+
+    @property
     def blocks(self) -> I64:
         """When each block came, was decoded, decided and kept, and what had come up to it: rings.py's steps (n, N_STEP)."""
-        return self._part(self.rings.steps, self._first.steps, self.counts.steps)
+        return self._part(self.rings.steps, self.first.steps, self.counts.steps)
 
     @property
     def messages(self) -> I64:
         """Where the stream messages of the call stand in `kept`: rings.py's spans (n, 4)."""
-        return self._part(self.rings.messages, self._first.messages, self.counts.messages)
+        return self._part(self.rings.messages, self.first.messages, self.counts.messages)
 
     @property
     def answers(self) -> I64:
         """Where the acknowledgements stand in `kept`."""
-        return self._part(self.rings.answers, self._first.answers, self.counts.answers)
+        return self._part(self.rings.answers, self.first.answers, self.counts.answers)
 
     @property
     def shows(self) -> I64:
         """Where the commands stand in `kept` that were sent."""
-        return self._part(self.rings.shows, self._first.shows, self.counts.shows)
+        return self._part(self.rings.shows, self.first.shows, self.counts.shows)
 
     @property
     def notes(self) -> I64:
         """The waits for bytes: rings.py's notes (n, 4)."""
-        return self._part(self.rings.notes, self._first.notes, self.counts.notes)
+        return self._part(self.rings.notes, self.first.notes, self.counts.notes)
 
     @property
     def arrivals(self) -> I64:
         """When bytes were read, int64 (n,)."""
-        return self._part(self.rings.arrivals, self._first.arrivals, self.counts.arrivals)
+        return self._part(self.rings.arrivals, self.first.arrivals, self.counts.arrivals)
 
     @staticmethod
     def _part(part: I64, first: int, count: int) -> I64:

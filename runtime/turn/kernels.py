@@ -20,9 +20,10 @@ from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, STRUCTS, DeviceSta
 
 from . import rings as ring
 from .banks import LOOK_EVERY_NS, enter_bank, is_used, publish
+from .kinds import answer, take_message
 from .shared import load
-from .shows import IS_ODD, IS_REFUSED, send_show, take_ack
-from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
+from .shows import IS_ODD, IS_REFUSED, take_ack
+from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for, write_now
 
 READ_BYTES = 1 << 16  # at once, as link/serial.py
 LEAST_WAIT_NS = 200_000
@@ -38,10 +39,10 @@ _LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers a
 def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     """Take what is decoded, then read and take until something is due or not ordinary; return why it ended (rings.WHY).
 
-    decoder Decoder, walk WalkArrays, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). The rings are filled from
-    their beginning. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64 (n, 2) are their bytes and the
-    times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins; ALL_TAKEN behind the
-    last one.
+    decoder Decoder, walk of a class that kinds.py knows, drive Drive, rings Rings, control int64 (N_CONTROL,), scratch int64 (4,). Rings
+    are filled from their beginning. Where there are `reads`, nothing is read but `fed` uint8, read by read: `reads` int64 (n, 2) are their
+    bytes and the times of their arrival, control[NEXT_READ] and control[READ_AT] say which one comes next, and where it begins; ALL_TAKEN
+    behind the last one.
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     fed, reads, control, scratch = bare(fed), bare(reads), bare(control), bare(scratch)
@@ -122,13 +123,16 @@ def _go_on_awaiting(decoder, walk, rings, control, scratch):  # type: ignore[no-
             return ring.DUE
         control[ring.BEAT] += 1
         now, used = now_ns(scratch), is_used(control)
-        full = _is_out_of_notes(control)
-        if full or (used and now >= control[ring.PUBLISH_NS]):
+        full, urgent = _is_out_of_notes(control), control[ring.URGENT] and control[ring.WAKE_FD] >= 0
+        if full or (used and (urgent or now >= control[ring.PUBLISH_NS])):
             used = not publish(walk, rings, control, now)
             if used and full:
                 return ring.FULL
             if used:  # the other thread is behind: later, or when there is no room
                 control[ring.PUBLISH_NS] = now + LEAST_WAIT_NS
+        if urgent and not used:
+            control[ring.URGENT] = 0
+            write_now(control[ring.WAKE_FD], rings.kept, 0, 1)
         until = now + LOOK_EVERY_NS
         if used:
             until = min(until, control[ring.PUBLISH_NS])
@@ -239,27 +243,27 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
                 spans, count = rings.messages, ring.N_MESSAGES
             _keep(buffer, start, stop, rings.kept, spans, count, control)
             control[ring.PLACE] += 1
+            if buffer[start] == _ACK:
+                control[ring.URGENT] = 1  # more may be sent
             continue
         if buffer[start] == _ACK and control[ring.DRIVES]:
             if load_session(buffer, start) != walk.state[core.SESSION]:
                 return ring.ODD
-            answer = take_ack(buffer, _U(start), _U(stop), control)
-            if answer == IS_ODD:
+            said = take_ack(buffer, _U(start), _U(stop), control)
+            if said == IS_ODD:
                 return ring.ODD
             _keep(buffer, start, stop, rings.kept, rings.answers, ring.N_ANSWERS, control)
-            if answer == IS_REFUSED:
+            if said == IS_REFUSED:
                 rings.answers[control[ring.N_ANSWERS] - 1, ring.WHAT] = ring.REFUSAL
             control[ring.PLACE] += 1
             continue
         if not control[ring.OPEN]:
             return ring.ODD
         decoded_ns = now_ns(scratch)
-        took = core.take_message(
-            buffer, _U(start), _U(stop), walk.state, walk.marks, walk.windows, walk.tables, walk.rows, walk.counts
-        )
+        took = take_message(walk, buffer, _U(start), _U(stop))
         if took == core.TOOK_BLOCK:
             decided_ns = now_ns(scratch)
-            sent = not control[ring.DRIVES] or send_show(walk, drive, rings, control, scratch)
+            sent = answer(walk, drive, rings, control, scratch)
             _keep(buffer, start, stop, rings.kept, rings.messages, ring.N_MESSAGES, control)
             _put_step(walk, rings.steps, control, decoded_ns, decided_ns, now_ns(scratch))
             control[ring.PLACE] += 1

@@ -8,6 +8,7 @@ it: whoever takes what came must not keep the next block waiting.
 from __future__ import annotations
 
 import os
+import select
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,8 +28,10 @@ DEAD_S = 1.0  # without a sign of life; one comes every 10 ms
 class LastingCall:
     """The thread, from construction to `close`; one call at a time, `begin`, `wait` and `banks` again and again, `end`."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, wakes: bool = False) -> None:
+        """With `wakes`, `wait` returns as soon as a bank has been published that is urgent (rings.URGENT)."""
         self.under_way = False
+        self._wake: tuple[int, int] | None = _pipe() if wakes else None  # where a byte comes, and is written
         self.page_faults: dict[str, int] = {}  # of the thread during calls
         self._turn: Turn | None = None
         self._call: Callable[[], int] | None = None
@@ -49,11 +52,19 @@ class LastingCall:
     def begin(self, turn: Turn, fd: int, floor_ns: int) -> None:
         """Begin a call that reads `fd`; `turn` is the thread's until `wait` or `end` says that it has ended."""
         self._turn, self._call = turn, turn.lasting(fd, floor_ns)
+        turn.control[ring.WAKE_FD] = -1 if self._wake is None else self._wake[1]
         self._beat, self._beat_s, self.under_way = -1, time.monotonic(), True
         self._go.release()
 
     def wait(self, seconds: float) -> int | None:
         """Wait until the call has ended, at most so long; return why it did, None where it goes on."""
+        if self._wake is None:
+            return self._ended(seconds)
+        if select.select([self._wake[0]], [], [], seconds)[0]:
+            os.read(self._wake[0], 4096)
+        return self._ended(0.0)
+
+    def _ended(self, seconds: float) -> int | None:
         if not self._done.acquire(timeout=seconds):
             return None
         self.under_way = False
@@ -82,7 +93,7 @@ class LastingCall:
         """Stop the call; return why it ended, None where it does not stop."""
         assert self._turn is not None
         self._turn.stop()
-        return self.wait(STOP_S)
+        return self._ended(STOP_S)
 
     @property
     def lives(self) -> bool:
@@ -116,6 +127,10 @@ class LastingCall:
         if self._thread.is_alive():
             self._go.release()
             self._thread.join()
+        if self._wake is not None:
+            for fd in self._wake:
+                os.close(fd)
+            self._wake = None
 
     def _work(self) -> None:
         _go_above()
@@ -129,6 +144,17 @@ class LastingCall:
             for name, count in counts.since().items():
                 self.page_faults[name] = self.page_faults.get(name, 0) + count
             self._done.release()
+            if self._wake is not None:
+                with suppress(BlockingIOError):  # it is awake anyhow
+                    os.write(self._wake[1], b"\0")
+
+
+def _pipe() -> tuple[int, int]:
+    """Return the ends of a pipe that never lets a writer wait."""
+    ends = os.pipe()
+    for end in ends:
+        os.set_blocking(end, False)
+    return ends
 
 
 def _go_above() -> None:

@@ -34,9 +34,12 @@ LASTING, HEAD, TAIL, BEAT, WRITES, PUBLISH_NS = range(24, 30)
 # the bank under way: where it begins, in rows, bytes and waits, and where each ring's part of it ends
 FROM_ROWS, FROM_KEPT, FROM_NOTES = range(30, 33)
 ROOM_STEPS, ROOM_MESSAGES, ROOM_ANSWERS, ROOM_SHOWS, ROOM_NOTES, ROOM_ARRIVALS, ROOM_KEPT, ROOM_ROWS = range(33, 41)
+# of a call that goes on: whether the bank under way is to be published at once, and a descriptor to which a byte is written when it has
+# been (-1: none), for pulses that decisions ask for and answers to them
+URGENT, WAKE_FD = range(41, 43)
 # what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
 # ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(41, 52)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(43, 54)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)

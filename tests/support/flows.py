@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from pans.runtime.core.decision import Output, joined
 from pans.runtime.core.plan import NO_SHOT, Plan
-from pans.runtime.decide.verdict import Verdict
+from pans.runtime.decide.verdict import Decider, Verdict
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import make_flow_core
 from pans.runtime.flow.settings import FlowSettings
@@ -63,11 +64,18 @@ CLASSES = ("a", "b", "c", "null")
 SETTINGS = FlowSettings("cells", fields_per_s=10_000.0, onset_frames=6)
 
 
-def make(block: int = 20, dark: bool = False, n_cycles: int = 0, shots: int = 1, **changes: object) -> FlowCore:
+def make(
+    block: int = 20,
+    dark: bool = False,
+    n_cycles: int = 0,
+    shots: int = 1,
+    decider: Decider | None = None,
+    **changes: object,
+) -> FlowCore:
     flow = replace(SETTINGS, **changes)  # type: ignore[arg-type]
     core = make_flow_core(
         plan_of(block, dark),
-        LowestChannel(),
+        decider or LowestChannel(),
         flow,
         CLASSES,
         shots=shots,
@@ -118,3 +126,60 @@ def scene(*cells: tuple[int, int, int], n: int = 1000) -> np.ndarray:
 
 def mark(number: int, centre: int, truth: int, half: int = 40) -> Mark:
     return Mark(0, number, truth, centre, 1000 + centre * PERIOD_TICKS, 6.0, half)
+
+
+NOTHING = Output([], [], None)
+
+
+def stream(words: np.ndarray, block: int, marks: int = 8) -> list[bytes]:
+    """The messages of `words` uint16 (n,), a mark at every 120th exposure."""
+    messages, seq = [], 0
+    waiting = [mark(number, 60 + 120 * number, number % 4, 30) for number in range(marks)]
+    for first in range(0, len(words), block):
+        part = np.ascontiguousarray(words[first : first + block].astype("<u2")).view(np.uint8).reshape(-1, 2)
+        while waiting and waiting[0].exposure_index < first + len(part):
+            messages.append(wire.encode_mark(waiting.pop(0)._replace(seq=seq), SESSION))
+            seq += 1
+        tick = 1000 + first * PERIOD_TICKS
+        messages.append(wire.encode_frames(FrameBlock(seq, 0, tick, first, PERIOD_TICKS, NO_OBJECT, part), SESSION))
+        seq += 1
+    return messages
+
+
+def strange(kind: str, message: bytes) -> list[bytes]:
+    """What a bad day makes of one message."""
+    frame = FrameDecoder().feed(message)[0]
+    if kind == "lost":
+        return []
+    if kind == "twice":
+        return [message, message]
+    if kind == "another session":
+        return [wire.encode_frame(frame.type, frame.payload, SESSION + 1), message]
+    if kind == "short":
+        return [wire.encode_frame(frame.type, frame.payload[:-1], SESSION)]
+    if kind == "drops":  # the device has dropped something
+        return [wire.encode_frame(frame.type, frame.payload[:4] + b"\5\0\0\0" + frame.payload[8:], SESSION)]
+    assert kind == "period"
+    return [wire.encode_frame(frame.type, frame.payload[:24] + b"\7\0\0\0" + frame.payload[28:], SESSION)]
+
+
+def by_one(core: FlowCore, data: bytes) -> Output:
+    output = NOTHING
+    for frame in FrameDecoder().feed(data):
+        if frame.session == SESSION:
+            output = joined(output, core.step(frame))
+    return joined(output, core.end())
+
+
+def state_of(core: FlowCore) -> dict[str, Any]:
+    return {
+        "counters": core.tracker.counters,
+        "position": core.tracker.position,
+        "marks": core.marks,
+        "last_tick": core.last_tick,
+        "jitter": core.jitter_ticks,
+        "tallies": core.tallies.tolist(),
+        "empty": (core.empty_frames, core.empty_channels.tolist()),
+        "matched": core.matcher.figures(1),
+        "n": (core.n_decisions, core.n_abstained, core.n_passages),
+    }

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flows import PERIOD_TICKS, SESSION, make, mark, plan_of, scene
+from flows import NOTHING, PERIOD_TICKS, SESSION, by_one, make, plan_of, scene, state_of, strange, stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,49 +20,7 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Messages, pack_body
-from pans.runtime.wire.messages import NO_OBJECT, FrameBlock, FrameDecoder
-
-NOTHING = Output([], [], None)
-
-
-def stream(words: np.ndarray, block: int, marks: int = 8) -> list[bytes]:
-    """The messages of `words` uint16 (n,), a mark at every 120th exposure."""
-    messages, seq = [], 0
-    waiting = [mark(number, 60 + 120 * number, number % 4, 30) for number in range(marks)]
-    for first in range(0, len(words), block):
-        part = np.ascontiguousarray(words[first : first + block].astype("<u2")).view(np.uint8).reshape(-1, 2)
-        while waiting and waiting[0].exposure_index < first + len(part):
-            messages.append(wire.encode_mark(waiting.pop(0)._replace(seq=seq), SESSION))
-            seq += 1
-        tick = 1000 + first * PERIOD_TICKS
-        messages.append(wire.encode_frames(FrameBlock(seq, 0, tick, first, PERIOD_TICKS, NO_OBJECT, part), SESSION))
-        seq += 1
-    return messages
-
-
-def strange(kind: str, message: bytes) -> list[bytes]:
-    """What a bad day makes of one message."""
-    frame = FrameDecoder().feed(message)[0]
-    if kind == "lost":
-        return []
-    if kind == "twice":
-        return [message, message]
-    if kind == "another session":
-        return [wire.encode_frame(frame.type, frame.payload, SESSION + 1), message]
-    if kind == "short":
-        return [wire.encode_frame(frame.type, frame.payload[:-1], SESSION)]
-    if kind == "drops":  # the device has dropped something
-        return [wire.encode_frame(frame.type, frame.payload[:4] + b"\5\0\0\0" + frame.payload[8:], SESSION)]
-    assert kind == "period"
-    return [wire.encode_frame(frame.type, frame.payload[:24] + b"\7\0\0\0" + frame.payload[28:], SESSION)]
-
-
-def by_one(core: FlowCore, data: bytes) -> Output:
-    output = NOTHING
-    for frame in FrameDecoder().feed(data):
-        if frame.session == SESSION:
-            output = joined(output, core.step(frame))
-    return joined(output, core.end())
+from pans.runtime.wire.messages import FrameDecoder
 
 
 def by_many(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
@@ -78,20 +36,6 @@ def by_many(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
                 output, at = joined(output, came), at + taken
             place = end + 1
     return joined(output, core.end())
-
-
-def state_of(core: FlowCore) -> dict[str, Any]:
-    return {
-        "counters": core.tracker.counters,
-        "position": core.tracker.position,
-        "marks": core.marks,
-        "last_tick": core.last_tick,
-        "jitter": core.jitter_ticks,
-        "tallies": core.tallies.tolist(),
-        "empty": (core.empty_frames, core.empty_channels.tolist()),
-        "matched": core.matcher.figures(1),
-        "n": (core.n_decisions, core.n_abstained, core.n_passages),
-    }
 
 
 @settings(max_examples=25, deadline=None)

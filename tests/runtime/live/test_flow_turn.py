@@ -1,0 +1,99 @@
+"""A flow's compiled turn in whole runs: the same recording, pulses and figures as Python's turn, in virtual time and over a descriptor."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pans.firmware_sim.ports.serve import build_instrument, open_sim, parse_sim_url
+from pans.firmware_sim.ports.shell import open_port, serve
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.flow.make import plan_flow
+from pans.runtime.flow.settings import FlowSettings
+from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link import connection
+from pans.runtime.link.base import open_link
+from pans.runtime.live import Observers, Recovery, RunConfig, run_live
+from pans.runtime.live.config import DarkSettings
+from pans.runtime.live.dark_run import DarkRun
+from pans.runtime.live.flow_run import FlowRun
+from pans.runtime.record import Recorder, read_recording, replay
+from pans.runtime.turn import system
+
+pytestmark = pytest.mark.skipif(bool(system.offered()), reason="no compiled turn here")
+PROFILE = load_profile("flow-snspd")
+SETTINGS = FlowSettings("cells", fields_per_s=20_000.0, onset_frames=4, gate_classes=("a", "b"))
+
+
+def run(folder: Path, settings: FlowSettings, link: Any, turn: str, seconds: float, url: str = "") -> tuple[Any, ...]:
+    bundle = load_bundle(folder / "thirds.pans")[0]
+    plan, core, cycles = plan_flow(PROFILE, bundle, make_decider(bundle), settings, 1, seconds)
+    dark = DarkRun.of(DarkSettings(), PROFILE)
+    core.guard = dark.guard(plan, bundle, 1, flow=True)
+    flow, path = FlowRun(core, None), folder / f"{turn}.pansrec"
+    config = RunConfig(n_cycles=cycles, deadline_us=1e9, realtime=False, turn=turn)
+    facts = {"shots": 1, "tick_hz": PROFILE.clock.tick_hz, "backend": "table", "confidence": 0.0, "dark": dark.header()}
+    with Recorder(path, {"config": facts | {"flow": flow.header()}}, overwrite=True) as recorder:
+        recovery, observers = Recovery.of(link, url, 10.0), Observers(prepared=flow.prepared)
+        result = run_live(link, PROFILE, bundle, plan, core, config, recorder, recovery, observers)
+        recorder.close({})
+    return result, flow.figures().as_json(), read_recording(path), bundle
+
+
+@pytest.mark.parametrize("dark_every", [0, 2])
+@pytest.mark.parametrize("faults", ["", "loss:0.01,flip:0.01,duplicate:0.01,truncate:0.01,reorder:0.01,drip:0.01"])
+def test_both_turns_leave_the_same(
+    faults: str, dark_every: int, flow_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decisions, times, events, figures, messages and pulses, byte for byte."""
+    told = []
+    for turn in ("python", "compiled"):
+        numbers = random.Random(7)
+        monkeypatch.setattr(connection, "secrets", SimpleNamespace(randbelow=numbers.randrange))
+        link = open_sim(f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=4&pace=fast&faults={faults}")
+        settings = replace(SETTINGS, dark_every=dark_every)
+        result, figures, recording, _ = run(flow_folder, settings, link, turn, 0.05)
+        assert (result.turn.taken, result.ended) == (turn, "completed")
+        told.append(
+            {
+                "decisions": recording.decisions().tolist(),
+                "timings": recording.timings().tolist(),
+                "messages": list(recording.messages()),
+                "commands": list(recording.commands()),
+                "events": list(recording.events()),
+                "figures": figures,
+                "tally": result.tally.figures(),
+                "stream": result.stream,
+                "dark": result.dark,
+                "late": (result.timing.late, result.timing.blame),
+            }
+        )
+    assert told[1]["figures"]["gates"]["done"] > 5
+    assert told[0] == told[1]
+
+
+def test_a_run_through_a_descriptor(flow_folder: Path) -> None:
+    """At real pace, in a thread of its own; pulses leave behind the record of their decisions, and a replay decides the same."""
+    url = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=3"
+    device, clock = build_instrument(parse_sim_url(url), time.perf_counter_ns())
+    port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    settings = replace(SETTINGS, gate_delay_us=400_000.0)  # a busy machine makes it
+    result, figures, recording, bundle = run(flow_folder, settings, open_link(port.url), "compiled", 0.3, port.url)
+    stopped.set()
+    thread.join(10)
+    assert (result.ended, result.turn.words()) == ("completed", "compiled")
+    gates = figures["gates"]
+    assert gates["asked"] == gates["done"] + gates["refused"] + gates["expired"]
+    assert gates["done"] > 0
+    again = replay(recording, bundle)
+    assert (again.as_recorded, again.decisions) == (True, len(recording.decisions()))
