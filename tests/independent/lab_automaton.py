@@ -1,4 +1,4 @@
-"""Automata in bundles of version 3, read as a lab would from docs/reference/formats.md ("Automata, version 3") alone.
+"""Automata in bundles of versions 3 and 4, read as a lab would from docs/reference/formats.md ("Automata, versions 3 and 4") alone.
 
 Owns the meaning of the parts: patterns out of bits, walks, the golden ones recomputed, stopping by a confidence. Plain Python where the
 package has arrays and kernels. Imports nothing of the package.
@@ -29,6 +29,7 @@ class Automaton:
     posteriors: NDArray[np.float32]
     channels: int
     slots: int
+    counts: bool = False  # version 4: a number of a click word is the outcome of a slot
 
     def walk(self, word: Sequence[int], confidence: float = 0.0) -> list[int]:
         """Return the nodes of a click word's walk, from state 0 to the node that decides."""
@@ -37,7 +38,7 @@ class Automaton:
             if confidence and len(nodes) > 1 and self.posteriors[nodes[-1]].max() >= np.float32(confidence):
                 break
             first = (len(nodes) - 1) * self.channels
-            outcome = sum(word[first + k] * 2**k for k in range(self.channels))
+            outcome = word[first] if self.counts else sum(word[first + k] * 2**k for k in range(self.channels))
             nodes.append(self.successors[nodes[-1]][outcome])
         return nodes
 
@@ -49,17 +50,24 @@ class Automaton:
 
 
 def read_automaton(bundle: Bundle) -> Automaton:
-    """Return the automaton of a bundle of version 3, every rule of the document checked."""
+    """Return the automaton of a bundle of version 3 or 4, every rule of the document checked."""
     header, parts = bundle.header, bundle.parts
     pixels = header["image_shape"][0] * header["image_shape"][1]
     steps = header["automaton"]["dwell_steps"]
-    demand(header["encoder"] == "automaton" and set(header["automaton"]) == {"dwell_steps"}, "the keys of an automaton")
+    counts = "outcomes" in header["automaton"]
+    keys = {"dwell_steps", "outcomes"} if counts else {"dwell_steps"}
+    demand(header["encoder"] == "automaton" and set(header["automaton"]) == keys, "the keys of an automaton")
     demand(type(steps) is int and 1 <= steps <= 65_535, "dwell_steps")
     patterns = _patterns(header["levels"], parts, pixels)
     successors, posteriors = parts["successors"], parts["posteriors"]
     states, nodes = len(successors), len(posteriors)
-    channels = successors.shape[1].bit_length() - 1
-    demand(1 <= channels <= 8 and successors.shape[1] == 2**channels, "outcomes")
+    outcomes = successors.shape[1]
+    channels = 1 if counts else outcomes.bit_length() - 1
+    if counts:
+        said = header["automaton"]["outcomes"]
+        demand(type(said) is int and 3 <= said <= 16 and said == outcomes, "outcomes")
+    else:
+        demand(1 <= channels <= 8 and outcomes == 2**channels, "outcomes")
     demand(1 <= states <= 65_533 and 1 <= nodes - states <= 1 << 20, "states and leaves")
     demand(parts["state_pattern"].shape == parts["state_dwell"].shape == (states,), "one pattern and dwell per state")
     demand(int(parts["state_pattern"].max()) < len(patterns), "a pattern that is not there")
@@ -71,7 +79,7 @@ def read_automaton(bundle: Bundle) -> Automaton:
     demand(slots <= 1024 and slots * channels <= 4096, "length of a walk")
     shares = [int(dwell) / steps for dwell in parts["state_dwell"]]
     shown = [int(pattern) for pattern in parts["state_pattern"]]
-    automaton = Automaton(patterns, shown, shares, successors.tolist(), posteriors, channels, slots)
+    automaton = Automaton(patterns, shown, shares, successors.tolist(), posteriors, channels, slots, counts)
     _check_golden(automaton, parts)
     _check_expected(header, automaton)
     return automaton
@@ -117,10 +125,18 @@ def _check_golden(automaton: Automaton, parts: dict[str, NDArray[Any]]) -> None:
     )
     demand(walks.shape[1] == automaton.slots + 1, "length of a golden walk")
     for row, wanted, posterior in zip(words, walks.tolist(), posteriors):
-        nodes = automaton.walk(bits_of(row, automaton.slots * automaton.channels))
+        nodes = automaton.walk(_golden_word(automaton, row))
         nodes += nodes[-1:] * (automaton.slots + 1 - len(nodes))
         demand(nodes == wanted, "a golden walk")
         demand(posterior.tobytes() == automaton.posteriors[nodes[-1]].tobytes(), "a golden posterior")
+
+
+def _golden_word(automaton: Automaton, row: NDArray[np.uint8]) -> list[int]:
+    if not automaton.counts:
+        return bits_of(row, automaton.slots * automaton.channels)
+    most = len(automaton.successors[0]) - 1
+    demand(len(row) == automaton.slots and int(row.max()) <= most, "a golden word")
+    return [int(number) for number in row]
 
 
 def _check_expected(header: dict[str, Any], automaton: Automaton) -> None:

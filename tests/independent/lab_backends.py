@@ -1,6 +1,6 @@
 """The back ends that any reader can recompute bit for bit, from docs/reference/formats.md ("The back ends", "The quantised head").
 
-Owns the way from clicks per pattern to scores, label and probability. Imports nothing of the package.
+Owns the way from clicks (or sums of photon numbers) per pattern to scores, label and probability. Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ Scores = Callable[[Counts, int], NDArray[Any]]
 
 def table_scores(bundle: Bundle) -> Scores:
     """Return the back end `table`."""
-    table = bundle.parts["table"]
-    return lambda counts, shots: table[sum(int(count) << i for i, count in enumerate(counts))]
+    table, base = bundle.parts["table"], bundle.largest + 1
+    return lambda counts, shots: table[sum(int(count) * base**i for i, count in enumerate(counts))]
 
 
 def float64_scores(bundle: Bundle) -> Scores:
@@ -31,7 +31,7 @@ def float64_scores(bundle: Bundle) -> Scores:
     layers = bundle.layers()
 
     def scores(counts: Counts, shots: int) -> NDArray[Any]:
-        x = counts / np.float64(shots)
+        x = counts / np.float64(shots * bundle.largest)
         for weights, bias, relu in layers:
             x = x @ weights.astype(np.float64) + bias.astype(np.float64)
             x = np.maximum(x, 0.0) if relu else x
@@ -46,7 +46,7 @@ def int8_scores(bundle: Bundle) -> Scores:
     scale, bias = bundle.parts["int8_affine"]
 
     def scores(counts: Counts, shots: int) -> NDArray[Any]:
-        x, unit, weight_at, at = counts, np.float32(1) / np.float32(shots), 0, 0
+        x, unit, weight_at, at = counts, np.float32(1) / np.float32(shots * bundle.largest), 0, 0
         for n_in, n_out in pairwise(sizes):
             flat = bundle.parts["int8_weights"][weight_at : weight_at + n_in * n_out]
             sums = (x @ flat.reshape(n_in, n_out).astype(np.int64)).astype(np.float32)

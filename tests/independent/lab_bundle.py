@@ -41,7 +41,14 @@ AUTOMATON_DTYPES = {
     "golden_walks": "<u4",
     "golden_posteriors": "<f4",
 }
-NEW_KEYS: dict[int, set[str]] = {1: set(), 2: {"sensor", "picture_shape"}, 3: {"automaton", "expected"}}
+NEW_KEYS: dict[int, set[str]] = {
+    1: set(),
+    2: {"sensor", "picture_shape"},
+    3: {"automaton", "expected"},
+    4: {"automaton", "expected"},
+    5: {"outcomes"},
+}
+OF_AUTOMATA = (3, 4)
 KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}
 
 
@@ -64,6 +71,11 @@ class Bundle:
     header: dict[str, Any]
     parts: dict[str, NDArray[Any]]
     sha256: str
+
+    @property
+    def largest(self) -> int:
+        """The largest number that an exposure of fixed patterns can have: 1 of clicks."""
+        return int(self.header.get("outcomes", 2)) - 1
 
     def layers(self) -> list[Layer]:
         """Return the layers of the head."""
@@ -116,8 +128,11 @@ def read_bundle(data: bytes) -> Bundle:
     header = strict_json(data[16 : 16 + length])
     more = set(header) - KEYS
     demand(set(header) >= KEYS and more <= NEW_KEYS[version] and bool(more) == (version > 1), "header keys")
-    demand(version < 3 or "automaton" in more, "an automaton")
-    dtypes = AUTOMATON_DTYPES if version == 3 else DTYPES
+    demand(("automaton" in more) == (version in OF_AUTOMATA), "an automaton")
+    if version in OF_AUTOMATA:
+        demand(isinstance(header["automaton"], dict), "an automaton that is no object")
+        demand(("outcomes" in header["automaton"]) == (version == 4), "an automaton of photon numbers is version 4")
+    dtypes = AUTOMATON_DTYPES if version in OF_AUTOMATA else DTYPES
     parts: dict[str, NDArray[Any]] = {}
     begin, offset = 16 + length, 0
     for row in header["parts"]:
@@ -134,7 +149,26 @@ def read_bundle(data: bytes) -> Bundle:
     if "pattern_levels" in parts:
         levels = parts["pattern_levels"]
         demand(levels.shape[1] == height * width and bool((levels < header["levels"]).all()), "patterns")
+    if version == 5:
+        _check_numbers(header, parts)
     return Bundle(header, parts, hashlib.sha256(data).hexdigest())
+
+
+def _check_numbers(header: dict[str, Any], parts: dict[str, NDArray[Any]]) -> None:
+    """Fixed patterns read as photon numbers: `outcomes`, the table in its base, and the golden rows that it answers."""
+    outcomes = header["outcomes"]
+    demand(type(outcomes) is int and 3 <= outcomes <= 16 and header["encoder"] == "active", "outcomes")
+    means = parts["golden_means"]
+    demand(means.shape[1] == len(parts["pattern_levels"]) and bool(((means >= 0) & (means <= 1)).all()), "golden means")
+    if "table" not in parts:
+        return
+    table, largest = parts["table"], np.float32(outcomes - 1)
+    demand(table.shape == (outcomes ** means.shape[1], len(header["classes"])) and len(table) <= 1 << 20, "table")
+    for row, scores in zip(means, parts["golden_scores"]):
+        numbers = [round(float(value) * int(largest)) for value in row]
+        if all(np.float32(number) / largest == value for number, value in zip(numbers, row)):
+            found = table[sum(number * outcomes**i for i, number in enumerate(numbers))].astype(np.float64)
+            demand(bool((np.abs(found - scores) <= 1e-5 * np.maximum(1, np.abs(scores))).all()), "a golden row")
 
 
 # ---- as much of ONNX as a chain of layers needs; field numbers are those of onnx.proto ----

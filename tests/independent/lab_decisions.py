@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from lab_backends import ABSTAINED, BACKENDS, NO_LABEL, Counts, Scores, verdict
 from lab_bundle import Bundle, demand
-from lab_frames import CLICKS, COMMAND, FRAMES, MARK, STATUS, FrameCutter, open_body
+from lab_frames import CLICKS, COMMAND, COUNTS, FRAMES, MARK, STATUS, FrameCutter, open_body
 from lab_recording import ROW, Recording
 from numpy.typing import NDArray
 
@@ -32,6 +32,7 @@ class Plan:
     exposure_ticks: int
     cycles_per_object: int
     slots: list[tuple[int, int, int]]  # start, pattern, shot
+    largest: int = 1  # the largest photon number that READ_COUNTS asked for; 1: clicks
 
     @property
     def visit(self) -> int:
@@ -53,6 +54,7 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
     pieces: dict[int, bytes] = {}
     arms: dict[int, Arm] = {}
     head: tuple[int, ...] = ()
+    largest = 1
     for _, data in recording.commands:
         cutter = FrameCutter()
         for kind, session, payload in cutter.feed(data):
@@ -63,6 +65,8 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
             if opcode == 0x02:
                 head = struct.unpack_from("<BBHIIIIQHHI", body)
                 pieces[head[4]] = body[36:]
+            elif opcode == 0x0A:
+                largest, _ = struct.unpack("<HH", body)
             elif opcode == 0x03:
                 start, cycles, _, _ = struct.unpack("<QQII", body)
                 arms[session] = Arm(session, start, cycles)
@@ -70,7 +74,7 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
     mode, _, patterns, n_slots, _, exposure_ticks, _, _, _, _, cycles_per_object = head
     slots = list(struct.iter_unpack("<QHH", b"".join(pieces[first] for first in sorted(pieces))))
     demand(len(slots) == n_slots, "slots of the plan are missing")
-    return Plan(bool(mode), patterns, exposure_ticks, cycles_per_object, slots), list(arms.values())
+    return Plan(bool(mode), patterns, exposure_ticks, cycles_per_object, slots, largest), list(arms.values())
 
 
 # ---- the rules ----
@@ -139,7 +143,7 @@ class Decisions:
                 self.marks[number] = truth
                 if len(self.marks) > 4096:
                     del self.marks[next(iter(self.marks))]
-        elif kind in (CLICKS, FRAMES) and len(payload) >= 36:
+        elif kind in (CLICKS, FRAMES, COUNTS) and len(payload) >= 36:
             self._on_block(kind, payload)
 
     def _is_next(self, sequence: int, first: int = 0) -> bool:
@@ -152,13 +156,18 @@ class Decisions:
     def _on_block(self, kind: int, payload: bytes) -> None:
         sequence, _, tick, first, spacing, n, width, number = struct.unpack_from("<IIQQIHHI", payload)
         rest = payload[36:]
-        size = 2 * n + (n + 7) // 8 if kind == CLICKS else n * width
-        if n == 0 or size == 0 or len(rest) != size or not self._is_next(sequence, first) or first < self.exposure:
+        size = {CLICKS: 2 * n + (n + 7) // 8, COUNTS: 3 * n, FRAMES: n * width}[kind]
+        if n == 0 or size == 0 or len(rest) != size or (kind == COUNTS and max(rest[2 * n :]) > width):
+            return
+        if not self._is_next(sequence, first) or first < self.exposure:
             return
         self.exposure = first + n
-        plan = self.plan
-        fits = first % plan.visit + n <= plan.visit and first + n <= self.end
+        plan, shown = self.plan, () if kind == FRAMES else struct.unpack_from(f"<{n}H", rest)
+        fits = first % plan.visit + n <= plan.visit and first + n <= self.end and self._stamps_fit(shown)
+        largest = width if kind == COUNTS else 1
         if (kind == FRAMES) != plan.parallel or not fits or (kind == FRAMES and 8 * width < plan.patterns):
+            return
+        if largest != plan.largest:
             return
         end = tick + (n - 1) * spacing + plan.exposure_ticks
         self.last_end = end
@@ -166,10 +175,10 @@ class Decisions:
         while self.visit < first // plan.visit:
             self._next_visit()
         self.object = number
-        if kind == CLICKS:
-            bits = _bits(rest[2 * n :])
-            for i, shown in enumerate(struct.unpack_from(f"<{n}H", rest)):
-                self._count_one(first + i, shown, int(bits[i]))
+        if kind != FRAMES:
+            numbers = _bits(rest[2 * n :]) if kind == CLICKS else np.frombuffer(rest[2 * n :], np.uint8)
+            for i, one in enumerate(shown):
+                self._count_one(first + i, one, int(numbers[i]))
         else:
             for i, word in enumerate(_bits(rest).reshape(n, 8 * width)):
                 window = self.window_of.get((first + i) % plan.visit)
@@ -177,6 +186,9 @@ class Decisions:
                     window.counts += word[: plan.patterns]
                     window.right += plan.patterns
         self._settle(first + n, lambda exposure: tick + (exposure - first) * spacing + plan.exposure_ticks)
+
+    def _stamps_fit(self, _stamps: Sequence[int]) -> bool:
+        return True  # of fixed patterns any stamp is counted, right or wrong
 
     def _count_one(self, exposure: int, shown: int, bit: int) -> None:
         within = exposure % self.plan.visit
@@ -199,33 +211,43 @@ class Decisions:
                     return
                 self._next_visit()
             window = self.windows[self.next_window]
-            last = self.visit * self.plan.visit + window.members[-1]
-            if window.right < self._needed() and last >= up_to:
+            last = self.visit * self.plan.visit + self._last(window)
+            if window.right < self._needed(window) and last >= up_to:
                 return
             self._decide(window, tick_of(last), 0)
 
-    def _needed(self) -> int:
+    def _last(self, window: Window) -> int:
+        """Its last exposure in the visit."""
+        return window.members[-1]
+
+    def _needed(self, _window: Window) -> int:
         return self.shots * self.plan.patterns
+
+    def _verdict(self, window: Window) -> tuple[int, np.float32, int]:
+        return verdict(self.scores(window.counts, self.shots))
 
     def _next_visit(self) -> None:
         self.visit += 1
         self._open_visit()
 
     def _decide(self, window: Window, tick: int, flags: int) -> None:
-        missing = self._needed() - window.right - window.wrong
+        missing = self._needed(window) - window.right - window.wrong
         flags |= (GAP if missing else 0) | (WRONG if window.wrong else 0)
         label, probability = NO_LABEL, np.float32(0)
         if flags:
             flags |= ABSTAINED
         else:
-            label, probability, flags = verdict(self.scores(window.counts, self.shots))
-        last = self.visit * self.plan.visit + window.members[-1]
+            label, probability, flags = self._verdict(window)
+        last = self.visit * self.plan.visit + self._last(window)
         shot = self.next_window * self.shots
         truth = -1 if self.object == NO_OBJECT else self.marks.get(self.object, -1)
         clicks, crc = int(window.counts.sum()), zlib.crc32(window.counts.astype("<i8").tobytes())
         place = (len(self.rows), tick, last, self.object, shot)
-        self.rows.append((*place, clicks, label, truth, flags, probability, crc, 0))
+        self.rows.append((*place, clicks, label, truth, flags, probability, crc, self._exposures(window)))
         self.next_window += 1
+
+    def _exposures(self, _window: Window) -> int:
+        return 0  # of fixed patterns
 
     # -- the end -------------------------------------------------------------------------------------------------------
 
@@ -266,13 +288,21 @@ def _bits(data: bytes) -> NDArray[np.uint8]:
 
 
 def decide_again(recording: Recording, bundle: Bundle, backend: str = "") -> NDArray[np.void]:
-    """Return the rows that the messages of `recording` give, ROW (n,)."""
+    """Return the rows that the messages of `recording` give, ROW (n,); the patterns are fixed."""
+    config = recording.header["config"]
+    demand("drive" not in config, "patterns follow from the clicks: lab_walks.py")
+    scores = BACKENDS[backend or config["backend"]](bundle)
+    return run_again(recording, lambda plan: Decisions(plan, scores, config["shots"]))
+
+
+def run_again(recording: Recording, make: Callable[[Plan], Decisions]) -> NDArray[np.void]:
+    """Give the messages of `recording` to what `make` returns for its plan; return the rows."""
     config = recording.header["config"]
     demand("flow" not in config, "objects flow past")
     demand(config["dark"].get("guard", {}).get("policy", "warn") == "warn", "the dark counts decide too")
     plan, arms = sent_plan(recording)
-    scores = BACKENDS[backend or config["backend"]](bundle)
-    run = Decisions(plan, scores, config["shots"])
+    demand(plan.largest == config.get("photon_number_max", 1), "the numbers that were asked for")
+    run = make(plan)
     run.begin(arms.pop(0))
     for _, body in recording.messages:
         kind, session, payload = open_body(body)

@@ -17,7 +17,7 @@ from lab_bundle import MIB, demand, strict_json
 from numpy.typing import NDArray
 
 HEADER, BUNDLE, MESSAGES, COMMANDS, CLOCK, DECISIONS, TIMINGS, EVENTS, END, ANSWERS, TIMING_RUNS = range(1, 12)
-LIMITS = {kind: 2 * MIB for kind in range(1, 12)} | {HEADER: 4 * MIB, BUNDLE: 256 * MIB}
+LIMITS = {kind: 2 * MIB for kind in range(1, 12)} | {HEADER: 4 * MIB, BUNDLE: 64 * MIB}
 VERDICT = [("clicks", "<u4"), ("label", "<u2"), ("flags", "<u4"), ("probability", "<f4"), ("counts_crc", "<u4")]
 PLACE = [("index", "<u8"), ("tick", "<u8"), ("exposure_index", "<u8"), ("object", "<u4"), ("shot", "<u4")]
 ROW = np.dtype([*PLACE, *VERDICT[:2], ("truth", "<i2"), *VERDICT[2:], ("exposures", "<u4")])
@@ -73,7 +73,7 @@ def iter_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, payload) of every block, with the chain of checksums checked."""
     magic, version, chain = struct.unpack_from("<8sII", data)
     demand(magic == b"PANSRECD" and zlib.crc32(data[:12]) == chain, "no recording")
-    demand(version in (2, 3, 4, 5), f"version {version}")
+    demand(version in (2, 3, 4, 5, 6), f"version {version}")
     known = set(LIMITS) - ({ANSWERS} if version == 2 else set()) - ({TIMING_RUNS} if version < 5 else set())
     at, index, kind = 16, 0, 0
     while at < len(data):

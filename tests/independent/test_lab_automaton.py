@@ -6,31 +6,37 @@ import json
 import random
 import struct
 from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, early_leaf, random_automaton
 from lab_automaton import ABSTAINS, read_automaton
 from lab_bundle import Damaged, read_bundle
+from lab_recording import read_recording
+from lab_walks import walk_again
 
 from pans.firmware_sim.resealed.contents import mutated_array
-from pans.runtime.bundle import Automaton, bundle_bytes, parse_bundle, with_expected
+from pans.runtime.bundle import Automaton, bundle_bytes, parse_bundle, with_expected, write_bundle
+from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
 from pans.runtime.decide.automaton import AutomatonDecider
 from pans.runtime.errors import DamagedFileError
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=12), random_automaton(2, slots=5, channels=2)]
+COUNTED = [random_automaton(3, slots=6, outcomes=3), random_automaton(4, slots=4, outcomes=16)]  # version 4
 
 
 @pytest.mark.parametrize("levels", [2, 100, 1000])
-@pytest.mark.parametrize("automaton", AUTOMATA)
+@pytest.mark.parametrize("automaton", [*AUTOMATA, *COUNTED])
 def test_an_automaton_means_the_same(automaton: Automaton, levels: int) -> None:
     made = automaton_bundle(automaton, levels=levels)
     found = read_automaton(read_bundle(bundle_bytes(made)))
     assert np.array_equal(found.patterns, made.pattern_levels)
     light = [found.patterns[p].sum() * made.photons_per_level * d for p, d in zip(found.shows, found.dwell_share)]
     assert light == pytest.approx(made.state_light())
-    words = np.random.default_rng(levels).integers(0, 2, (100, made.n_features))
+    assert found.counts == automaton.counts
+    words = np.random.default_rng(levels).integers(0, automaton.largest + 1, (100, made.n_features))
     decider = make_decider(made)
     for word in words:
         assert found.decide(word.tolist()) == decider.decide(word, 1)
@@ -60,11 +66,12 @@ def accepted(read: object) -> bool:
     return True
 
 
-def test_both_readers_accept_and_refuse_the_same() -> None:
+@pytest.mark.parametrize("automaton", [diamond(), random_automaton(5, slots=3, width=3, outcomes=3)])
+def test_both_readers_accept_and_refuse_the_same(automaton: Automaton) -> None:
     """Arrays changed, checksums made to fit: whatever the one takes, the other takes."""
     facts = {"profile": "p", "task": "t", "split": "s", "objects": 3}
     figures = {"accuracy": 0.5, "clicks": 1.0, "photons": 1.0, "illumination": 2.0, "exposures": 1.5}
-    base = bundle_bytes(with_expected(automaton_bundle(diamond(), levels=2), facts | figures))
+    base = bundle_bytes(with_expected(automaton_bundle(automaton, levels=2), facts | figures))
     dice, taken = random.Random(6), 0
     for number in range(400):
         data = with_one_part_changed(base, dice)
@@ -88,3 +95,28 @@ def with_one_part_changed(data: bytes, dice: random.Random) -> bytes:
     text = json.dumps(header).encode()
     body = data[:12] + struct.pack("<I", len(text)) + text + b"".join(blobs)
     return body + sha256(body).digest()
+
+
+FAULTS = "loss:0.02,duplicate:0.02,flip:0.01"
+
+
+@pytest.mark.parametrize(
+    ("drive", "outcomes", "faults"), [("device", 0, ""), ("host", 3, ""), ("device", 3, FAULTS), ("host", 0, FAULTS)]
+)
+def test_walks_come_out_the_same(tmp_path: Path, drive: str, outcomes: int, faults: str) -> None:
+    """A run with an automaton, of clicks (version 4) and of photon numbers (version 6): every row, bit for bit."""
+    made = automaton_bundle(random_automaton(7, slots=6, outcomes=outcomes), levels=2, photons_per_level=0.25)
+    write_bundle(made, tmp_path / "walk.pans")
+    images = np.random.default_rng(2).integers(0, 256, (20, *made.image_shape)).astype(np.uint8)
+    np.savez(tmp_path / "tiny.npz", images=images, labels=np.arange(20) % 3, classes=np.array(made.classes))
+    more = f"&faults={faults}" if faults else ""
+    device = f"sim:dmd-qcmos?scene={tmp_path / 'tiny.npz'}&seed=5&pace=fast{more}"
+    words = ["--drive", drive, "--decisions", "60", "--trials", "3", "--out", str(tmp_path / "out"), "-q"]
+    main(["run", str(tmp_path / "walk.pans"), "--device", device, *words])
+    data = (tmp_path / "out" / "run.pansrec").read_bytes()
+    assert struct.unpack_from("<I", data, 8) == (6 if outcomes else 4,)
+    recording = read_recording(data)
+    rows = walk_again(recording, read_automaton(read_bundle(recording.bundle)))
+    assert rows.tobytes() == recording.rows.tobytes()
+    assert len(rows) == 60
+    assert (np.count_nonzero(rows["flags"]) > 0) == bool(faults)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import secrets
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from lab_decisions import decide_again
 from lab_recording import read_recording
 from tree import ROOT
 
-from pans.runtime.bundle import Bundle, load_bundle, write_bundle
+from pans.runtime.bundle import Bundle, bundle_bytes, load_bundle, parse_bundle, write_bundle
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.cli import EXIT_DEVICE, main
 from pans.runtime.container import parse_json_object
@@ -40,6 +43,7 @@ class Case:
     order: str = "auto"
     faults: str = ""
     decisions: int = 60
+    outcomes: int = 2  # of an exposure
 
 
 CASES = [
@@ -51,19 +55,25 @@ CASES = [
     Case("sequential", "table", trials=2, order="shot-major", faults=TROUBLE, decisions=3000),
     Case("parallel", "int8", shots=4, trials=3, faults=TROUBLE, decisions=6000),
 ]
+COUNTED = [  # photon numbers: bundles of version 5, recordings of version 6
+    Case("sequential", "table", trials=3, outcomes=4),
+    Case("sequential", "float64", shots=3, trials=2, order="pattern-major", outcomes=3),
+    Case("sequential", "int8", shots=2, order="shot-major", outcomes=16),
+    Case("sequential", "float64", trials=2, order="shot-major", faults=TROUBLE, decisions=2000, outcomes=3),
+]
 
 
-def small_bundle(backend: str) -> Bundle:
+def small_bundle(backend: str, outcomes: int = 2) -> Bundle:
     rng = np.random.default_rng(5)
     levels = rng.integers(0, LEVELS, (D_F, 4)).astype(np.uint16)
     levels[0, 0] = LEVELS - 1
-    parts: dict[str, object] = {"table": rng.normal(size=(1 << D_F, CLASSES)).astype(np.float32)}
+    parts: dict[str, object] = {"table": rng.normal(size=(outcomes**D_F, CLASSES)).astype(np.float32)}
     if backend != "table":
         layers = random_layers([D_F, 24, 10, CLASSES], seed=3)
         parts = {"head_onnx": onnx_chain(layers, "transposed"), "int8_head": quantise_head(layers)}
     scale = PEAK_HZ * EXPOSURE_US * 1e-6 / (LEVELS - 1)
     facts = {"image_shape": (2, 2), "levels": LEVELS, "pattern_levels": levels, "photons_per_level": scale}
-    return made_bundle(D_F, CLASSES, **facts, **parts)
+    return made_bundle(D_F, CLASSES, outcomes=outcomes, **facts, **parts)
 
 
 def small_profile(mode: str) -> str:
@@ -94,19 +104,24 @@ def record(folder: Path, case: Case, bundle: Path) -> Path:
     return folder / "out" / "run.pansrec"
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.mode}-{case.backend}-{bool(case.faults)}")
+@pytest.mark.parametrize(
+    "case", [*CASES, *COUNTED], ids=lambda case: f"{case.mode}-{case.backend}-{bool(case.faults)}-{case.outcomes}"
+)
 def test_decisions_come_out_the_same(tmp_path: Path, case: Case) -> None:
-    write_bundle(small_bundle(case.backend), tmp_path / "small.pans")
+    write_bundle(small_bundle(case.backend, case.outcomes), tmp_path / "small.pans")
     path = record(tmp_path, case, tmp_path / "small.pans")
     recording = read_recording(path.read_bytes())
     assert recording.timings == our_reader(path).timings().tolist()
     assert recording.bundle == (tmp_path / "small.pans").read_bytes()
     assert recording.header["config"]["backend"] == case.backend
+    assert struct.unpack_from("<I", path.read_bytes(), 8)[0] == (6 if case.outcomes > 2 else our_reader(path).version)
     rows = decide_again(recording, read_bundle(recording.bundle))
     for found, logged in zip(rows, recording.rows):
         assert found == logged
     assert rows.tobytes() == recording.rows.tobytes()
     assert len(rows) >= case.decisions // 2
+    if case.outcomes > 2:
+        assert rows["clicks"].max() > D_F * case.shots  # more than a click each
     if case.faults:
         assert 0 < np.count_nonzero(rows["flags"]) < len(rows)
 
@@ -171,3 +186,36 @@ def test_both_readers_notice_every_change(tmp_path: Path) -> None:
         path.write_bytes(changed)
         with pytest.raises(DamagedFileError, match=r"altered|expected|format version"):
             our_reader(path)
+
+
+def test_both_readers_take_and_refuse_the_same_bundles_of_numbers() -> None:
+    """Headers and parts changed, checksums made to fit: whatever the one takes, the other takes."""
+    base = bundle_bytes(made_bundle(3, 2, outcomes=3, table=np.arange(54.0).reshape(27, 2) % 7))
+    length = struct.unpack_from("<I", base, 12)[0]
+
+    def sealed(version: int = 5, table_at: int = -1, **facts: object) -> bytes:
+        header, parts = strict_json(base[16 : 16 + length]), bytearray(base[16 + length : -32])
+        header = {key: value for key, value in {**header, **facts}.items() if value is not None}
+        if table_at >= 0:
+            row = next(one for one in header["parts"] if one["name"] == "table")
+            struct.pack_into("<f", parts, row["offset"] + 4 * table_at, 5.5)
+            row["sha256"] = hashlib.sha256(parts[row["offset"] : row["offset"] + row["length"]]).hexdigest()
+        text = json.dumps(header).encode()
+        body = base[:8] + struct.pack("<II", version, len(text)) + text + bytes(parts)
+        return body + hashlib.sha256(body).digest()
+
+    def taken(data: bytes) -> bool:
+        found = []
+        for read, error in ((lambda: read_bundle(data), Damaged), (lambda: parse_bundle(data, "x"), DamagedFileError)):
+            try:
+                read()
+                found.append(True)
+            except error:
+                found.append(False)
+        assert found[0] == found[1]
+        return found[0]
+
+    assert taken(sealed())
+    wrong = [{"outcomes": 2}, {"outcomes": 4}, {"outcomes": 17}, {"outcomes": None}, {"outcomes": True}, {"version": 4}]
+    assert not any(taken(sealed(**facts)) for facts in [*wrong, {"version": 1}, {"encoder": "automaton"}])
+    assert [taken(sealed(table_at=at)) for at in range(54)].count(True) < 27  # golden rows are most of the 27 words
