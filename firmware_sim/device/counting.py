@@ -19,10 +19,10 @@ from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, stream_key
 from pans.runtime.instrument.count_law import count_chances, counting
 from pans.runtime.wire.inner import inner
-from pans.runtime.wire.messages import ADAPTIVE_PATTERN, DARK_PATTERN
+from pans.runtime.wire.messages import DARK_PATTERN
 
 from .states import ShowList
-from .walking import Walked
+from .walking import Followed, Walked
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -173,14 +173,14 @@ class Counted:
 
     def __init__(self, walked: Walked, largest: int) -> None:
         self.largest = largest
-        self._walked, self._reader = walked, reader_of(walked.model, largest, walked.seed)
+        self._walked, self.reader = walked, reader_of(walked.model, largest, walked.seed)
 
-    def _read(self, first: int, light: F64, numbers: U8) -> None:
+    def read(self, first: int, light: F64, numbers: U8) -> None:
         """Expose once for each of `light`; numbers uint8 (n, 1) are set."""
         walked = self._walked
-        read_each(walked.first_draw + first, light, self._conditions(first, len(light)), self._reader, numbers[:, 0])
+        read_each(walked.first_draw + first, light, self.conditions(first, len(light)), self.reader, numbers[:, 0])
 
-    def _conditions(self, first: int, count: int) -> F64:
+    def conditions(self, first: int, count: int) -> F64:
         """Gain of the light, photoelectrons beside it, whether the detector lives, and by how much readings are lower; float64.
 
         The shape is (count, N_CONDITIONS); asked for in the order of exposures.
@@ -220,7 +220,7 @@ class CountedPlan(Counted):
         shown = program.patterns[np.arange(first, first + count) % program.n_slots]
         for place in np.flatnonzero(shown != DARK_PATTERN).tolist():
             light[place] = self._walked.photoelectrons(first + place, int(shown[place]), 1.0)
-        self._read(first, light, numbers)
+        self.read(first, light, numbers)
         return shown, numbers
 
 
@@ -250,74 +250,36 @@ class CountedShows(Counted):
                 stamps[place] = shown.state
                 light[place] = self._walked.photoelectrons(exposure, shown.pattern, shown.light)
         numbers = np.zeros((count, 1), np.uint8)
-        self._read(first, light, numbers)
+        self.read(first, light, numbers)
         return stamps, numbers
 
 
-class CountedWalk(Counted):
-    """The exposures of an automaton over photon numbers that the device follows."""
+class CountedWalk(Followed):
+    """The photon numbers of an automaton that the device follows."""
 
     def __init__(self, walked: Walked, states: States) -> None:
-        super().__init__(walked, states.successors.shape[1] - 1)
-        self._states = states
-        self._adaptive = walked.program.patterns == ADAPTIVE_PATTERN
-        self._node = 0
-        self._expected: dict[int, float] = {}  # by object of the scene
-        self.ahead = walked.program.n_slots if walked.sample is None else 0
+        super().__init__(walked, states, at_once=walked.sample is None)
+        self.largest = states.successors.shape[1] - 1
+        self._counted = Counted(walked, self.largest)
 
     def prepare(self, exposure: int) -> bool:
         """Nothing: a walk needs no more than the light of its states."""
         return False
 
-    def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
-        """See `SlotSource`."""
-        stamps, numbers = np.empty(count, np.uint16), np.zeros((count, 1), np.uint8)
-        n_slots, at = self._walked.program.n_slots, 0
-        while at < count:
-            slot = (first + at) % n_slots
-            self._node = self._node if slot else 0
-            part = slice(at, at + min(n_slots - slot, count - at))
-            follow = self._at_once if self._walked.sample is None else self._one_by_one
-            follow(first + at, slot, stamps[part], numbers[part])
-            at = part.stop
-        return stamps, numbers
-
-    def expected_photoelectrons(self, number: int) -> float:
-        """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes.
-
-        NaN of one that bleaches: that depends on the walk.
-        """
-        if self._walked.sample is not None:
-            return math.nan
-        found = self._expected.get(number)
-        if found is None:
-            light = self._light(number)
-            chances = _chances(self._walked.model, self.largest + 1, light)
-            found = self._expected[number] = float(expected_light(chances, light, self._states.successors))
-        return found
-
-    def _light(self, number: int) -> F64:
-        """Photoelectrons of an exposure in each state, float64 (states,)."""
-        return np.asarray(self._walked.light.of(number)[self._states.pattern] * self._states.light)
-
-    def _one_by_one(self, first: int, slot: int, stamps: U16, numbers: U8) -> None:
-        """Follow the walk where its light bleaches the object."""
-        states = self._states
-        for place, lit in enumerate(self._adaptive[slot : slot + len(stamps)].tolist()):
-            light, shows = np.zeros(1), lit and self._node < len(states.pattern)
-            if shows:
-                pattern, share = int(states.pattern[self._node]), float(states.light[self._node])
-                light[0] = self._walked.photoelectrons(first + place, pattern, share)
-            self._read(first + place, light, numbers[place : place + 1])
-            stamps[place] = self._node if shows else DARK_PATTERN
-            if shows:
-                self._node = int(states.successors[self._node, numbers[place, 0]])
-
-    def _at_once(self, first: int, slot: int, stamps: U16, numbers: U8) -> None:
-        """Follow the walk through exposures of one cycle in a compiled loop."""
-        walked = self._walked
-        self._node = follow_counts(
-            walked.first_draw + first, self._node, np.append(self._light(walked.object_of(first)), 0.0),
-            self._states.successors, self._adaptive[slot : slot + len(stamps)], self._conditions(first, len(stamps)),
-            self._reader, stamps, numbers[:, 0],
+    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
+        walked, counted = self._walked, self._counted
+        self._state = follow_counts(
+            walked.first_draw + first, self._state, np.append(self._light(walked.object_of(first)), 0.0),
+            self._states.successors, self._adaptive[slot : slot + len(stamps)], counted.conditions(first, len(stamps)),
+            counted.reader, stamps, readings[:, 0],
         )  # fmt: skip
+
+    def _expose(self, exposure: int, light: float, before: U8) -> U8:
+        number = np.zeros((1, 1), np.uint8)
+        self._counted.read(exposure, np.array([light]), number)
+        return number[0]
+
+    def _walk_light(self, light: F64) -> float:
+        return float(
+            expected_light(_chances(self._walked.model, self.largest + 1, light), light, self._states.successors)
+        )

@@ -8,6 +8,7 @@ exposure alone: both ways of driving give the same clicks for the same patterns.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -181,32 +182,81 @@ class ShownSource:
         return stamps, clicks
 
 
-class WalkSource:
-    """The exposures of an automaton that the device follows."""
+class Followed(ABC):
+    """The exposures of an automaton that the device follows, of clicks or of photon numbers."""
 
-    largest = 1
-
-    def __init__(self, walked: Walked, states: States) -> None:
+    def __init__(self, walked: Walked, states: States, *, at_once: bool) -> None:
+        """`at_once`: exposures of a cycle depend on nothing but the walk, so that they can be followed together."""
         self._walked, self._states = walked, states
         self._adaptive = walked.program.patterns == ADAPTIVE_PATTERN
         self._state = 0
-        self._kept: dict[int, U64] = {}
         self._expected: dict[int, float] = {}  # by object of the scene
-        self.ahead = 0 if walked.changing else walked.program.n_slots
+        self.ahead = walked.program.n_slots if at_once else 0
 
     def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
         """See `SlotSource`."""
-        stamps, clicks = np.full(count, DARK_PATTERN, np.uint16), np.zeros((count, 1), np.uint8)
+        stamps, readings = np.full(count, DARK_PATTERN, np.uint16), np.zeros((count, 1), np.uint8)
         n_slots, at = self._walked.program.n_slots, 0
         while at < count:
             slot = (first + at) % n_slots
             if slot == 0:
                 self._state = 0
             part = slice(at, at + min(n_slots - slot, count - at))
-            follow = self._one_by_one if self._walked.changing else self._at_once
-            follow(first + at, stamps[part], clicks[part], before)
-            before, at = clicks[part.stop - 1], part.stop
-        return stamps, clicks
+            follow = self._at_once if self.ahead else self._one_by_one
+            follow(first + at, slot, stamps[part], readings[part], before)
+            before, at = readings[part.stop - 1], part.stop
+        return stamps, readings
+
+    def expected_photoelectrons(self, number: int) -> float:
+        """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes.
+
+        NaN of one that bleaches: that depends on the walk.
+        """
+        if self._walked.sample is not None:
+            return math.nan
+        found = self._expected.get(number)
+        if found is None:
+            found = self._expected[number] = self._walk_light(self._light(number))
+        return found
+
+    def _light(self, number: int) -> F64:
+        """Photoelectrons of an exposure in each state, float64 (states,)."""
+        return np.asarray(self._walked.light.of(number)[self._states.pattern] * self._states.light)
+
+    def _one_by_one(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
+        """Follow the walk where the detector changes with time, or the object with its dose."""
+        walked, states = self._walked, self._states
+        for place, adaptive in enumerate(self._adaptive[slot : slot + len(stamps)].tolist()):
+            light, lit = 0.0, adaptive and self._state < len(states.pattern)
+            if lit:
+                pattern, share = int(states.pattern[self._state]), float(states.light[self._state])
+                light = walked.photoelectrons(first + place, pattern, share)
+            readings[place] = before = self._expose(first + place, light, before)
+            if lit:
+                stamps[place] = self._state
+                self._state = int(states.successors[self._state, before[0]])
+
+    @abstractmethod
+    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
+        """Follow the walk through exposures of one cycle in a compiled loop; stamps (n,) and readings (n, 1) are set."""
+
+    @abstractmethod
+    def _expose(self, exposure: int, light: float, before: U8) -> U8:
+        """Draw one exposure with `light` photoelectrons expected, uint8 (1,), as `before` of the exposure before."""
+
+    @abstractmethod
+    def _walk_light(self, light: F64) -> float:
+        """The light of a walk in expectation, from that of its states (states,)."""
+
+
+class WalkSource(Followed):
+    """The clicks of an automaton that the device follows."""
+
+    largest = 1
+
+    def __init__(self, walked: Walked, states: States) -> None:
+        super().__init__(walked, states, at_once=not walked.changing)
+        self._kept: dict[int, U64] = {}
 
     def prepare(self, exposure: int) -> bool:
         """See `SlotSource`: the thresholds of one of the objects to come."""
@@ -222,52 +272,23 @@ class WalkSource:
                 return True
         return False
 
-    def expected_photoelectrons(self, number: int) -> float:
-        """The photoelectrons that a walk on object `number` of the scene brings, in expectation and without what changes.
-
-        NaN of one that bleaches: that depends on the walk.
-        """
-        if self._walked.sample is not None:
-            return math.nan
-        found = self._expected.get(number)
-        if found is None:
-            from . import walk_kernels
-
-            light = self._light(number)
-            probability = walk_kernels.chances(self._walked.model, light)
-            found = self._expected[number] = float(
-                walk_kernels.expected_light(probability, light, self._states.successors)
-            )
-        return found
-
-    def _light(self, number: int) -> F64:
-        """Photoelectrons of an exposure in each state, float64 (states,)."""
-        return np.asarray(self._walked.light.of(number)[self._states.pattern] * self._states.light)
-
-    def _at_once(self, first: int, stamps: U16, clicks: U8, before: U8) -> None:
-        """Follow the walk through exposures of one cycle in a compiled loop."""
+    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
         from . import walk_kernels
 
         walked = self._walked
-        slot = first % walked.program.n_slots
         self._state = walk_kernels.follow(
             self._thresholds(walked.object_of(first)), self._states.successors, self._adaptive[slot : slot + len(stamps)],
-            walk_kernels.key_of(walked.seed), walked.first_draw + first, (self._state, int(before[0])), stamps, clicks[:, 0],
+            walk_kernels.key_of(walked.seed), walked.first_draw + first, (self._state, int(before[0])), stamps, readings[:, 0],
         )  # fmt: skip
 
-    def _one_by_one(self, first: int, stamps: U16, clicks: U8, before: U8) -> None:
-        """Follow the walk where the detector changes with time, or the object with its dose."""
-        walked, states = self._walked, self._states
-        for place, exposure in enumerate(range(first, first + len(stamps))):
-            lit = self._adaptive[exposure % walked.program.n_slots] and self._state < len(states.pattern)
-            light = 0.0
-            if lit:
-                pattern, share = int(states.pattern[self._state]), float(states.light[self._state])
-                light = walked.photoelectrons(exposure, pattern, share)
-            clicks[place] = before = walked.click(exposure, light, before)
-            if lit:
-                stamps[place] = self._state
-                self._state = int(states.successors[self._state, before[0]])
+    def _expose(self, exposure: int, light: float, before: U8) -> U8:
+        return self._walked.click(exposure, light, before)
+
+    def _walk_light(self, light: F64) -> float:
+        from . import walk_kernels
+
+        chances = walk_kernels.chances(self._walked.model, light)
+        return float(walk_kernels.expected_light(chances, light, self._states.successors))
 
     def _thresholds(self, number: int) -> U64:
         """What a number must be below to click, uint64 (2, states + 1): without and with a click before, the last column in the dark."""

@@ -7,6 +7,8 @@ exact in this; where several walks meet, their mean stands for all of them, whic
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -15,6 +17,14 @@ from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.detector import Afterpulses
 
 F64 = NDArray[np.float64]
+
+
+class _Sums(NamedTuple):
+    """As `Remembered` has them."""
+
+    chance: F64
+    memory: F64
+    ends: F64
 
 
 class Remembered:
@@ -26,10 +36,10 @@ class Remembered:
 
     def __init__(self, automaton: Automaton, afterpulses: Afterpulses, n: int, begins: float) -> None:
         self._automaton, self._afterpulses = automaton, afterpulses
-        self.chance = np.zeros((2, n, len(automaton.posteriors)))
-        self.memory = np.zeros_like(self.chance)
+        nodes = (2, n, len(automaton.posteriors))
+        self._sums = _Sums(np.zeros(nodes), np.zeros(nodes), np.zeros(n))
+        self.chance, self.memory, self.ends = self._sums
         self.chance[0, :, 0], self.memory[0, :, 0] = 1.0, begins
-        self.ends = np.zeros(n)
         self._of_law = np.array([afterpulses.decay, *afterpulses.steps])
 
     def go_on(self, states: NDArray[np.int64], mean: F64) -> tuple[F64, F64]:
@@ -41,16 +51,19 @@ class Remembered:
         reached = self.chance[:, :, states].sum(axis=0)
         clicks = np.zeros(len(mean))
         behind = automaton.n_slots - 1 - int(automaton.depth[states[0]])
-        _pass_memory_on(
-            self.chance, self.memory, states, automaton.successors, mean, self._of_law, clicks, self.ends,
-            self._afterpulses.after_silences(behind), automaton.n_states,
-        )  # fmt: skip
+        left_behind = self._afterpulses.after_silences(behind)
+        _pass_memory_on(self._sums, states, automaton.successors, mean, self._of_law, left_behind, clicks)
         return reached, clicks
 
 
 @njit(cache=True, nogil=True)
-def _pass_memory_on(chance, memory, states, successors, mean, of_law, clicks, ends, left_behind, n_states):  # type: ignore[no-untyped-def]
-    """Add what leaves `states` (m,) to its successors, with its memory; of_law: decay and the four steps of `Afterpulses`."""
+def _pass_memory_on(sums, states, successors, mean, of_law, left_behind, clicks):  # type: ignore[no-untyped-def]
+    """Add what leaves `states` (m,) to its successors in `sums`, with its memory, and the expected clicks to `clicks` (objects,).
+
+    of_law float64 (5,): decay and the four steps of `Afterpulses`; left_behind: what is left of a memory when the slots behind are over.
+    """
+    chance, memory, ends = sums
+    n_states = successors.shape[0]
     decay, fixed, per_mean, per_memory, in_pause = of_law[0], of_law[1], of_law[2], of_law[3], of_law[4]
     for before in range(2):
         for i in range(mean.shape[0]):

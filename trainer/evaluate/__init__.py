@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .accuracy import Light, Measured, MeasuredPictures, light_of
-    from .held_out import Conditions, evaluate, measure
+    from .accuracy import Conditions, Light, Measured, MeasuredPictures, light_of
+    from .held_out import evaluate, measure
 
 __all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "evaluate", "light_of", "measure"]
 
@@ -21,7 +21,7 @@ __getattr__ = lazy_names(
         "Measured": ".accuracy",
         "MeasuredPictures": ".accuracy",
         "light_of": ".accuracy",
-        "Conditions": ".held_out",
+        "Conditions": ".accuracy",
         "evaluate": ".held_out",
         "measure": ".held_out",
     },

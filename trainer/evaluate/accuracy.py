@@ -36,6 +36,27 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the objects are shown: by default through the profile that the bundle was trained for, as it is."""
+
+    profile: str | None = None
+    eta: float = 1.0  # all light times this
+    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
+    seed: int = 0  # of the trials
+    data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
+    confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
+    imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
+    bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
+
+    def imaging_on(self, profile: Profile) -> Imaging:
+        """Return how objects stand on the grid of the patterns, on `profile`."""
+        return profile.imaging() if self.imaging is None else self.imaging
+
+
+AS_IT_IS = Conditions()
+
+
+@dataclass(frozen=True, slots=True)
 class Measured:
     """Means per decision. `accuracy_std` is the spread over trials, `accuracy_se_objects` the error from having few objects."""
 

@@ -16,7 +16,9 @@ from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.tasks.remembered import remembered_task
 
 from .accuracy import (
+    AS_IT_IS,
     EXACT_OUTCOMES_MAX,
+    Conditions,
     Measured,
     MeasuredPictures,
     evaluate_exactly,
@@ -32,20 +34,6 @@ PICTURE_TRIALS = 3  # a picture is hundreds of numbers
 EXACT_NUMBERS_MAX = (
     1 << 16
 )  # vectors of photon numbers that are gone through unasked: ten thousand objects in half a minute
-
-
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """How the objects are shown: by default through the profile that the bundle was trained for, as it is."""
-
-    profile: str | None = None
-    eta: float = 1.0  # all light times this
-    dark: float | None = None  # dark photoelectrons per exposure, instead of the profile's
-    seed: int = 0  # of the trials
-    data_seed: int | None = None  # of a drawn task; None: that of the bundle's training
-    confidence: float = 0.0  # of an automaton: it decides as soon as a class is that sure, and abstains below it
-    imaging: Imaging | None = None  # how objects stand on the grid of the patterns; None: as the profile states
-    bleaching: Bleaching = NO_BLEACHING  # what the light does to the objects, each of them fresh when it comes
 
 
 def trained_bleaching(bundle: Bundle) -> Bleaching:
@@ -78,7 +66,7 @@ def evaluate(
     exact: bool = True,
     objects: int | None = None,
     data_dir: str | Path | None = None,
-    conditions: Conditions = Conditions(),
+    conditions: Conditions = AS_IT_IS,
 ) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` (or the .pans file at that path) decides on held-out objects, per decision of `shots` shots.
 
@@ -127,7 +115,7 @@ def held_out_of(
 
 def imaging_on(held_out: HeldOut, conditions: Conditions) -> Imaging:
     """Return how the objects stand on the grid of the patterns."""
-    return held_out.profile.imaging() if conditions.imaging is None else conditions.imaging
+    return conditions.imaging_on(held_out.profile)
 
 
 def measure(
@@ -136,7 +124,7 @@ def measure(
     *,
     shots: int = 1,
     trials: int | None = None,
-    conditions: Conditions = Conditions(),
+    conditions: Conditions = AS_IT_IS,
 ) -> Measured | MeasuredPictures | MeasuredWalks:
     """Return what `bundle` decides on the objects: from `trials` decisions per object, or exact without (not of pictures)."""
     objects = held_out.objects
@@ -170,27 +158,15 @@ def walks_on(
     *,
     shots: int = 1,
     trials: int | None = None,
-    conditions: Conditions = Conditions(),
+    conditions: Conditions = AS_IT_IS,
 ) -> Walks:
     """Return what the automaton of `bundle` does on the objects: `trials` walks of each, or exact without."""
     if shots != 1:
         raise ValueError(
             f"shots is {shots}, allowed with an automaton: 1 (a walk is one shot; several are several trials)"
         )
-    objects, told = held_out.objects, conditions
-    return walks_of(
-        bundle,
-        held_out.profile,
-        objects.images,
-        objects.labels,
-        eta=told.eta,
-        dark=told.dark,
-        confidence=told.confidence,
-        trials=trials,
-        seed=told.seed,
-        imaging=imaging_on(held_out, told),
-        bleaching=told.bleaching,
-    )
+    objects = held_out.objects
+    return walks_of(bundle, held_out.profile, objects.images, objects.labels, conditions, trials)
 
 
 def afterpulses_in(bundle: Bundle, held_out: HeldOut, shots: int = 1, trials: int | None = None) -> str:

@@ -15,8 +15,8 @@ import numpy as np
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import Imaging, Tolerance
 
-from .accuracy import Measured
-from .held_out import Conditions, HeldOut, measure, trials_needed
+from .accuracy import AS_IT_IS, Conditions, Measured
+from .held_out import HeldOut, measure, trials_needed
 from .walks import MeasuredWalks
 
 CURVES: Mapping[str, tuple[float, ...]] = {
@@ -25,7 +25,6 @@ CURVES: Mapping[str, tuple[float, ...]] = {
     "psf_px": (0.0, 0.3, 0.5, 0.7, 0.9, 1.2),
     "black": (0.0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02),
 }
-AS_IT_IS = Conditions()
 DRAW_STREAM = 0xD7A  # beside the seed
 Figures = Measured | MeasuredWalks
 Told = Callable[[int, int], None]

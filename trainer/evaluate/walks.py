@@ -18,15 +18,15 @@ from pans.runtime.bundle.automaton import Automaton, stopped
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.bundle.walks import EXPECTED_KEYS
 from pans.runtime.decide.automaton import leaf_verdicts
-from pans.runtime.decide.expectation import expected_walk, pattern_light
+from pans.runtime.decide.expectation import ExpectedWalk, expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses, afterpulses_of
-from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, met
+from pans.runtime.imaging import Bleaching, Imaging, met
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
-from .accuracy import demand_sequence, exposure_of, outcome_law_of
+from .accuracy import AS_IT_IS, Conditions, demand_sequence, exposure_of, outcome_law_of
 from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
@@ -96,62 +96,94 @@ def walks_of(
     profile: Profile,
     images: NDArray[np.uint8],
     labels: NDArray[np.int64],
-    *,
-    eta: float = 1.0,
-    dark: float | None = None,
-    confidence: float = 0.0,
+    conditions: Conditions = AS_IT_IS,
     trials: int | None = None,
-    seed: int = 0,
-    imaging: Imaging = IDENTITY,
-    bleaching: Bleaching = NO_BLEACHING,
 ) -> Walks:
     """Show the automaton of `bundle` to `images` (n, height, width) through `profile`; exact, or `trials` walks per object.
 
-    `eta` scales the light, `dark` replaces the profile's dark photoelectrons per exposure, `confidence` stops early, `imaging`
-    is how the object stands on the grid of the patterns, `bleaching` what the light of a walk does to it: that needs `trials`, as what is
-    left in a state depends on the walk to it. ValueError for what does not fit.
+    `conditions` say how; their profile and data seed are the caller's to follow. Bleaching needs `trials`, as what is left in a state
+    depends on the walk to it. ValueError for what does not fit.
     """
+    whole = _fitting(bundle, profile, images, conditions, trials)
+    law = outcome_law_of(bundle, profile, conditions.eta, conditions.dark)
+    automaton = stopped(whole, conditions.confidence) if conditions.confidence else whole
+    leaf_labels = leaf_verdicts(automaton, conditions.confidence).labels
+    step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
+    step = step if conditions.bleaching.is_none else min(step, BLEACHED_AT_ONCE)
+    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
+    shown = _Shown(
+        automaton, _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
+    )
+    begins, rng = 0.0, np.random.default_rng(conditions.seed)
+    if trials is None and afterpulses.time:
+        few = object_transmission(profile, _spread(images, min(step, BEGIN_OBJECTS)).reshape(-1, bundle.n_pixels))
+        begins = _begins(shown, few, law, afterpulses)
+    parts: list[Walks] = []
+    for start in range(0, len(images), step):
+        part = images[start : start + step]
+        seen = object_transmission(profile, part.reshape(len(part), -1))
+        if trials is None:
+            sums = _sums_of(_expected(shown, seen, law, afterpulses, begins))
+        else:
+            lit = _lit(shown, seen, conditions.bleaching)
+            sums = _sampled(automaton, lit, shown.illumination, (law, afterpulses), trials, rng)
+        parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
+    return _together(parts, trials or 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shown:
+    """What is walked: the automaton, its patterns (n, pixels) as they meet the object, and photoelectrons per level."""
+
+    automaton: Automaton
+    patterns: NDArray[Any]
+    scale: float
+
+    @property
+    def illumination(self) -> F64:
+        """Of one exposure of each pattern, float64 (n,)."""
+        return np.asarray(self.patterns.sum(axis=1, dtype=np.float64) * self.scale)
+
+
+def _fitting(
+    bundle: Bundle, profile: Profile, images: NDArray[np.uint8], conditions: Conditions, trials: int | None
+) -> Automaton:
+    """Return the automaton of `bundle`; ValueError where bundle, images, conditions and trials do not fit each other."""
     if bundle.automaton is None:
         raise ValueError(f"{bundle.name} has no automaton")
     if images.shape[1:] != bundle.image_shape:
         raise ValueError(f"images are {images.shape[1:]}, allowed with {bundle.name}: {bundle.image_shape}")
     if trials is not None and trials < 1:
         raise ValueError(f"trials is {trials}, allowed: 1 or more")
-    if not bleaching.is_none:
+    if not conditions.bleaching.is_none:
         demand_sequence(profile)
         if trials is None:
             raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
-    law = outcome_law_of(bundle, profile, eta, dark)
-    automaton = stopped(bundle.automaton, confidence) if confidence else bundle.automaton
-    leaf_labels = leaf_verdicts(automaton, confidence).labels
-    parts: list[Walks] = []
-    step = max(1, min(_LEAF_NUMBERS // automaton.n_leaves, _LIGHT_NUMBERS // bundle.n_patterns))
-    step = step if bleaching.is_none else min(step, BLEACHED_AT_ONCE)
-    rng, scale = np.random.default_rng(seed), bundle.photons_per_level * eta
-    afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
-    patterns: NDArray[Any] = bundle.pattern_levels
-    if not imaging.is_identity:
-        patterns = met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
-    begins = 0.0
-    if trials is None and afterpulses.time:
-        few = object_transmission(profile, _spread(images, min(step, BEGIN_OBJECTS)).reshape(-1, bundle.n_pixels))
-        begins = _begins(automaton, patterns, few, law, scale, afterpulses)
-    for start in range(0, len(images), step):
-        part = images[start : start + step]
-        seen = object_transmission(profile, part.reshape(len(part), -1))
-        sums: _Sums
-        if trials is None:
-            found = expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
-            sums = (found.clicks, found.photons, found.illumination, found.exposures, found.leaves)
-        else:
-            lit: _Lit = _Steady(automaton, patterns, seen, scale)
-            if not bleaching.is_none:
-                lit = BleachedObjects(automaton, patterns, seen, scale, bleaching)
-            sums = _sampled(
-                automaton, lit, patterns.sum(axis=1, dtype=np.float64) * scale, (law, afterpulses), trials, rng
-            )
-        parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
-    return _together(parts, trials or 0)
+    return bundle.automaton
+
+
+def _patterns(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
+    """The patterns in levels, as they meet the object."""
+    if imaging.is_identity:
+        return bundle.pattern_levels
+    return met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
+
+
+def _lit(shown: _Shown, seen: F64, bleaching: Bleaching) -> _Lit:
+    what = shown.automaton, shown.patterns, seen, shown.scale
+    return _Steady(*what) if bleaching.is_none else BleachedObjects(*what, bleaching)
+
+
+def _expected(
+    shown: _Shown, seen: F64, law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: float
+) -> ExpectedWalk:
+    return expected_walk(
+        shown.automaton, shown.patterns, seen, law, shown.scale, afterpulses=afterpulses, begins=begins
+    )
+
+
+def _sums_of(found: ExpectedWalk) -> _Sums:
+    return found.clicks, found.photons, found.illumination, found.exposures, found.leaves
 
 
 def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
@@ -159,18 +191,11 @@ def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return images[np.linspace(0, len(images) - 1, min(count, len(images))).astype(np.int64)]
 
 
-def _begins(
-    automaton: Automaton,
-    patterns: NDArray[Any],
-    seen: NDArray[Any],
-    law: ClickLaw | CountLaw,
-    scale: float,
-    afterpulses: Afterpulses,
-) -> float:
+def _begins(shown: _Shown, seen: F64, law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> float:
     """The detector's memory when an object comes: the mean of what the objects before leave, which begin with it themselves."""
     begins = 0.0
     for _ in range(BEGIN_ROUNDS):
-        found = expected_walk(automaton, patterns, seen, law, scale, afterpulses=afterpulses, begins=begins)
+        found = _expected(shown, seen, law, afterpulses, begins)
         assert found.ends is not None
         begins = float(found.ends.mean())
     return begins

@@ -24,7 +24,7 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import outcome_law_of
+from pans.trainer.evaluate.accuracy import Conditions, outcome_law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -76,9 +76,7 @@ def export_automaton(
     bundle = with_tolerance(bundle, task, profile, trained.options.optics, trained.options.dark)
     difference = compare_walks(bundle, trained, task, profile)
     dark = trained.options.dark
-    found = measured_walks(
-        walks_of(bundle, profile, task.test.images, task.test.labels, dark=dark, imaging=profile.imaging())
-    )
+    found = measured_walks(walks_of(bundle, profile, task.test.images, task.test.labels, Conditions(dark=dark)))
     first = measure_walks(bundle, task.test.first(FIRST_OBJECTS), profile, dark)
     expected = expected_figures(found, profile.name, task.name, "test")
     with whole_file(path, force=force) as unchecked:
@@ -124,7 +122,7 @@ def bundle_of(
 def measure_walks(bundle: Bundle, objects: Objects, profile: Profile, dark: float | None = None) -> WalkFigures:
     """Return what the automaton of `bundle` does on `objects` through `profile`, exactly."""
     return walk_figures(
-        measured_walks(walks_of(bundle, profile, objects.images, objects.labels, dark=dark, imaging=profile.imaging()))
+        measured_walks(walks_of(bundle, profile, objects.images, objects.labels, Conditions(dark=dark)))
     )
 
 

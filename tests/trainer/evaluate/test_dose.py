@@ -85,13 +85,13 @@ def test_walks_before_samples_that_bleach_are_those_of_all_words(mixed: bool) ->
                 node = int(automaton.successors[node, click])
             wanted[row, node - automaton.n_states] += chance
             photons[row] += chance * spent
-    found = walks_of(bundle, IDEAL, IMAGES, LABELS, trials=trials, bleaching=law, dark=0.0)
+    found = walks_of(bundle, IDEAL, IMAGES, LABELS, Conditions(bleaching=law, dark=0.0), trials=trials)
     by_class = np.stack([wanted[label == LABELS].sum(axis=0) for label in range(3)])
     error = 5 * np.sqrt(by_class / trials) + 1e-3
     assert (np.abs(found.by_class - by_class) <= error).all()
     assert found.photons.mean() == pytest.approx(photons.mean(), rel=5 / math.sqrt(trials * len(IMAGES)))
     with pytest.raises(ValueError, match="sample trials instead"):
-        walks_of(bundle, IDEAL, IMAGES, LABELS, bleaching=law)
+        walks_of(bundle, IDEAL, IMAGES, LABELS, Conditions(bleaching=law))
 
 
 def test_a_table_of_the_first_patterns_sums_over_the_others() -> None:

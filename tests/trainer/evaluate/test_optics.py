@@ -50,7 +50,7 @@ def test_a_moved_object_brings_the_light_of_moved_pixels() -> None:
 @pytest.mark.parametrize("trials", [None, 40])
 def test_an_automaton_walks_as_before_moved_objects(trials: int | None) -> None:
     bundle = automaton_bundle(six_states(), photons=1.5)
-    moved = measured_walks(walks_of(bundle, IDEAL, IMAGES, LABELS, imaging=TABLE, trials=trials))
+    moved = measured_walks(walks_of(bundle, IDEAL, IMAGES, LABELS, Conditions(imaging=TABLE), trials=trials))
     by_hand = measured_walks(walks_of(bundle, IDEAL, MOVED, LABELS, trials=trials))
     assert moved.photons_mean == pytest.approx(by_hand.photons_mean, rel=1e-12)
     assert moved.accuracy_mean == pytest.approx(by_hand.accuracy_mean, rel=1e-12)

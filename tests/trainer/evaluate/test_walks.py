@@ -66,7 +66,7 @@ def by_hand(model: Bundle, dark: float, eta: float, confidence: float) -> dict[s
 @pytest.mark.parametrize(("dark", "eta", "confidence"), [(0.02, 1.0, 0.0), (0.0, 2.0, 0.7)])
 def test_exact_figures_are_sums_over_all_words(dark: float, eta: float, confidence: float) -> None:
     model = bundle()
-    walks = walks_of(model, PROFILE, IMAGES, LABELS, dark=dark, eta=eta, confidence=confidence)
+    walks = walks_of(model, PROFILE, IMAGES, LABELS, Conditions(dark=dark, eta=eta, confidence=confidence))
     found, wanted = measured_walks(walks), by_hand(model, dark, eta, confidence)
     assert found.accuracy_mean == pytest.approx(wanted["right"] / wanted["decided"], rel=1e-9)
     assert found.abstained == pytest.approx(1 - wanted["decided"] / 60, abs=1e-9)
@@ -87,8 +87,10 @@ def test_trials_agree_with_the_expectation_within_their_error(afterpulse: float)
     """400 walks of each object; 5 standard errors, seed fixed."""
     model, trials = bundle(), 400
     profile = replace(PROFILE, detector=replace(PROFILE.detector, afterpulse_probability=afterpulse))
-    exact = measured_walks(walks_of(model, profile, IMAGES, LABELS, dark=0.02, confidence=0.7))
-    sampled = measured_walks(walks_of(model, profile, IMAGES, LABELS, dark=0.02, confidence=0.7, trials=trials, seed=4))
+    exact = measured_walks(walks_of(model, profile, IMAGES, LABELS, Conditions(dark=0.02, confidence=0.7)))
+    sampled = measured_walks(
+        walks_of(model, profile, IMAGES, LABELS, Conditions(dark=0.02, confidence=0.7, seed=4), trials=trials)
+    )
     assert abs(sampled.accuracy_mean - exact.accuracy_mean) < 5 * exact.accuracy_std / math.sqrt(trials)
     n = len(LABELS) * trials
     assert abs(sampled.abstained - exact.abstained) < 5 * math.sqrt(0.25 / n)
@@ -101,8 +103,10 @@ def test_trials_agree_with_the_expectation_within_their_error(afterpulse: float)
 
 def test_the_spread_over_trials_is_that_of_trials() -> None:
     model = bundle()
-    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, confidence=0.7))
-    runs = [walks_of(model, PROFILE, IMAGES, LABELS, confidence=0.7, trials=1, seed=seed) for seed in range(300)]
+    exact = measured_walks(walks_of(model, PROFILE, IMAGES, LABELS, Conditions(confidence=0.7)))
+    runs = [
+        walks_of(model, PROFILE, IMAGES, LABELS, Conditions(confidence=0.7, seed=seed), trials=1) for seed in range(300)
+    ]
     spread = float(np.std([measured_walks(run).accuracy_mean for run in runs], ddof=1))
     assert spread == pytest.approx(exact.accuracy_std, rel=0.2)  # five times 1 / sqrt(2 * 300)
 
@@ -121,7 +125,7 @@ def test_calibration_compares_probability_and_accuracy() -> None:
     labels[:10], labels[40:50] = 1, 0
     ideal = load_profile("ideal")
     for sure in (0.75, 0.95):
-        walks = walks_of(two_leaves(sure), ideal, images, labels, dark=0.0, eta=50.0)
+        walks = walks_of(two_leaves(sure), ideal, images, labels, Conditions(dark=0.0, eta=50.0))
         (only,) = calibration_bins(walks)
         assert (only.share, only.accuracy) == pytest.approx((1.0, 0.75), abs=1e-9)
         assert only.probability == pytest.approx(sure, abs=1e-6)
@@ -129,7 +133,7 @@ def test_calibration_compares_probability_and_accuracy() -> None:
 
 
 def test_nothing_decided_is_no_accuracy() -> None:
-    found = measured_walks(walks_of(two_leaves(0.6), PROFILE, IMAGES, LABELS % 2, confidence=0.99))
+    found = measured_walks(walks_of(two_leaves(0.6), PROFILE, IMAGES, LABELS % 2, Conditions(confidence=0.99)))
     assert found.accuracy_mean is None
     assert found.accuracy_std is None
     assert found.abstained == 1.0
@@ -227,7 +231,7 @@ def test_dark_counts_do_not_follow_the_dwell() -> None:
     short = Automaton(automaton.pattern, np.ones_like(automaton.dwell), 8, automaton.successors, automaton.posteriors)
     ideal = load_profile("ideal")
     for one in (automaton, short):
-        found = measured_walks(walks_of(automaton_bundle(one), ideal, IMAGES, LABELS, dark=0.3, eta=0.0))
+        found = measured_walks(walks_of(automaton_bundle(one), ideal, IMAGES, LABELS, Conditions(dark=0.3, eta=0.0)))
         assert found.clicks_mean == pytest.approx((1 - math.exp(-0.3)) * found.exposures_mean, rel=1e-12)
 
 
@@ -260,10 +264,10 @@ def test_photon_numbers_are_summed_over_all_words() -> None:
             right = decider.decide_leaf(states.leaf).label == label
             seen = sum(word[: len(states.states)])
             sums += chance * np.array([right, seen, light[states.states].sum(), len(states.states)])
-    found = measured_walks(walks_of(model, COUNTING, images, labels, dark=0.02))
+    found = measured_walks(walks_of(model, COUNTING, images, labels, Conditions(dark=0.02)))
     wanted = (found.accuracy_mean, found.clicks_mean, found.photons_mean, found.exposures_mean)
     np.testing.assert_allclose(sums / 6, wanted, rtol=1e-9)
-    drawn = measured_walks(walks_of(model, COUNTING, images, labels, dark=0.02, trials=3000, seed=1))
+    drawn = measured_walks(walks_of(model, COUNTING, images, labels, Conditions(dark=0.02, seed=1), trials=3000))
     assert abs(drawn.clicks_mean - found.clicks_mean) < 5 * 3 * 4 / math.sqrt(6 * 3000)
     assert abs(drawn.accuracy_mean - found.accuracy_mean) < 5 * found.accuracy_std / math.sqrt(3000)
 
