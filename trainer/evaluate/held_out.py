@@ -18,7 +18,6 @@ from pans.trainer.tasks.remembered import remembered_task
 from .accuracy import (
     AS_IT_IS,
     EXACT_OUTCOMES_MAX,
-    Conditions,
     Measured,
     MeasuredPictures,
     evaluate_exactly,
@@ -26,6 +25,7 @@ from .accuracy import (
     evaluate_sampled,
     light_of,
 )
+from .accuracy import Conditions as Conditions
 from .walks import MeasuredWalks, Walks, measured_walks, walks_of
 
 DEFAULT_PROFILE = "oled-qcmos"

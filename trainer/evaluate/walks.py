@@ -169,13 +169,13 @@ def _patterns(bundle: Bundle, imaging: Imaging) -> NDArray[Any]:
     return met(imaging, bundle.pattern_levels.astype(np.float64), bundle.image_shape, bundle.levels - 1.0)
 
 
-def _lit(shown: _Shown, seen: F64, bleaching: Bleaching) -> _Lit:
+def _lit(shown: _Shown, seen: NDArray[Any], bleaching: Bleaching) -> _Lit:
     what = shown.automaton, shown.patterns, seen, shown.scale
     return _Steady(*what) if bleaching.is_none else BleachedObjects(*what, bleaching)
 
 
 def _expected(
-    shown: _Shown, seen: F64, law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: float
+    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: float
 ) -> ExpectedWalk:
     return expected_walk(
         shown.automaton, shown.patterns, seen, law, shown.scale, afterpulses=afterpulses, begins=begins
@@ -191,7 +191,7 @@ def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return images[np.linspace(0, len(images) - 1, min(count, len(images))).astype(np.int64)]
 
 
-def _begins(shown: _Shown, seen: F64, law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> float:
+def _begins(shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> float:
     """The detector's memory when an object comes: the mean of what the objects before leave, which begin with it themselves."""
     begins = 0.0
     for _ in range(BEGIN_ROUNDS):
