@@ -290,7 +290,7 @@ def _bits(data: bytes) -> NDArray[np.uint8]:
 def decide_again(recording: Recording, bundle: Bundle, backend: str = "") -> NDArray[np.void]:
     """Return the rows that the messages of `recording` give, ROW (n,); the patterns are fixed."""
     config = recording.header["config"]
-    demand("drive" not in config, "patterns follow from the clicks: lab_walks.py")
+    demand("drive" not in config, "patterns follow from the clicks: lab_automaton.py")
     scores = BACKENDS[backend or config["backend"]](bundle)
     return run_again(recording, lambda plan: Decisions(plan, scores, config["shots"]))
 

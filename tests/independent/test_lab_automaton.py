@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, early_leaf, random_automaton
-from lab_automaton import ABSTAINS, read_automaton
+from lab_automaton import ABSTAINS, read_automaton, walk_again
 from lab_bundle import Damaged, read_bundle
 from lab_recording import read_recording
-from lab_walks import walk_again
 
 from pans.firmware_sim.resealed.contents import mutated_array
 from pans.runtime.bundle import Automaton, bundle_bytes, parse_bundle, with_expected, write_bundle
