@@ -50,6 +50,7 @@ from pans.runtime.wire.messages import (
 from pans.runtime.wire.schema import SCHEMA
 
 from . import ingest
+from .flow_turn import flow_row
 from .rows import BenchOptions, Row, cpu_times, per_item_ns, percentiles_us
 from .turn_c import DEVICE, built, loop_in_c
 from .walks import CLICK, SESSION, made_automaton, sequential_plan
@@ -62,7 +63,7 @@ ROUNDS = 5
 
 
 def bench_turn(options: BenchOptions) -> list[Row]:
-    """Return the rows of the work per block and per frame, then of round trips over a pseudo-terminal and TCP."""
+    """Return the rows of the work per block and per frame, still and in flow, then of round trips over a pseudo-terminal and TCP."""
     if why := offered():
         return [{"name": "turn", "skipped": why}]
     walking = made_automaton()
@@ -71,6 +72,7 @@ def bench_turn(options: BenchOptions) -> list[Row]:
         rows = [
             _block_row(walking, folder, options.quick),
             _frame_row(load_bundle(options.first_bundle)[0], folder, options.quick),
+            flow_row(load_bundle(options.first_bundle)[0], options.quick),
         ]
         return rows + _trips(walking, folder, options.quick)
 

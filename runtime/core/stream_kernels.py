@@ -24,7 +24,8 @@ N_DECISIONS, N_ABSTAINED, LAST_TICK, JITTER = range(OBJECT + 1, OBJECT + 5)
 EXPOSURE_TICKS, VISIT_EXPOSURES, SHOTS, START_TICK, PERIOD_TICKS, CYCLE_TICKS, N_CLASSES = range(JITTER + 1, JITTER + 8)
 # blocks that may be taken before the kernel returns, and then no marks (0: any number); the kind of the plan's blocks
 STEPS, KIND, N_STATE = range(N_CLASSES + 1, N_CLASSES + 4)
-ALL_DONE, ROWS_FULL, ODD, TOOK_MARK, TOOK_BLOCK = range(5)  # what `walk_messages` and `take_message` return
+# what `walk_messages` and `take_message` return; TOOK_URGENT is a block of which the caller must know at once (flow/deciding.py's alone)
+ALL_DONE, ROWS_FULL, ODD, TOOK_MARK, TOOK_BLOCK, TOOK_URGENT = range(6)
 MARK_SLOTS = 4096  # as many objects as follower.MAX_MARKS
 
 _U = np.uint64

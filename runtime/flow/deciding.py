@@ -40,6 +40,8 @@ _HALF, _PART, _WATCHED = 1 << (Q - 1), (1 << Q) - 1, WATCHED_FRAMES
 def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
     """As core/stream_kernels.py's, of a flow: the message from `start` to `stop`, uint64; TOOK_MARK, TOOK_BLOCK or ODD.
 
+    TOOK_URGENT is a block of which a pulse is asked for.
+
     A mark is only counted: who compares decisions with the truth looks for it in what was kept.
     """
     state, flow = walk.state, walk.flow
@@ -68,7 +70,8 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
     else:
         _take_bars(walk, behind, origin)
         flow.state[kernels.NEXT] = behind
-    return core.TOOK_BLOCK
+    asks, state[columns.ASKS] = state[columns.ASKS], 0
+    return core.TOOK_URGENT if asks else core.TOOK_BLOCK
 
 
 @inner

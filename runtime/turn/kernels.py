@@ -261,9 +261,10 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
             return ring.ODD
         decoded_ns = now_ns(scratch)
         took = take_message(walk, buffer, _U(start), _U(stop))
-        if took == core.TOOK_BLOCK:
+        if took >= core.TOOK_BLOCK:
+            control[ring.URGENT] |= took - core.TOOK_BLOCK
             decided_ns = now_ns(scratch)
-            sent = answer(walk, drive, rings, control, scratch)
+            sent = not control[ring.DRIVES] or answer(walk, drive, rings, control, scratch)
             _keep(buffer, start, stop, rings.kept, rings.messages, ring.N_MESSAGES, control)
             _put_step(walk, rings.steps, control, decoded_ns, decided_ns, now_ns(scratch))
             control[ring.PLACE] += 1

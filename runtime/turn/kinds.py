@@ -15,81 +15,75 @@ from numba import types
 from numba.extending import intrinsic
 
 from pans.runtime.core import stream_kernels as core
+from pans.runtime.core.stream_arrays import WalkArrays
 from pans.runtime.flow.arrays import FlowWalk
-from pans.runtime.flow.columns import ASKS
 from pans.runtime.wire.inner import inner
 
-from . import rings as ring
 from .shows import send_show
 
 
 @inner
-def _take_still(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
-    return core.take_message(
-        buffer, start, stop, walk.state, walk.marks, walk.windows, walk.tables, walk.rows, walk.counts
-    )
-
-
-@inner
-def _answer_still(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
-    return not control[ring.DRIVES] or send_show(walk, drive, rings, control, scratch)
-
-
-@inner
-def _answer_flow(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
-    """A pulse is sent by the caller, behind the record of its decision: he is to have that at once."""
-    if walk.state[ASKS]:
-        walk.state[ASKS] = 0
-        control[ring.URGENT] = 1
+def _answer_nothing(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
     return np.bool_(True)
 
 
-def taking(kind: Any) -> Any:
-    """Return the kernel that takes a message of a walk of class `kind`."""
+def taking(kind: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return the kernel that takes a message of a walk of class `kind`, and which fields of the walk it wants behind the message.
+
+    Without names it wants the whole walk before the message.
+    """
     if kind is FlowWalk:
         from pans.runtime.flow.deciding import take_message as take_flow
 
-        return take_flow
-    return _take_still
+        return take_flow, ()
+    return core.take_message, WalkArrays._fields
 
 
-def answering(kind: Any) -> Any:
-    """Return the kernel that answers a block of a walk of class `kind`."""
-    return _answer_flow if kind is FlowWalk else _answer_still
+def answering(kind: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return the kernel that answers a block of a walk of class `kind`, and no names: it wants the whole walk."""
+    return (_answer_nothing if kind is FlowWalk else send_show), ()
 
 
-def _typed(choose: Callable[[Any], Any], context: Any, arguments: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Return what the compiler wants of a call of the kernel that `choose` names for the first of `arguments`, a tuple's type."""
-    kernel = types.Dispatcher(choose(arguments[0].instance_class))
-    found = context.resolve_function_type(kernel, arguments, {})
+def _typed(choose: Callable[[Any], Any], context: Any, walk: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Return what the compiler wants of a call of the kernel that `choose` names for a walk of this type.
+
+    The fields are taken out here: one more kernel in between takes the compiler half a second.
+    """
+    kernel, names = choose(walk.instance_class)
+    places = [walk.fields.index(name) for name in names]
+    arguments = (*rest, *(walk.types[place] for place in places)) if names else (walk, *rest)
+    called = types.Dispatcher(kernel)
+    found = context.resolve_function_type(called, arguments, {})
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        called = context.get_function(kernel, found)
-        result = called(builder, values)
-        context.add_linking_libs(getattr(called, "libs", ()))
+        function = context.get_function(called, found)
+        parts = [builder.extract_value(values[0], place) for place in places]
+        result = function(builder, [*values[1:], *parts] if names else values)
+        context.add_linking_libs(getattr(function, "libs", ()))
         return result
 
-    return found.return_type(*found.args), code
+    return found.return_type(walk, *rest), code
 
 
 if numba.config.DISABLE_JIT:
 
     def take_message(walk: Any, *rest: Any) -> Any:
         """Take a message with the kernel of the walk's kind."""
-        return taking(type(walk))(walk, *rest)
+        kernel, names = taking(type(walk))
+        return kernel(*rest, *(getattr(walk, name) for name in names)) if names else kernel(walk, *rest)
 
     def answer(walk: Any, *rest: Any) -> Any:
         """Answer a block with the kernel of the walk's kind."""
-        return answering(type(walk))(walk, *rest)
+        return answering(type(walk))[0](walk, *rest)
 
 else:
 
     @intrinsic
     def take_message(context, walk, buffer, start, stop):  # type: ignore[no-untyped-def]
         """Take the message from `start` to `stop`, uint64, of `buffer`: as core/stream_kernels.py's, by the kernel of the walk's kind."""
-        return _typed(taking, context, (walk, buffer, start, stop))
+        return _typed(taking, context, walk, (buffer, start, stop))
 
     @intrinsic
     def answer(context, walk, drive, rings, control, scratch):  # type: ignore[no-untyped-def]
         """Answer a block that has been taken; False when that could not be sent whole."""
-        return _typed(answering, context, (walk, drive, rings, control, scratch))
+        return _typed(answering, context, walk, (drive, rings, control, scratch))

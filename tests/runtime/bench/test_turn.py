@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pans.runtime.bench import turn as bench
+from pans.runtime.bench.flow_turn import flow_row
 from pans.runtime.bench.rows import BenchOptions
 from pans.runtime.bench.turn_c import DEVICE, built
 from pans.runtime.bench.walks import made_automaton
@@ -35,3 +36,10 @@ def test_round_trips_are_decided_as_by_the_plain_core(
     row = bench._trip_row(kind, plan, decider, device, 300)
     assert (row["changed_percent"], row["command_bytes"]) == (0.0, 38)
     assert row["calls"] >= 270
+
+
+def test_the_flow_that_is_timed_is_decided_as_by_the_plain_core() -> None:
+    shipped, _ = load_bundle(BenchOptions().first_bundle)
+    row = flow_row(shipped, True)
+    assert row["changed_percent"] == 0.0
+    assert row["decisions"] == 100  # one every 500 of 400 blocks' frames
