@@ -20,11 +20,12 @@ from pans.runtime.bundle import load_bundle
 from pans.runtime.bundle.model import word_means
 from pans.runtime.bundle.walks import log_scores
 from pans.runtime.decide.expectation import expected_walk
+from pans.runtime.detector import afterpulses_of
 from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.choosing import choose, kinds_for
 from pans.runtime.refit.evidence import evidence_of, log_softmax
-from pans.trainer.evaluate.accuracy import law_of, light_of
+from pans.trainer.evaluate.accuracy import exposure_of, law_of, light_of
 from pans.trainer.tasks import load_task
 
 SIZES, DRAWS = (100, 200, 500, 1000, 2000, 4000), 10
@@ -54,7 +55,7 @@ def outcomes(bundle, profile, images):
             seen,
             law,
             bundle.photons_per_level,
-            afterpulse=profile.detector.afterpulse_probability,
+            afterpulses=afterpulses_of(profile, exposure_of(bundle, profile)),
         )
         parts.append(walk.leaves)
     chance = np.concatenate(parts)

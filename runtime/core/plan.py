@@ -49,6 +49,7 @@ ORDERS = ("auto", "pattern-major", "shot-major")
 DRIVES = ("auto", "device", "host")
 MAX_BLOCK_BYTES = 16384  # keeps a block of wide frames far below the longest message
 _MAX_SHOTS = 0xFFFE
+_ROUNDING = 1e-6  # of an exposure: training keeps to the limits in float32, and a tick is longer
 
 
 def build_plan(
@@ -135,12 +136,12 @@ def exposure_us(profile: Profile, bundle: Bundle) -> float:
         f"{profile.name}: the brightest pixel needs {top:.4g} photoelectrons per exposure; at "
         f"projector.peak_photoelectrons_hz = {peak_hz:.6g} that takes {needed_us:.6g} us, allowed are {low:g} to {high:g} us"
     )
-    if needed_us > high * (1 + 1e-9):
+    if needed_us > high * (1 + _ROUNDING):
         raise PlanError(
             f"{said}: the light is too weak by a factor of {needed_us / high:.4g}",
             remedy=f"make it brighter, to at least {top / high * 1e6:.4g} photoelectrons/s, and calibrate; or train for less light",
         )
-    if needed_us < low * (1 - 1e-9):
+    if needed_us < low * (1 - _ROUNDING):
         raise PlanError(
             f"{said}: the light is too bright by a factor of {low / needed_us:.4g}",
             remedy=f"put a filter of optical density {math.log10(low / needed_us):.2f} or a little more before the detector "
@@ -152,7 +153,7 @@ def exposure_us(profile: Profile, bundle: Bundle) -> float:
 def _passive_exposure_us(profile: Profile, wanted_us: float) -> float:
     """A passive sensor was trained for one exposure: another would bring other light and other dark counts."""
     low, high = profile.exposure.min_us, profile.exposure.max_us
-    if not low * (1 - 1e-9) <= wanted_us <= high * (1 + 1e-9):
+    if not low * (1 - _ROUNDING) <= wanted_us <= high * (1 + _ROUNDING):
         raise PlanError(
             f"the bundle's passive optics were trained for {wanted_us:g} us, {profile.name} exposes {low:g} to {high:g} us",
             remedy=f"retrain: pans train --profile {profile.name}",

@@ -9,7 +9,7 @@ exposure; where they have a time constant, with the mean memory of each (remembe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
@@ -53,7 +53,6 @@ def expected_walk(
     law: ClickLaw | CountLaw,
     photons_per_level: float = 1.0,
     *,
-    afterpulse: float = 0.0,
     afterpulses: Afterpulses = NO_AFTERPULSES,
     begins: float = 0.0,
 ) -> ExpectedWalk:
@@ -61,38 +60,30 @@ def expected_walk(
 
     `patterns` (n_patterns, pixels) times `photons_per_level` are photoelectrons per exposure and unit transmission, lit all the
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
-    `afterpulse` is the chance that a click makes the next exposure click as well; the exposure before a walk is taken to have none (that
-    of the last object's end is forgotten, at most `afterpulse` clicks per walk). `afterpulses` with a time constant take its place, and
-    `begins` is the memory with which a walk begins; then remembering.py says what is exact.
-    ValueError for shapes that do not fit, more than one
-    channel, a law of other outcomes than the automaton's, and afterpulses of a detector that counts.
+    Of `afterpulses` without a time constant a click makes the next exposure click as well; the exposure before a walk is taken to have
+    none (that of the last object's end is forgotten, at most one click in so many walks). With one, `begins` is the memory with which a
+    walk begins, and remembering.py says what is exact.
+    ValueError for shapes that do not fit, more than one channel, a law of other outcomes than the automaton's, and afterpulses of a
+    detector that counts.
     """
     _check_arguments(automaton, patterns, transmission)
-    if not afterpulses.time:
-        afterpulse = afterpulse or afterpulses.probability
-    if not 0 <= afterpulse < 1:
-        raise ValueError(f"afterpulse is {afterpulse:g}, allowed: from 0 to below 1")
-    outcomes = outcomes_of(law)
-    any_afterpulse = afterpulse or afterpulses.probability
-    if outcomes != automaton.n_outcomes or (automaton.counts and any_afterpulse):
-        raise ValueError(
-            f"an automaton of {automaton.n_outcomes} outcomes under a law of {outcomes}, afterpulse {any_afterpulse:g}, allowed: "
-            "the same outcomes, and no afterpulses where photons are counted"
-        )
+    _check_law(automaton, law, afterpulses)
     n, n_leaves = len(transmission), automaton.n_leaves
     ends = np.empty(n) if afterpulses.time else None
     found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)), ends)
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
-    slots = _states_by_slot(automaton)
-    shown = patterns.sum(axis=1, dtype=np.float64) * photons_per_level
+    slots, shown = _states_by_slot(automaton), patterns.sum(axis=1, dtype=np.float64) * photons_per_level
     for start in range(0, n, step):
         here = slice(start, min(start + step, n))
         light = pattern_light(patterns, transmission[here], photons_per_level)
-        if afterpulses.time and isinstance(law, ClickLaw):
-            walked = Remembered(automaton, afterpulses, len(light), begins)
-            _remembered_block(automaton, slots, light, shown, (law, walked), found, here)
+        walked: _Walked
+        if isinstance(law, CountLaw):
+            walked = _ByNumbers(automaton, law, len(light))
+        elif afterpulses.time:
+            walked = _ByMemory(Remembered(automaton, afterpulses, len(light), begins), law, automaton.n_states)
         else:
-            _walk_block(automaton, slots, light, shown, (law, afterpulse), found, here)
+            walked = _ByClicks(automaton, law, len(light), afterpulses.probability)
+        _walk_block(automaton, slots, light, shown, walked, found, here)
     return found
 
 
@@ -107,6 +98,16 @@ def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission:
         most = LEAF_NUMBERS_MAX // automaton.n_leaves
         raise ValueError(
             f"{len(transmission)} objects and {automaton.n_leaves} leaves, allowed: {most} objects at once"
+        )
+
+
+def _check_law(automaton: Automaton, law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> None:
+    outcomes = outcomes_of(law)
+    if outcomes != automaton.n_outcomes or (automaton.counts and afterpulses):
+        found = f"{outcomes}, afterpulse {afterpulses.probability:g}"
+        raise ValueError(
+            f"an automaton of {automaton.n_outcomes} outcomes under a law of {found}, allowed: the same outcomes, and no afterpulses "
+            "where photons are counted"
         )
 
 
@@ -127,68 +128,108 @@ def pattern_light(patterns: NDArray[Any], transmission: NDArray[Any], scale: flo
     return light
 
 
+class _Walked(Protocol):
+    """The walks of some objects, carried on slot by slot."""
+
+    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        """Leave `states` (m,) of one slot, shown with `photoelectrons` (objects, m).
+
+        Returns the chances with which the objects reached them (objects, m), and the expected clicks (objects,).
+        """
+
+    def leaves(self) -> F64:
+        """The chance of each leaf, (objects, leaves)."""
+
+    def ends(self) -> F64 | None:
+        """Mean memory of the detector behind a walk, (objects,), where it has one."""
+
+
+class _ByClicks:
+    """Walks by clicks, each of which may make the next exposure click too."""
+
+    def __init__(self, automaton: Automaton, law: ClickLaw, n: int, afterpulse: float) -> None:
+        self._automaton, self._law, self._afterpulse = automaton, law, afterpulse
+        self._alpha = np.zeros((2 if afterpulse else 1, n, len(automaton.posteriors)))
+        self._alpha[0, :, 0] = 1.0
+
+    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        alpha, afterpulse = self._alpha, self._afterpulse
+        reached = alpha[:, :, states].sum(axis=0)
+        click, miss = both_chances(self._law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
+        clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
+        pass_on(alpha, states, self._automaton.successors, (click, miss), afterpulse)
+        return reached, (reached * click + clicked).sum(axis=1)
+
+    def leaves(self) -> F64:
+        return np.asarray(self._alpha[:, :, self._automaton.n_states :].sum(axis=0))
+
+    def ends(self) -> None:
+        return None
+
+
+class _ByNumbers:
+    """Walks by photon numbers."""
+
+    def __init__(self, automaton: Automaton, law: CountLaw, n: int) -> None:
+        self._automaton, self._law = automaton, law
+        self._alpha = np.zeros((n, len(automaton.posteriors)))
+        self._alpha[:, 0] = 1.0
+
+    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        reached = self._alpha[:, states]
+        chances = count_chances(self._law, photoelectrons)
+        pass_counts_on(self._alpha, states, self._automaton.successors, chances)
+        return reached, (reached * np.tensordot(np.arange(len(chances)), chances, 1)).sum(axis=1)
+
+    def leaves(self) -> F64:
+        return self._alpha[:, self._automaton.n_states :]
+
+    def ends(self) -> None:
+        return None
+
+
+class _ByMemory:
+    """Walks by clicks on a detector that remembers several exposures."""
+
+    def __init__(self, walked: Remembered, law: ClickLaw, n_states: int) -> None:
+        self._walked, self._law, self._n_states = walked, law, n_states
+
+    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        return self._walked.go_on(states, -log_no_click(self._law, photoelectrons))
+
+    def leaves(self) -> F64:
+        return np.asarray(self._walked.chance[:, :, self._n_states :].sum(axis=0))
+
+    def ends(self) -> F64:
+        return self._walked.ends
+
+
 def _walk_block(
     automaton: Automaton,
     slots: list[NDArray[np.int64]],
     light: F64,
     shown: F64,
-    detector: tuple[ClickLaw | CountLaw, float],
+    walked: _Walked,
     found: ExpectedWalk,
     here: slice,
 ) -> None:
-    law, afterpulse = detector
-    alpha = np.zeros((2 if afterpulse else 1, len(light), len(automaton.posteriors)))
-    alpha[0, :, 0] = 1.0
+    """Carry `walked` through all slots; `light` (objects, patterns) and `shown` (patterns,) of the patterns, lit all the time."""
     sums = np.zeros((4, len(light)))
     for states in slots:
         pattern = automaton.pattern[states]
         share = automaton.dwell[states] / automaton.dwell_steps
         photoelectrons = light[:, pattern] * share
-        reached = alpha[:, :, states].sum(axis=0)
-        if isinstance(law, CountLaw):
-            chances = count_chances(law, photoelectrons)
-            click, clicked = np.tensordot(np.arange(outcomes_of(law)), chances, 1), 0.0
-        else:
-            click, miss = both_chances(law, photoelectrons)  # 1 - p would lose the digits of what is all but certain
-            clicked = alpha[-1][:, states] * (miss * afterpulse) if afterpulse else 0.0  # by afterpulses alone
-        sums[0] += (reached * click + clicked).sum(axis=1)
-        sums[1] += (reached * photoelectrons).sum(axis=1)
-        sums[2] += reached @ (shown[pattern] * share)
-        sums[3] += reached.sum(axis=1)
-        if isinstance(law, CountLaw):
-            pass_counts_on(alpha[0], states, automaton.successors, chances)
-        else:
-            pass_on(alpha, states, automaton.successors, (click, miss), afterpulse)
-    for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
-        total[here] = row
-    found.leaves[here] = alpha[:, :, automaton.n_states :].sum(axis=0)
-
-
-def _remembered_block(
-    automaton: Automaton,
-    slots: list[NDArray[np.int64]],
-    light: F64,
-    shown: F64,
-    detector: tuple[ClickLaw, Remembered],
-    found: ExpectedWalk,
-    here: slice,
-) -> None:
-    law, walked = detector
-    sums = np.zeros((4, len(light)))
-    for states in slots:
-        pattern = automaton.pattern[states]
-        share = automaton.dwell[states] / automaton.dwell_steps
-        photoelectrons = light[:, pattern] * share
-        reached, clicks = walked.go_on(states, -log_no_click(law, photoelectrons))
+        reached, clicks = walked.go_on(states, photoelectrons)
         sums[0] += clicks
         sums[1] += (reached * photoelectrons).sum(axis=1)
         sums[2] += reached @ (shown[pattern] * share)
         sums[3] += reached.sum(axis=1)
     for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
         total[here] = row
-    assert found.ends is not None
-    found.ends[here] = walked.ends
-    found.leaves[here] = walked.chance[:, :, automaton.n_states :].sum(axis=0)
+    found.leaves[here] = walked.leaves()
+    ends = walked.ends()
+    if found.ends is not None and ends is not None:
+        found.ends[here] = ends
 
 
 @njit(cache=True, nogil=True)

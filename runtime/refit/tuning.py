@@ -29,7 +29,7 @@ from .evidence import F64
 from .moves import STILL, Move, moved
 from .search import CLEARLY, Budget, Cost, Measure, Search, Step, held_out_of, paired
 from .trial import Bench, Trial, demand_labelled
-from .words import estimate_json, percent_words
+from .words import estimate_json, light_words, percent_words
 
 FORMAT = "pans-tune 1"
 CHECKPOINT_MAX_BYTES = 1 << 28
@@ -188,11 +188,10 @@ def words_of(report: Mapping[str, Any]) -> str:
         lines.append("not compared: the old patterns stay" if not report["changed"] else "not compared: interrupted")
     else:
         for name in ("old", "new"):
-            light, here = compared[name], compared["held_out"][f"accuracy_{name}"]
-            photons = "unknown" if light["photons_mean"] is None else f"{light['photons_mean']:.4g}"
+            here = compared["held_out"][f"accuracy_{name}"]
             lines.append(
                 f"  {name}  held out {percent_words(here)}, all objects {percent_words(compared['all_objects'][f'accuracy_{name}'])} "
-                f"at {light['clicks_mean']:.4g} clicks, {photons} photons, illumination {light['illumination']:.4g}"
+                f"{light_words(compared[name])}"
             )
         if not report["changed"]:
             lines.append("the old patterns stay: the new ones are not better on fresh clicks")

@@ -89,8 +89,7 @@ def words_of(report: Mapping[str, Any]) -> str:
         f"  accuracy  old {percent_words(held['accuracy_old'])}, new {percent_words(held['accuracy_new'])}, "
         f"gain {percent_words(held['accuracy_gain'], '+')}",
         f"  log loss  old {_plain(held['log_loss_old'])}, new {_plain(held['log_loss_new'])}, gain {_plain(held['log_loss_gain'])}",
-        f"  at {_number(report['clicks_mean'])} clicks, {_number(report['photons_mean'])} photons, "
-        f"illumination {_number(report['illumination'])} per decision",
+        f"  {light_words(report)} per decision",
         "accuracy by the number of labelled objects: "
         + ", ".join(f"{row['objects']}: {100 * row['value']:.1f} %" for row in report["learning_curve"]),
         f"with {report['more_objects']['objects']} objects in all, about "
@@ -132,6 +131,12 @@ def percent_words(found: Mapping[str, float], sign: str = "") -> str:
     """Return an accuracy and its interval in words; with `sign` "+" a gain."""
     value, low, high = (format(100 * found[name] + 0.0, f"{sign}.1f") for name in ("value", "low", "high"))
     return f"{value} ({low} to {high}) %"
+
+
+def light_words(figures: Mapping[str, Any]) -> str:
+    """Return `clicks_mean`, `photons_mean` (None: unknown) and `illumination` of `figures` in words."""
+    clicks, photons = _number(figures["clicks_mean"]), _number(figures["photons_mean"])
+    return f"at {clicks} clicks, {photons} photons, illumination {_number(figures['illumination'])}"
 
 
 def _plain(found: Mapping[str, float]) -> str:

@@ -275,3 +275,17 @@ def test_refuses_orders_that_mean_nothing():
 def test_refuses_a_bundle_without_light():
     dark = replace(bundle_for(IDEAL, 1, 10.0), photons_per_level=0.0)
     assert "above 0, found 0.0" in refusal(IDEAL, dark).message
+
+
+@pytest.mark.parametrize("peak", [100.0, 500.0])
+def test_a_limit_that_training_met_in_float32_is_met(peak: float) -> None:
+    """The brightest level of a trained bundle is a float32: at a limit of the exposure its last digits lie beyond it."""
+    shipped = load_profile("dmd-qcmos")
+    profile = replace(shipped, projector=replace(shipped.projector, peak_photoelectrons_hz=peak))
+    top = 0.3  # of 3000 us at 100 photoelectrons/s, and of 600 us, the shortest exposure, at 500
+    for scale in (float(np.float32(top)), top * (1 - 5e-8), top * (1 + 5e-8)):
+        plan = build_plan(profile, made_bundle(2, 2, table=np.zeros((4, 2)), photons_per_level=scale))
+        assert plan.exposure_ticks == round(top / peak * shipped.clock.tick_hz)
+    for beyond in (top * 1.001 if peak == 100.0 else top * 0.999,):
+        with pytest.raises(PlanError, match="too weak" if peak == 100.0 else "too bright"):
+            build_plan(profile, made_bundle(2, 2, table=np.zeros((4, 2)), photons_per_level=beyond))

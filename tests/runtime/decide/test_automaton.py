@@ -17,8 +17,10 @@ from pans.runtime.decide import make_decider
 from pans.runtime.decide.automaton import AutomatonDecider, walk_words
 from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.decide.verdict import NO_LABEL
+from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
+from pans.runtime.instrument.count_law import CountLaw
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=9), random_automaton(2, slots=5, channels=2)]
 
@@ -124,7 +126,7 @@ LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2,
 @pytest.mark.parametrize("automaton", [early_leaf(), diamond(), random_automaton(5, slots=8)])
 def test_expectations_are_sums_over_all_words(automaton: Automaton, law: ClickLaw, afterpulse: float) -> None:
     patterns, objects = of_objects(automaton)
-    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5, afterpulse=afterpulse)
+    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5, afterpulses=Afterpulses(afterpulse))
     for i, seen in enumerate(objects):
         light = [
             1.5 * float(patterns[p] @ seen) * d / automaton.dwell_steps
@@ -169,10 +171,10 @@ def test_chances_keep_their_digits_however_small(brightness: float) -> None:
 def test_objects_in_pieces_are_objects_together(monkeypatch: pytest.MonkeyPatch) -> None:
     automaton = random_automaton(7, slots=6)
     patterns, objects = of_objects(automaton, n=23)
-    whole = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulse=0.1)
+    whole = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulses=Afterpulses(0.1))
     monkeypatch.setattr("pans.runtime.decide.expectation._NUMBERS_AT_ONCE", 5 * len(automaton.posteriors))
     monkeypatch.setattr("pans.runtime.decide.expectation._PATTERNS_AT_ONCE", 2)
-    pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulse=0.1)
+    pieces = expected_walk(automaton, patterns, objects, ClickLaw(0.01), afterpulses=Afterpulses(0.1))
     for name in ("clicks", "photons", "illumination", "exposures", "leaves"):
         assert getattr(pieces, name) == pytest.approx(getattr(whole, name), rel=1e-13)
 
@@ -184,7 +186,8 @@ def test_expectations_refuse_what_does_not_fit() -> None:
         expected_walk(automaton, patterns[:, 1:], objects, ClickLaw())
     with pytest.raises(ValueError, match="shows pattern 2 of 2"):
         expected_walk(automaton, patterns[:2], objects, ClickLaw())
-    with pytest.raises(ValueError, match="afterpulse is 1"):
-        expected_walk(automaton, patterns, objects, ClickLaw(), afterpulse=1.0)
+    with pytest.raises(ValueError, match="the same outcomes, and no afterpulses"):
+        counting = random_automaton(5, outcomes=3)
+        expected_walk(counting, *of_objects(counting), CountLaw(0.0, 0.2, (0.5, 1.5)), afterpulses=Afterpulses(0.1))
     with pytest.raises(ValueError, match="2 channels"):
         expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw())
