@@ -90,7 +90,7 @@ class Labelled:
 
     counts: NDArray[np.int64]  # (n, d_f): clicks per pattern, or of a walk its click word
     truth: NDArray[np.int64]  # (n,)
-    thing: NDArray[np.int64]  # (n,): the object; the same number in two decisions is the same object
+    object_id: NDArray[np.int64]  # (n,): the object; the same number in two decisions is the same object
     shots: int
     sources: tuple[dict[str, Any], ...]  # of the provenance: name, SHA-256 and decisions of each recording
     simulated: bool
@@ -125,7 +125,7 @@ def labelled_clicks(
     _demand_same_shots(read)
     if labels is not None:
         _check_named(labels, read)
-    truths, things, counts, sources = [], [], [], []
+    truths, object_ids, counts, sources = [], [], [], []
     of_one_scene = labels is None or not labels.names_recordings
     numbers: dict[tuple[str, int], int] = {}
     left_out = {"without a label": 0, "not trusted": 0}
@@ -142,16 +142,16 @@ def labelled_clicks(
                 taken += 1
                 counts.append(words)
                 truths.append(truth)
-                things.append(numbers.setdefault((scene, one.place(decision)), len(numbers)))
+                object_ids.append(numbers.setdefault((scene, one.place(decision)), len(numbers)))
         sources.append({"name": one.path.name, "sha256": one.sha256, "decisions": taken})
     if not truths:
         raise UsageError(
             "no decision has a label" + "".join(f", {n} are {why}" for why, n in left_out.items() if n),
             remedy="name the objects' classes with --labels FILE.csv (a simulated scene with labels names them itself)",
         )
-    _demand_one_truth(truths, things, [place for _, place in numbers])
+    _demand_one_truth(truths, object_ids, [place for _, place in numbers])
     return Labelled(
-        np.stack(counts), np.array(truths), np.array(things), read[0].log.shots, tuple(sources),
+        np.stack(counts), np.array(truths), np.array(object_ids), read[0].log.shots, tuple(sources),
         any(one.recording.simulated for one in read), left_out, _light(read),
     )  # fmt: skip
 
@@ -259,12 +259,12 @@ def _truths(one: _Read, labels: Labels | None, *, alone: bool) -> list[int | Non
     return [mine.get(place) for place in places]
 
 
-def _demand_one_truth(truths: list[int], things: list[int], places: list[int]) -> None:
+def _demand_one_truth(truths: list[int], object_ids: list[int], places: list[int]) -> None:
     known: dict[int, int] = {}
-    for truth, thing in zip(truths, things):
-        if known.setdefault(thing, truth) != truth:
+    for truth, object_id in zip(truths, object_ids):
+        if known.setdefault(object_id, truth) != truth:
             raise UsageError(
-                f"object {places[thing]} is once of class {known[thing]}, once of class {truth}",
+                f"object {places[object_id]} is once of class {known[object_id]}, once of class {truth}",
                 remedy="correct the labels, or --cycle: after how many objects the scene starts over",
             )
 

@@ -34,11 +34,11 @@ class Eigentasks(NamedTuple):
 
 def eigentasks(evidence: Evidence, chosen: NDArray[np.bool_] | None = None) -> Eigentasks | None:
     """Return the eigentasks of the clicks of the objects `chosen` (objects,), all unless given; None where noise cannot be told."""
-    taken = np.ones(len(evidence.row), bool) if chosen is None else chosen[evidence.thing]
-    clicks, thing = evidence.clicks[evidence.row[taken]], evidence.thing[taken]
+    taken = np.ones(len(evidence.row), bool) if chosen is None else chosen[evidence.object_id]
+    clicks, object_id = evidence.clicks[evidence.row[taken]], evidence.object_id[taken]
     if not clicks.shape[1] or len(clicks) < 2:
         return None
-    noise = _noise(clicks, thing, evidence.shots)
+    noise = _noise(clicks, object_id, evidence.shots)
     if noise is None:
         return None
     centred = clicks - clicks.mean(axis=0)
@@ -50,16 +50,16 @@ def eigentasks(evidence: Evidence, chosen: NDArray[np.bool_] | None = None) -> E
     return Eigentasks(inverse.T @ directions, share)
 
 
-def _noise(clicks: F64, thing: NDArray[np.int64], shots: int) -> F64 | None:
+def _noise(clicks: F64, object_id: NDArray[np.int64], shots: int) -> F64 | None:
     """The variance of each click mean about its object's expectation, (d_f,): by repeated objects, else by the shots of a decision."""
-    times = np.bincount(thing)
+    times = np.bincount(object_id)
     again = times > 1
     if int(again.sum()) >= REPEATED_MIN:
         sums = np.zeros((len(times), clicks.shape[1]))
-        np.add.at(sums, thing, clicks)
+        np.add.at(sums, object_id, clicks)
         means = sums / np.maximum(times, 1)[:, None]
-        inside = again[thing]
-        scatter = ((clicks - means[thing])[inside] ** 2).sum(axis=0)
+        inside = again[object_id]
+        scatter = ((clicks - means[object_id])[inside] ** 2).sum(axis=0)
         return np.asarray(scatter / (times[again] - 1).sum())
     if shots > 1:
         return np.asarray((clicks * (1 - clicks)).mean(axis=0) / (shots - 1))

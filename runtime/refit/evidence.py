@@ -35,7 +35,7 @@ class Evidence:
     clicks: F64  # (rows, features): click means of fixed patterns; (rows, 0) of nodes
     row: I64  # (n,)
     truth: I64  # (n,)
-    thing: I64  # (n,): the object, 0..objects-1; an object has one truth
+    object_id: I64  # (n,): the object, 0..objects-1; an object has one truth
     shots: int = 1  # of a decision, whose mean `clicks` are
 
     @property
@@ -46,25 +46,25 @@ class Evidence:
     @cached_property
     def n_objects(self) -> int:
         """Number of objects."""
-        return int(self.thing.max()) + 1
+        return int(self.object_id.max()) + 1
 
     @cached_property
     def shown(self) -> I64:
         """How many decisions there are of each object, (objects,)."""
-        return np.bincount(self.thing, minlength=self.n_objects)
+        return np.bincount(self.object_id, minlength=self.n_objects)
 
     @cached_property
     def classes(self) -> I64:
         """The truth of each object, (objects,)."""
         found = np.zeros(self.n_objects, np.int64)
-        found[self.thing] = self.truth
+        found[self.object_id] = self.truth
         return found
 
     def counts(self, chosen: NDArray[np.bool_]) -> F64:
         """Return how often each class came to each row, (rows, classes), over the objects `chosen` (objects,), each with weight 1."""
-        taken = chosen[self.thing]
+        taken = chosen[self.object_id]
         found = np.zeros(self.scores.shape)
-        np.add.at(found, (self.row[taken], self.truth[taken]), 1.0 / self.shown[self.thing[taken]])
+        np.add.at(found, (self.row[taken], self.truth[taken]), 1.0 / self.shown[self.object_id[taken]])
         return found
 
     def losses(self, scores: F64) -> tuple[F64, F64]:
@@ -83,7 +83,7 @@ class Evidence:
         return fold
 
     def _per_object(self, values: F64) -> F64:
-        return np.bincount(self.thing, values, self.n_objects) / self.shown
+        return np.bincount(self.object_id, values, self.n_objects) / self.shown
 
 
 def evidence_of(
@@ -91,12 +91,12 @@ def evidence_of(
     clicks: NDArray[Any],
     row: NDArray[Any],
     truth: NDArray[Any],
-    thing: NDArray[Any],
+    object_id: NDArray[Any],
     shots: int = 1,
 ) -> Evidence:
     """Return the evidence with scores centred on each row's mean, in float64, and objects numbered without gaps."""
     wide = np.asarray(scores, np.float64)
-    _, numbers = np.unique(thing, return_inverse=True)
+    _, numbers = np.unique(object_id, return_inverse=True)
     centred = wide - wide.mean(axis=1, keepdims=True)
     wide_clicks = np.asarray(clicks, np.float64)
     return Evidence(centred, wide_clicks, row.astype(np.int64), truth.astype(np.int64), numbers, shots)

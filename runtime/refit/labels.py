@@ -65,11 +65,11 @@ def _read(path: Path, rows: Any, classes: tuple[str, ...]) -> dict[str, dict[int
         if len(row) != len(head) or count >= ROWS_MAX:
             raise ConfigError(f"{where}: {len(row)} values, allowed: {len(head)}, in at most {ROWS_MAX} lines")
         recording = row[0].strip() if len(head) == 3 else ""
-        thing = _number(row[-2].strip(), where)
+        object_id = _number(row[-2].strip(), where)
         mine = found.setdefault(recording, {})
-        if thing in mine:
-            raise ConfigError(f"{where}: object {thing} has a label already", remedy="name each object once")
-        mine[thing] = _label(row[-1].strip(), classes, where)
+        if object_id in mine:
+            raise ConfigError(f"{where}: object {object_id} has a label already", remedy="name each object once")
+        mine[object_id] = _label(row[-1].strip(), classes, where)
     if not any(label is not None for mine in found.values() for label in mine.values()):
         raise ConfigError(f"{path}: no object has a label", remedy=_REMEDY)
     return found

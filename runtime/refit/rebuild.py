@@ -67,7 +67,7 @@ def rows_of(bundle: Bundle, clicks: Labelled) -> Rows:
     shots = (
         clicks.shots if bundle.largest == 1 else 1
     )  # the noise of several shots is known of clicks, not of photon numbers
-    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.thing, shots)
+    evidence = evidence_of(scores, means, row.reshape(-1), clicks.truth, clicks.object_id, shots)
     return Rows(evidence, np.arange(len(vectors)), own_posteriors=False)
 
 
@@ -77,7 +77,7 @@ def _rows(
     """The rows that were seen, of `scores` (all rows, classes) and click `means` (all rows, d_f), None of nodes."""
     number, row = np.unique(found, return_inverse=True)
     seen = np.zeros((len(number), 0)) if means is None else means[number]
-    return Rows(evidence_of(scores[number], seen, row, clicks.truth, clicks.thing), number, own_posteriors)
+    return Rows(evidence_of(scores[number], seen, row, clicks.truth, clicks.object_id), number, own_posteriors)
 
 
 def _layers(bundle: Bundle) -> tuple[Layer, ...] | None:
@@ -187,7 +187,7 @@ def _of_slot(
         return None
     number, row = np.unique(nodes, return_inverse=True)
     seen = np.zeros((len(number), 0))
-    evidence = evidence_of(scores[number], seen, row, clicks.truth[passed], clicks.thing[passed])
+    evidence = evidence_of(scores[number], seen, row, clicks.truth[passed], clicks.object_id[passed])
     found = choose(evidence, (Kind(blocks), Kind(blocks, rows=True)))
     if found.correction is None:
         return None

@@ -164,11 +164,11 @@ def one_draw(case: Case, size: int, seed: int) -> dict[str, tuple[float, str]]:
     rng = np.random.default_rng([seed, size])
     order = rng.permutation(len(case.labels))
     fit, judged = order[:size], order[len(order) // 2 :]
-    thing = np.repeat(np.arange(size), SHOWN)
-    chance = case.chance[fit][thing]
-    row = (chance.cumsum(axis=1) < rng.random(len(thing))[:, None] * chance.sum(axis=1, keepdims=True)).sum(axis=1)
+    object_id = np.repeat(np.arange(size), SHOWN)
+    chance = case.chance[fit][object_id]
+    row = (chance.cumsum(axis=1) < rng.random(len(object_id))[:, None] * chance.sum(axis=1, keepdims=True)).sum(axis=1)
     number, seen = np.unique(row, return_inverse=True)
-    evidence = evidence_of(case.scores[number], case.means[number], seen, case.labels[fit][thing], thing)
+    evidence = evidence_of(case.scores[number], case.means[number], seen, case.labels[fit][object_id], object_id)
     kinds = kinds_for(evidence, rows=False)
     trials = choose(evidence, kinds).trials
     existing = tuple(kind for kind in kinds if kind in KINDS)

@@ -20,9 +20,9 @@ def world(seed: int, changed: float):
 def drawn(scores, chance, objects: int, seed: int, each: int = 1):
     rng = np.random.default_rng(seed)
     truth = rng.choice(CLASSES, objects, p=chance.sum(axis=0))
-    things = np.repeat(np.arange(objects), each)
-    rows = np.array([rng.choice(ROWS, p=chance[:, c] / chance[:, c].sum()) for c in truth[things]])
-    return evidence_of(scores, np.zeros((ROWS, 0)), rows, truth[things], things)
+    object_ids = np.repeat(np.arange(objects), each)
+    rows = np.array([rng.choice(ROWS, p=chance[:, c] / chance[:, c].sum()) for c in truth[object_ids]])
+    return evidence_of(scores, np.zeros((ROWS, 0)), rows, truth[object_ids], object_ids)
 
 
 def exact(scores, chance) -> tuple[float, float]:
@@ -79,7 +79,7 @@ def test_an_object_counts_once_however_often_it_was_shown_and_is_never_in_two_fo
     part = fold == 0
     assert evidence.counts(part).sum() == pytest.approx(part.sum())
     loss, right = evidence.losses(evidence.scores)
-    mine = np.flatnonzero(evidence.thing == 7)
+    mine = np.flatnonzero(evidence.object_id == 7)
     logs = log_softmax(evidence.scores)[evidence.row[mine]]
     assert loss[7] == pytest.approx(-logs[np.arange(5), evidence.truth[mine]].mean())
     assert right[7] == pytest.approx(np.mean(logs.argmax(axis=1) == evidence.truth[mine]))

@@ -15,10 +15,10 @@ D_F, CLASSES = 6, 3
 def shown(chances, times: int, seed: int = 0, shots: int = 1, labels=None):
     """Evidence of objects with these click chances (objects, d_f), each shown `times`; every decision is a row of its own."""
     rng = np.random.default_rng(seed)
-    thing = np.repeat(np.arange(len(chances)), times)
-    clicks = rng.binomial(shots, chances[thing]) / shots
-    truth = np.zeros(len(thing), np.int64) if labels is None else labels[thing]
-    return evidence_of(np.zeros((len(thing), CLASSES)), clicks, np.arange(len(thing)), truth, thing, shots)
+    object_id = np.repeat(np.arange(len(chances)), times)
+    clicks = rng.binomial(shots, chances[object_id]) / shots
+    truth = np.zeros(len(object_id), np.int64) if labels is None else labels[object_id]
+    return evidence_of(np.zeros((len(object_id), CLASSES)), clicks, np.arange(len(object_id)), truth, object_id, shots)
 
 
 def objects(count: int, seed: int = 1):

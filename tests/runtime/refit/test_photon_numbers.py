@@ -91,4 +91,4 @@ def test_several_shots_are_refitted_through_the_head_and_claim_no_noise() -> Non
 
 
 def _others(clicks: Labelled) -> tuple[Any, ...]:
-    return (clicks.truth, clicks.thing, clicks.shots, (), True, {}, clicks.light)
+    return (clicks.truth, clicks.object_id, clicks.shots, (), True, {}, clicks.light)

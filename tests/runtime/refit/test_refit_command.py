@@ -91,11 +91,11 @@ def test_labels_from_a_file_are_the_marks(folder: Path) -> None:
         return labelled_clicks(bundle, sha256, [folder / "run.pansrec"], found)
 
     by_file, by_marks = read("truth.csv"), labelled_clicks(bundle, sha256, [folder / "run.pansrec"], None)
-    for name in ("counts", "truth", "thing"):
+    for name in ("counts", "truth", "object_id"):
         assert np.array_equal(getattr(by_file, name), getattr(by_marks, name))
     assert by_file.counts.sum(axis=1).tolist() == read_recording(folder / "run.pansrec").decisions()["clicks"].tolist()
     fewer = read("some.csv", **{f"o{number}": "" for number in range(0, 200, 4)}, o5="Bag", o6="8")
-    assert (len(fewer.truth), len(np.unique(fewer.thing)), fewer.left_out["without a label"]) == (300, 150, 100)
+    assert (len(fewer.truth), len(np.unique(fewer.object_id)), fewer.left_out["without a label"]) == (300, 150, 100)
     assert fewer.truth[[6, 8]].tolist() == [8, 8]  # objects 5 and 6: 1, 2 and 3 were before, twice each
 
 
