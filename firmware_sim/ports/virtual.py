@@ -6,6 +6,8 @@ an hour takes seconds. `VirtualLink` is an ordinary Link (pans.runtime.link) tha
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
 from pans.runtime.errors import LinkError
 
@@ -38,11 +40,23 @@ class VirtualLink:
         if self._faulty is not None:
             self._stand_still(self._faulty)
         while not self._arrived and self._now_ns < deadline_ns:
-            due = self.device.next_event_tick()
-            self._step(deadline_ns if due is None else min(deadline_ns, self.clock.host_ns_at(due)), b"")
+            self._step(deadline_ns, b"", to_event=True)
             self._check_open()
         data, self._arrived = self._arrived, b""
         return data
+
+    def read_ahead(self, timeout_s: float, frames: int, size: int, until_ns: int) -> list[tuple[int, bytes]]:
+        """`read` again and again until `frames` delimiters or `size` bytes have come, or time has passed `until_ns`.
+
+        Returns each read that brought something, with its time; one that fails ends it, and the next `read` fails again.
+        """
+        reads: list[tuple[int, bytes]] = []
+        with suppress(LinkError):
+            while frames > 0 and size > 0 and self._now_ns < until_ns and (data := self.read(timeout_s)):
+                reads.append((self._now_ns, data))
+                frames -= data.count(0)
+                size -= len(data)
+        return reads
 
     def write(self, data: bytes) -> None:
         """Hand `data` to the device at the present virtual time."""
@@ -57,8 +71,7 @@ class VirtualLink:
         """Let virtual time pass while the host does not read: what the device sends meanwhile is lost with the closed port."""
         until_ns = self._now_ns + round(seconds * NS_PER_S)
         while self._now_ns < until_ns:
-            due = self.device.next_event_tick()
-            self._step(until_ns if due is None else min(until_ns, self.clock.host_ns_at(due)), b"")
+            self._step(until_ns, b"", to_event=True)
             self._arrived = b""
 
     def reopen(self) -> VirtualLink:
@@ -73,7 +86,10 @@ class VirtualLink:
         """End the link; idempotent."""
         self._closed = True
 
-    def _step(self, now_ns: int, data: bytes) -> None:
+    def _step(self, now_ns: int, data: bytes, *, to_event: bool = False) -> None:
+        """Let time pass up to `now_ns`, or with `to_event` only up to what the device does next."""
+        if to_event and (due := self.device.next_event_tick()) is not None:
+            now_ns = min(now_ns, self.clock.host_ns_at(due))
         self._now_ns = max(now_ns, self._now_ns)
         self._arrived += self.device.step(self.clock.tick_at(self._now_ns), data)
         if self._faulty is not None and not self._faulty.connected:

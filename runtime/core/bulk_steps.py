@@ -27,7 +27,8 @@ from .stream_arrays import DecisionTables, MarkArrays, WalkArrays
 from .window import DecisionWindows
 from .window_kernels import WindowArrays
 
-ROWS_PER_BATCH = 24576
+ROWS_PER_BATCH = 65536
+WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 _KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}
 _LARGEST = (1 << 62) - 1
@@ -235,7 +236,7 @@ def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     if found is not None or (plan.automaton is not None and getattr(decider, "automaton", None) is plan.automaton):
         labels, probabilities = _finite(getattr(decider, "labels"), getattr(decider, "probabilities"))  # noqa: B009
     table, zero = count_crc_tables(n_features, shots)
-    n_bytes = -(-n_features // 8) if shots == 1 and found is not None else 0
+    n_bytes = -(-n_features // 8) if shots == 1 and found is not None and n_features <= WORD_FEATURES else 0
     word_rows, word_crc = np.zeros((n_bytes, 256), np.int64), np.zeros((n_bytes, 256), np.uint32)
     for feature in range(n_features if n_bytes else 0):
         byte, bit = feature >> 3, feature & 7

@@ -240,30 +240,38 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
     """
     window_at, seen, tallies = windows.window_at, windows.seen, windows.tallies
     labels, probabilities, word_rows, word_crc = tables.labels, tables.probabilities, tables.word_rows, tables.word_crc
-    n_features, n_lanes, crc_zero = windows.counts.shape[1], windows.lanes.size, tables.crc_zero[0]
-    n_rows, done = state[N_ROWS], block.frames
-    at = block.at + _U(state[FRAME]) * block.word_bytes
+    n_features, last, crc_zero, none = windows.counts.shape[1], _U(windows.lanes.size - 1), tables.crc_zero[0], np.uint32(0)
+    top_mask = _U(block.top_mask)
+    n_rows, done, room, known = _U(state[N_ROWS]), block.frames, _U(rows.size), block.truth
+    before, silent, window = _U(state[N_DECISIONS]) - n_rows, np.int64(0), state[NEXT_WINDOW]
+    at, tick = block.at + _U(state[FRAME]) * block.word_bytes, block.end_tick + state[FRAME] * block.period_ticks
     for i in range(state[FRAME], block.frames):
-        here, clicks, index, crc = np.int64(window_at[block.relative + i]), np.int64(0), np.int64(0), crc_zero
-        for p in range(n_lanes):
-            byte = np.int64(buffer[at + _U(p)]) & (block.top_mask if p == n_lanes - 1 else 0xFF)
-            clicks += ONES[byte]
-            index += word_rows[p, byte]
-            crc ^= word_crc[p, byte]
-        at += block.word_bytes
+        byte = _U(buffer[at + last]) & top_mask
+        clicks, word, crc = ONES[byte], word_rows[last, byte], crc_zero ^ word_crc[last, byte]
+        if last:  # one by one: a loop of one turn, made for many, took longer than all the rest
+            byte = _U(buffer[at])
+            clicks, word, crc = clicks + ONES[byte], word + word_rows[0, byte], crc ^ word_crc[0, byte]
+            if last > _U(1):
+                byte = _U(buffer[at + _U(1)])
+                clicks, word, crc = clicks + ONES[byte], word + word_rows[1, byte], crc ^ word_crc[1, byte]
+        here, ended = np.int64(window_at[block.relative + i]), tick
+        at, tick = at + block.word_bytes, tick + block.period_ticks
         if here < 0:
             tallies[DARK_CLICKS] += clicks
             tallies[DARK_EXPOSURES] += n_features
             continue
-        seen[here, 0] = n_features
-        label, probability, flags = _look_up(labels, probabilities, index)
-        _put_row(rows[n_rows], state, block, i, here, (clicks, label, flags, probability, crc))
-        n_rows += 1
-        state[NEXT_WINDOW] = here + 1
-        if n_rows == rows.size:
+        seen[_U(here), 0] = n_features
+        label, probability, flags = _look_up(labels, probabilities, _U(word))
+        row = rows[n_rows]
+        row["index"], row["tick"], row["exposure_index"], row["object"] = before + n_rows, ended, block.first + i, block.object
+        row["shot"], row["clicks"], row["label"], row["truth"], row["flags"] = here, clicks, label, known, flags
+        row["probability"], row["counts_crc"], row["exposures"] = probability, crc, none
+        n_rows, silent, window = n_rows + _U(1), silent + (flags != 0), here + 1
+        if n_rows == room:
             done = i + 1
             break
-    state[N_ROWS], state[FRAME] = n_rows, done
+    state[N_ROWS], state[FRAME], state[NEXT_WINDOW] = n_rows, done, window
+    state[N_DECISIONS], state[N_ABSTAINED] = before + n_rows, state[N_ABSTAINED] + silent
 
 
 @inner

@@ -28,24 +28,28 @@ def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyp
     been looked at, if it is the later.
     """
     clicks, flags, batch = rows["clicks"], rows["flags"], counts[BATCH]
-    for i in range(first, clicks.size):
-        if flags[i] & left_out:
-            continue
-        counts[DECISIONS] += 1
-        counts[CLICKS] += np.int64(clicks[i])
-        counts[IN_BATCH] += 1
-        if counts[IN_BATCH] < batch:
-            continue
-        total = counts[CLICKS]
+    i, total, taken = np.int64(first), counts[CLICKS], counts[IN_BATCH]
+    while i < clicks.size:
+        begun = taken
+        while i < clicks.size and taken < batch:
+            if not flags[i] & left_out:
+                total += np.int64(clicks[i])
+                taken += 1
+            i += 1
+        counts[DECISIONS] += taken - begun
+        counts[CLICKS], counts[IN_BATCH] = total, taken
+        if taken < batch:
+            break
         counts[CLICKS], counts[IN_BATCH] = 0, 0
         if math.isnan(levels[MEAN]):
             if _learn(total, counts, levels):
-                return i + 1, LEARNT
+                return i, LEARNT
         else:
             why = _compare(total, counts, levels)
             if why != ALL_TAKEN:
-                return i + 1, why
-    return clicks.size, ALL_TAKEN
+                return i, why
+        total, taken = np.int64(0), np.int64(0)
+    return np.int64(clicks.size), ALL_TAKEN
 
 
 @inner

@@ -85,6 +85,23 @@ class LinkReader:
         finally:
             self._away = True
 
+    def ahead(self, timeout_s: float, frames: int, size: int, until_ns: int) -> list[Chunk]:
+        """Read a virtual link again and again, each time as `wait` does, and return what came.
+
+        No more is read once `frames` delimiters or `size` bytes have come, the link's clock has passed `until_ns`, or a read brings nothing
+        or fails: the next `wait` meets that again.
+        """
+        many = getattr(self._link, "read_ahead", None)
+        if many is not None:
+            return [Chunk(*read) for read in many(timeout_s, frames, size, until_ns)]
+        chunks: list[Chunk] = []
+        with suppress(PansError):  # kept
+            while frames > 0 and size > 0 and self._link.now_ns() < until_ns and (more := self.wait(timeout_s)):
+                chunks += more
+                frames -= more[0].data.count(0)
+                size -= len(more[0].data)
+        return chunks
+
     def lend(self) -> bool:
         """Leave the link to the caller, who reads it himself until `take_back`; False where chunks wait or somebody reads."""
         self._away = False

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -202,17 +201,7 @@ class CompiledTurns:
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
         left = run.messages_granted - chunks[0].data.count(0)
-        n_bytes = 0
-        while left > 0 and n_bytes < GATHERED_BYTES and link.now_ns() < run.due_ns:
-            more: list[Chunk] = []
-            with suppress(LinkError):  # the reader says so again when it is asked for more
-                more = connection.reader.wait(poll_s)
-            if not more:
-                break
-            chunks += more
-            left -= more[0].data.count(0)
-            n_bytes += len(more[0].data)
-        return chunks
+        return chunks + connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)
 
     def _go_on(self, turn: Turn, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
         """Deal with what ended a call until nothing that was read is left; no more is read."""

@@ -91,27 +91,29 @@ class RunTally:
         """Compile or load what `add_rows` needs, and make room for `trials` of an object, before arming."""
         self._make_room(trials - 1)
         self._runs[:] = 0  # touched
-        self._add_part(np.zeros(0, DECISION_DTYPE), marks)
+        self._add_from(np.zeros(0, DECISION_DTYPE), 0, marks)
 
     def add_rows(self, rows: npt.NDArray[np.void], marks: MarkArrays) -> None:
         """Count many decisions, DECISION_DTYPE (n,), on objects of which `marks` tell; as `add` does for each."""
-        for first in range(0, len(rows), RUNS_AT_ONCE):
-            part = rows[first : first + RUNS_AT_ONCE]
-            self._make_room(int(part["shot"].max()) // self.shots)
-            self._add_part(part, marks)
+        first = 0
+        while first < len(rows):
+            self._make_room(int(rows["shot"][first]) // self.shots)
+            first = self._add_from(rows, first, marks)
 
-    def _add_part(self, rows: npt.NDArray[np.void], marks: MarkArrays) -> None:
+    def _add_from(self, rows: npt.NDArray[np.void], first: int, marks: MarkArrays) -> int:
+        """Count decisions from `first` on; return up to where there was room."""
         from pans.runtime.turn import settling as kernels  # numba is loaded only by who counts many at once
 
         plan, sums, photons = np.array([self.shots, self.distinct]), np.zeros(kernels.N_SUMS, np.int64), np.zeros(1)
         photons[0] = self.photons
         tables = (self.confusion, self._trials, self._runs)
-        n_runs = kernels.add_rows(rows, marks.objects, marks.photons, plan, sums, photons, *tables)
-        self._take_sums(len(rows), sums.tolist(), float(photons[0]))
+        stop, n_runs = kernels.add_rows(rows, first, marks.objects, marks.photons, plan, sums, photons, *tables)
+        self._take_sums(stop - first, sums.tolist(), float(photons[0]))
         for number, decided, right in self._runs[:n_runs].tolist():
             mine = self._object_sums(number)
             mine[0] += decided
             mine[1] += right
+        return int(stop)
 
     def _take_sums(self, decisions: int, sums: list[int], photons: float) -> None:
         clicks, exposures, photons_known, abstained, unsure, known, right = sums

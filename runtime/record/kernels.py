@@ -33,46 +33,76 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # ty
     state uint64 (N_STATE,), keys uint64 (LONG_VERDICT, 3) and slots uint16 (LONG_VERDICT: free) are the known verdicts;
     runs RUN_DTYPE, verdicts VERDICT_DTYPE with `lengths` uint32 of walks, and codes uint16 have room for n.
     """
-    n_runs, n_new = 0, 0
+    return _find_runs(rows, state, runs), _find_codes(rows, state, keys, slots, verdicts, lengths, codes)
+
+
+@inner
+def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
+    """Tell the runs that rows are made of; return how many were written."""
     # Columns are taken out of the rows once: a row at a time would count references for each.
     indices, ticks, exposures, objects = rows["index"], rows["tick"], rows["exposure_index"], rows["object"]
-    shots, truths, labels, flags = rows["shot"], rows["truth"], rows["label"], rows["flags"]
-    clicks, probabilities, checksums = rows["clicks"], rows["probability_bits"], rows["counts_crc"]
-    walked = rows["exposures"]
+    shots, truths = rows["shot"], rows["truth"]
     count, truth, number = state[RUN_ROWS], state[TRUTH], state[OBJECT]
     index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
     tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
-    n_known, mask = state[N_VERDICTS], state[SLOT_MASK]
-    part = 0  # rows of the open run that stand in this block
-    for i in range(_U(rows.size)):
+    n_runs, part = 0, _ZERO  # part: rows of the open run that stand in this block
+    i, n = _ZERO, _U(rows.size)
+    while i < n:
+        if count > _ONE:  # in the middle of a run, up to the first row that does not go on with it
+            first, stop = i, min(n, i + (_RUN_MAX - count))
+            while i < stop:
+                apart = (_U(indices[i]) ^ index) | (_U(ticks[i]) ^ tick) | (_U(exposures[i]) ^ exposure)
+                apart |= (_U(shots[i]) ^ shot) | (_U(objects[i]) ^ number) | ((_U(truths[i]) & _TRUTH_MASK) ^ truth)
+                if apart:
+                    break
+                index, tick, exposure, shot = index + _ONE, tick + tick_step, exposure + exposure_step, shot + shot_step
+                i += _ONE
+            if part == _ZERO and i > first:
+                _open(runs[n_runs], rows[first], True)
+                n_runs += 1
+            count, part = count + (i - first), part + (i - first)
+            if i == n:
+                break
         here_tick, here_exposure, here_shot = _U(ticks[i]), _U(exposures[i]), _U(shots[i])
         here_index, here_truth, here_object = _U(indices[i]), _U(truths[i]) & _TRUTH_MASK, _U(objects[i])
-        fits = here_index == index and here_object == number and here_truth == truth and count < _RUN_MAX
+        fits = count == _ONE and here_index == index and here_object == number and here_truth == truth
         if count == _ONE:  # the second row says what the steps are
             tick_step, exposure_step, shot_step = here_tick - tick, here_exposure - exposure, here_shot - shot
             fits = fits and tick_step < _U32 and exposure_step < _U32 and shot_step < _U32
-        else:
-            fits = fits and here_tick == tick and here_exposure == exposure and here_shot == shot
-        if not fits or count == _ZERO:
+        if not fits:
             if part:
                 _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
-            count, part = _ZERO, 0
+            count, part = _ZERO, _ZERO
             number, truth, index = here_object, here_truth, here_index
-        if part == 0:
+        if part == _ZERO:
             _open(runs[n_runs], rows[i], count != _ZERO)
             n_runs += 1
-        count += _ONE
-        part += 1
-        index += _ONE
+        count, part, index = count + _ONE, part + _ONE, index + _ONE
         tick, exposure, shot = here_tick, here_exposure, here_shot
         if count > _ONE:  # a run of one has no steps yet: the next row is compared with this one
             tick, exposure, shot = tick + tick_step, exposure + exposure_step, shot + shot_step
+        i += _ONE
+    if part:
+        _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
+    state[RUN_ROWS], state[TRUTH], state[OBJECT] = count, truth, number
+    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
+    state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = tick_step, exposure_step, shot_step
+    return n_runs
+
+
+@inner
+def _find_codes(rows, state, keys, slots, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
+    """Give each row the number of its verdict; return how many verdicts were written, which no row had before."""
+    labels, flags, clicks, walked = rows["label"], rows["flags"], rows["clicks"], rows["exposures"]
+    probabilities, checksums = rows["probability_bits"], rows["counts_crc"]
+    n_known, mask, n_new = state[N_VERDICTS], state[SLOT_MASK], 0
+    for i in range(_U(rows.size)):
         first = _U(clicks[i]) << _HALF_LEFT | _U(labels[i])
         second = _U(probabilities[i]) << _HALF_LEFT | _U(flags[i])
         third = _U(walked[i]) << _HALF_LEFT | _U(checksums[i])
         at = _slot_of(first, second, third) & mask
         known = _U(slots[at])
-        while known != _LONG and (keys[known, 2] != third or keys[known, 1] != second or keys[known, 0] != first):
+        while known != _LONG and (keys[known, 2] ^ third) | (keys[known, 1] ^ second) | (keys[known, 0] ^ first):
             at = (at + _ONE) & mask
             known = _U(slots[at])
         if known != _LONG:
@@ -88,13 +118,8 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # ty
             n_known += _ONE
             if SLOTS_PER_VERDICT * n_known > mask + _ONE:
                 mask = _widen(n_known, mask, keys, slots)
-    if part:
-        _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
-    state[RUN_ROWS], state[TRUTH], state[OBJECT] = count, truth, number
-    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
-    state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = tick_step, exposure_step, shot_step
     state[N_VERDICTS], state[SLOT_MASK] = n_known, mask
-    return n_runs, n_new
+    return n_new
 
 
 @inner

@@ -29,49 +29,66 @@ _NO_LABEL = NO_LABEL
 
 
 @outer
-def add_rows(rows, marked, photons_of, plan, sums, photons, table, trials, objects):  # type: ignore[no-untyped-def]
-    """Add rows, DECISION_DTYPE (n,), to what decisions add up to; return how many runs of one object they were.
+def add_rows(rows, first, marked, photons_of, plan, sums, photons, table, trials, objects):  # type: ignore[no-untyped-def]
+    """Add rows, DECISION_DTYPE (n,), from `first` on to what decisions add up to; return up to where, and how many runs of one object.
+
+    It ends before a row for which `objects` or `trials` have no room.
 
     marked int64 and photons_of float32 (MARK_SLOTS,): MarkArrays; plan int64 (2,): K and after how many objects the first one is shown
-    again (0: never). photons float64 (1,), table int64 (classes, classes) and trials int64 (m, 2) with room for all are added to.
-    sums int64 (N_SUMS,) are of these rows alone, and objects int64 (n, 3) is filled from its beginning.
+    again (0: never). photons float64 (1,), table int64 (classes, classes) and trials int64 (m, 2) are added to. sums int64 (N_SUMS,) are
+    of these rows alone, and objects int64 (n, 3) is filled from its beginning.
     """
     numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
     truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
     n_clicks, n_walked, n_right = np.int64(0), np.int64(0), np.int64(0)
     n_photons, n_silent, n_unsure, n_known = 0, 0, 0, 0
     total, per_decision, object_before, n_objects = photons[0], plan[0], np.int64(-1), 0
-    for i in range(rows.size):
-        number, label, truth = np.int64(numbers[i]), np.int64(labels[i]), np.int64(truths[i])
-        n_clicks += np.int64(clicks[i])
-        n_walked += np.int64(walked[i])
-        slot = number % MARK_SLOTS
-        if marked[slot] == number and not np.isnan(photons_of[slot]):
-            total += np.float64(photons_of[slot]) * per_decision
-            n_photons += 1
-        if flags[i] & _ABSTAINED or label == _NO_LABEL:
-            n_silent += 1
-            n_unsure += (flags[i] & _AMBIGUOUS) != 0
-        if truth < 0 or truth >= table.shape[0]:
+    i, n, room = np.int64(first), np.int64(rows.size), objects.shape[0]
+    while i < n and n_objects < room:  # the decisions in a row on one object share all that it tells
+        begun, number, truth, well, following = i, np.int64(numbers[i]), np.int64(truths[i]), np.int64(0), np.int64(-1)
+        slot, trial, light = number % MARK_SLOTS, np.int64(0), np.float64(np.nan)
+        if marked[slot] == number:
+            light = np.float64(photons_of[slot]) * per_decision
+        lit, known = not np.isnan(light), 0 <= truth < table.shape[0]
+        while i < n and numbers[i] == number and truths[i] == truth:
+            label = np.int64(labels[i])
+            if known:
+                shot = np.int64(shots[i])
+                trial = trial + 1 if shot == following else shot // per_decision  # a division for each would show
+                if trial >= trials.shape[0]:
+                    room = 0
+                    break
+                following = shot + per_decision
+            n_clicks += np.int64(clicks[i])
+            n_walked += np.int64(walked[i])
+            if lit:
+                total += light
+            if flags[i] & _ABSTAINED or label == _NO_LABEL:
+                n_silent += 1
+                n_unsure += (flags[i] & _AMBIGUOUS) != 0
+            if known:
+                right = np.int64(label == truth)
+                if label != _NO_LABEL:
+                    table[truth, label] += 1
+                trials[trial, 0] += 1
+                trials[trial, 1] += right
+                well += right
+            i += 1
+        n_photons += i - begun if lit else 0
+        if not known or i == begun:
             continue
-        right = np.int64(label == truth)
-        n_known += 1
-        n_right += right
-        if label != _NO_LABEL:
-            table[truth, label] += 1
-        trial = np.int64(shots[i]) // plan[0]
-        trials[trial, 0] += 1
-        trials[trial, 1] += right
+        n_known += i - begun
+        n_right += well
         which = number % plan[1] if plan[1] else number
         if which != object_before:
             objects[n_objects, NUMBER], objects[n_objects, DECIDED], objects[n_objects, WELL] = which, 0, 0
             n_objects, object_before = n_objects + 1, which
-        objects[n_objects - 1, DECIDED] += 1
-        objects[n_objects - 1, WELL] += right
+        objects[n_objects - 1, DECIDED] += i - begun
+        objects[n_objects - 1, WELL] += well
     photons[0] = total
     sums[CLICKS], sums[EXPOSURES], sums[PHOTONS_KNOWN], sums[ABSTAINED] = n_clicks, n_walked, n_photons, n_silent
     sums[UNSURE], sums[KNOWN], sums[RIGHT] = n_unsure, n_known, n_right
-    return n_objects
+    return i, n_objects
 
 
 @outer

@@ -28,6 +28,7 @@ from .rings import I64, U8
 # place, int64 (N_PLACE,): the dark exposures before, the object under way, whether it is, objects before it; alarms of the last block
 DARK, OBJECT, IS_OPEN, OBJECTS, ALARMS, N_PLACE = range(6)
 ALL_SEEN, SILENT, ALARMED, PASSED = range(4)  # why a call ended: nothing is left, or what a block told
+_EIGHT = 8  # bytes at once
 MOST_FRAMES = 1 << 16  # of one block: its count is a u16
 _NO_OBJECT = NO_OBJECT
 _U = np.uint64
@@ -150,9 +151,13 @@ def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-de
     dark_slot, lit = maps
     n_bytes, width = seen.shape[1], load4(kept, payload + _U(28)) >> _U(16)
     exposure = np.int64(load8(kept, payload + _U(16)))
-    slot, here, n_dark, any_lit = exposure % dark_slot.size, exposure % lit.size, 0, False
-    start = payload + _U(stream.BLOCK_HEADER)
-    for byte in range(n_bytes):
+    slot, here, n_dark = exposure % dark_slot.size, exposure % lit.size, 0
+    start, n_lit = payload + _U(stream.BLOCK_HEADER), np.int64(0)
+    for i in range(count):
+        n_lit += lit[here + i]
+    if n_lit == count:
+        _all_seen(kept, start, count * np.int64(width), np.int64(width), seen)
+    for byte in range(n_bytes if n_lit < count else 0):
         at, all_seen, lit_seen = start + _U(byte), np.int64(0), np.int64(0)
         for i in range(count):
             word = np.int64(kept[at])
@@ -160,16 +165,37 @@ def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-de
             lit_seen |= word if lit[here + i] else np.int64(0)
             at += width
         seen[0, byte], seen[1, byte] = all_seen, lit_seen
-    for i in range(count):
-        any_lit |= lit[here + i]
-        if dark.shape[0] and dark_slot[slot]:
+    for i in range(count if dark.shape[0] else 0):
+        if dark_slot[slot]:
             for byte in range(n_bytes):
                 dark[n_dark, byte] = kept[start + _U(i) * width + _U(byte)]
             n_dark += 1
         slot = slot + 1 if slot + 1 < dark_slot.size else 0
-    if not any_lit:
+    if not n_lit:
         seen[1, 0] = -1
     return n_dark
+
+
+@inner
+def _all_seen(kept, start, size, width, seen):  # type: ignore[no-untyped-def]
+    """Which channels clicked in any of a block's frames, all of them lit: `size` bytes from `start` on, `width` each."""
+    stop, at = start + _U(size), start
+    for byte in range(seen.shape[1]):
+        seen[0, byte] = 0
+    if _EIGHT % width == 0:  # eight bytes hold whole frames
+        gathered = _U(0)
+        while at + _U(_EIGHT) <= stop:
+            gathered |= load8(kept, at)
+            at += _U(_EIGHT)
+        for byte in range(_EIGHT):
+            if byte % width < seen.shape[1]:
+                seen[0, byte % width] |= np.int64(gathered >> _U(8 * byte) & _U(0xFF))
+    while at < stop:
+        for byte in range(seen.shape[1]):
+            seen[0, byte] |= np.int64(kept[at + _U(byte)])
+        at += _U(width)
+    for byte in range(seen.shape[1]):
+        seen[1, byte] = seen[0, byte]
 
 
 @inner
