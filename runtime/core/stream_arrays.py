@@ -19,8 +19,8 @@ class DecisionTables(NamedTuple):
     A label NO_LABEL abstains: its probability is below what was asked for, or 0 where the scores were not finite. `radix` int64 (d_f,):
     the row of a table is the sum of counts * radix; of an automaton it is the leaf. `crc` uint32 (bytes of a count, d_f, 256) and
     `crc_zero` uint32 (1,): CRC-32 is affine, so that the checksum of all counts is that of zeros, exclusive-or one entry per byte. For
-    K = 1 with a table, `word_rows` int64 and `word_crc` uint32 (bytes of a word: 1 to 3, 256) say the same of a byte of the click word; else
-    they are empty.
+    K = 1 with a table, `word_rows` int64 and `word_crc` uint32 (1 to 3 bytes of a word, 256) say the same of a byte of the click word;
+    else they are empty.
     """
 
     labels: npt.NDArray[np.uint16]

@@ -240,7 +240,12 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
     """
     window_at, seen, tallies = windows.window_at, windows.seen, windows.tallies
     labels, probabilities, word_rows, word_crc = tables.labels, tables.probabilities, tables.word_rows, tables.word_crc
-    n_features, last, crc_zero, none = windows.counts.shape[1], _U(windows.lanes.size - 1), tables.crc_zero[0], np.uint32(0)
+    n_features, last, crc_zero, none = (
+        windows.counts.shape[1],
+        _U(windows.lanes.size - 1),
+        tables.crc_zero[0],
+        np.uint32(0),
+    )
     top_mask = _U(block.top_mask)
     n_rows, done, room, known = _U(state[N_ROWS]), block.frames, _U(rows.size), block.truth
     before, silent, window = _U(state[N_DECISIONS]) - n_rows, np.int64(0), state[NEXT_WINDOW]
@@ -263,7 +268,12 @@ def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no
         seen[_U(here), 0] = n_features
         label, probability, flags = _look_up(labels, probabilities, _U(word))
         row = rows[n_rows]
-        row["index"], row["tick"], row["exposure_index"], row["object"] = before + n_rows, ended, block.first + i, block.object
+        row["index"], row["tick"], row["exposure_index"], row["object"] = (
+            before + n_rows,
+            ended,
+            block.first + i,
+            block.object,
+        )
         row["shot"], row["clicks"], row["label"], row["truth"], row["flags"] = here, clicks, label, known, flags
         row["probability"], row["counts_crc"], row["exposures"] = probability, crc, none
         n_rows, silent, window = n_rows + _U(1), silent + (flags != 0), here + 1

@@ -6,6 +6,9 @@ inlined, in every kernel that calls it. Of an inner kernel the callers want the 
 its callers are loaded from theirs, nobody asks for it. And it is inlined wherever it is called: a call hands over each number of each
 array by itself, and a turn has some forty arrays.
 
+Kernels are loaded from the cache alone: numba would first bring in all that it can compile, and scipy where that is installed, which took
+a quarter of a second in each process that only loads. Whatever is compiled brings that in by itself.
+
 What is left out here is numba's own, which has no option for it: other versions of numba than those it was tried with compile inner
 kernels like all others, which takes longer and gives the same results.
 """
@@ -18,7 +21,8 @@ from typing import Any
 
 import numba
 from numba import njit, types
-from numba.core import event
+from numba.core import caching, event
+from numba.core.runtime import rtsys
 
 TRIED = ((0, 68),)  # versions of numba
 
@@ -118,3 +122,14 @@ class _Uncollected(event.Listener):  # type: ignore[misc]
 
 
 event.register("numba:compile", _Uncollected())
+
+
+def _load_overload(cache: Any, signature: Any, context: Any) -> Any:
+    """Return what numba's `cache` holds for `signature`, None where it holds nothing: as Cache.load_overload, all else left out."""
+    rtsys.initialize(context)  # what compiled code may call
+    with cache._guard_against_spurious_io_errors():
+        return cache._load_overload(signature, context)
+
+
+if numba.version_info.short in TRIED:
+    caching.Cache.load_overload = _load_overload

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pans.runtime.core.decision import NO_LABEL, Decision, DecisionFlag
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
+from pans.runtime.core.stream_arrays import MarkArrays
+from pans.runtime.core.stream_kernels import MARK_SLOTS
 from pans.runtime.live.tally import RunTally
 
 NAN = float("nan")
@@ -78,3 +80,33 @@ def test_an_object_that_is_shown_again_is_the_same_object() -> None:
     summary = tally.figures()
     assert (summary.objects, summary.decisions) == (10, 40)
     assert summary.accuracy_stderr_objects == pytest.approx(right.mean(axis=0).std(ddof=1) / np.sqrt(10))
+
+
+def test_decisions_in_rows_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "pans.runtime.live.tally.RUNS_AT_ONCE", 16
+    )  # more objects than that, and more trials than there is room for
+    rng = np.random.default_rng(3)
+    n, shots = 3000, 3
+    rows = np.zeros(n, DECISION_DTYPE)
+    rows["object"] = np.sort(rng.integers(0, 90, n))
+    rows["shot"] = rng.integers(0, 400, n) * shots
+    rows["clicks"], rows["exposures"] = rng.integers(0, 30, n), rng.integers(0, 5, n)
+    rows["label"] = np.where(rng.random(n) < 0.1, NO_LABEL, rng.integers(0, 4, n))
+    rows["truth"] = rows["object"].astype(np.int16) % 6 - 1  # -1: unknown; 4: no class of these
+    rows["flags"] = rng.choice(
+        [0, int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS | DecisionFlag.ABSTAINED)], n
+    )
+    photons = rng.random(MARK_SLOTS).astype(np.float32)
+    photons[::7] = np.nan
+    objects = np.where(np.arange(MARK_SLOTS) % 5 > 0, np.arange(MARK_SLOTS), -1)
+    one, many = RunTally(4, shots, distinct=50), RunTally(4, shots, distinct=50)
+    many.warm_up(MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons), 2)
+    for row in rows.tolist():
+        known = objects[row[3]] == row[3]
+        one.add(Decision(*row), float(photons[row[3]]) if known else NAN)
+    for part in np.split(rows, [700, 701, 2000]):
+        many.add_rows(part, MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons))
+    assert many.figures() == one.figures()
+    assert many.confusion.tolist() == one.confusion.tolist()
+    assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
