@@ -53,6 +53,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         _announce(args, port.url)
         gc.freeze()  # what was made so far is never collected: hardware has no pauses
+        gc.enable()
         serve(instrument, clock, port, orphaned.is_set, args.core)
     finally:
         port.close()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 DEFAULT_OFFSET_TICKS = 123_456_789  # any number that is not 0: device time is not host time
+BUFFER_MESSAGES = 256  # that a device can hold back
 DEFAULT_DRIFT_PPM = 20.0  # the tolerance of an ordinary quartz crystal
 _E18 = 10**18
 

@@ -24,6 +24,7 @@ from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_patt
 from pans.runtime.wire.counts import unpack_count_states, unpack_read_counts
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
+from .clock import BUFFER_MESSAGES
 from .facts import Now, facts_of, largest_number
 from .gates import Gates
 from .sequential import MAX_LEASE_MS, Measurement, check_arm
@@ -36,7 +37,6 @@ from .walking import PatternLight
 if TYPE_CHECKING:
     from .parallel import FrameRun
 
-BUFFER_MESSAGES = 256
 NEVER = 1 << 64
 
 

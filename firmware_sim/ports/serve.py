@@ -11,23 +11,30 @@ import os
 import subprocess
 import sys
 from dataclasses import MISSING, dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
-from pans.firmware_sim.device.clock import DEFAULT_DRIFT_PPM, DEFAULT_OFFSET_TICKS, DeviceClock, SteppedDevice
-from pans.firmware_sim.device.instrument import BUFFER_MESSAGES, Instrument
+from pans.firmware_sim.device.clock import (
+    BUFFER_MESSAGES,
+    DEFAULT_DRIFT_PPM,
+    DEFAULT_OFFSET_TICKS,
+    DeviceClock,
+    SteppedDevice,
+)
 from pans.firmware_sim.options import option, words_of
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import ConfigError, LinkError, UsageError, as_usage_error
 from pans.runtime.imaging import bleaching_of, imaging_of, is_spec
-from pans.runtime.instrument.profile import load_profile
+from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import Link, descriptor_of, open_link
 
 from .faults import NO_FAULTS, check_possible, parse_faults
 from .faulty import FaultyDevice
-from .on_table import scene_on_table
 from .virtual import START_NS, VirtualLink
+
+if TYPE_CHECKING:
+    from pans.firmware_sim.device.instrument import Instrument
 
 DEFAULT_SCENE = "fashion200"
 MAX_DRIFT_PPM = 1000.0
@@ -129,6 +136,10 @@ def build_instrument(options: SimOptions, host_ns: int) -> tuple[SteppedDevice, 
     """
     if options.engine != "python":
         raise UsageError(f"engine={options.engine}: not for an instrument in this process", remedy="use pans simulate")
+    from pans.firmware_sim.device.instrument import Instrument  # only where the instrument is: a host waits for it
+
+    from .on_table import scene_on_table
+
     profile = load_profile(options.profile)
     clock = DeviceClock(profile.clock.tick_hz, options.offset, round(options.drift_ppm * 1000))
     scene = scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
@@ -165,10 +176,7 @@ def open_sim(url: str) -> Link:
     """Open a `sim:` URL (entry point of `pans.devices`); the link's `close` ends what it started."""
     options = parse_sim_url(url)
     if options.pace == "real":
-        profile = load_profile(options.profile)  # a mistake in either is better told here than by the child
-        scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
-        _optics(options.optics)
-        return ChildLink(url, options)
+        return ChildLink(url, options, load_profile(options.profile))
     instrument, clock = build_instrument(options, START_NS)
     return VirtualLink(instrument, clock, url)
 
@@ -179,13 +187,17 @@ class ChildLink:
     simulated = True
     virtual = False
 
-    def __init__(self, url: str, options: SimOptions) -> None:
+    def __init__(self, url: str, options: SimOptions, profile: Profile) -> None:
         self.name = url
         self._child = _spawn(options)
         try:
+            _check_scene(
+                options, profile
+            )  # while the child starts: it has far more to load before it could tell a mistake
             self._url = self._first_line()
             self._connect()
         except BaseException:
+            self._child.kill()  # it may not have come to where it sees that it is to end
             self._end_child()
             raise
 
@@ -227,6 +239,14 @@ class ChildLink:
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
+
+
+def _check_scene(options: SimOptions, profile: Profile) -> None:
+    """Raise what is wrong with the scene here, where it is better told than by the child."""
+    from .on_table import scene_on_table
+
+    scene_on_table(options.scene, options.changes, options.optics, profile, options.bleach, options.seed)
+    _optics(options.optics)
 
 
 def _spawn(options: SimOptions) -> subprocess.Popen[bytes]:

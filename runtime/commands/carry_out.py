@@ -22,7 +22,7 @@ from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.html_card import html_card
 from pans.runtime.link.base import open_link
 from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
-from pans.runtime.operate.first_start import compiled_beside
+from pans.runtime.operate.first_start import compiled_beside, load_ahead
 
 from .job import Job, recording_header, stops_of, what_was_run
 from .run_files import check_run_files, claimed, gone_if_refused
@@ -220,6 +220,7 @@ def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
         say(f"pans: live page at {beside.monitor.url}")
     try:
         ready = _prepare(job, started_ns)
+        load_ahead()
     except BaseException:
         _close_quietly(opening)
         raise
@@ -288,7 +289,6 @@ def _watched(
     from pans.runtime.watch import Attendants
 
     dark, monitor = ready.dark, beside.monitor
-    beside.compiled()
     monitor.begin(ready.bundle, recorder, _facts(job, ready, link))
     with Attendants(job.continuous, recorder, beside.watchdog, beside.stop) as seen:
 
@@ -307,7 +307,7 @@ def _watched(
             seen.tell(run)
             monitor.watch(run, output)
 
-        observers = Observers(look, prepared, beside.stop, acts=False)
+        observers = Observers(look, prepared, beside.stop, acts=False, uploaded=beside.compiled)
         return run_live(
             link, dark.profile, ready.bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers
         )

@@ -7,8 +7,11 @@ shipped bundle, the shipped scene and the simulated instrument at real pace.
 from __future__ import annotations
 
 import argparse
+import gc
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pans.runtime import SHIPPED
@@ -133,6 +136,19 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(deadline_us=DEMO_DEADLINE_US)
 
 
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Leave out the search for garbage while all that a run needs is loaded, a sixth of that time; the run's end switches it on again."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+@_uncollected()
 def _run(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path
 
@@ -145,6 +161,7 @@ def _run(args: argparse.Namespace) -> int:
     return EXIT_FINE
 
 
+@_uncollected()
 def _demo(args: argparse.Namespace) -> int:
     device = f"sim:{args.profile}?scene={DEMO_SCENE}&seed={args.seed}&pace={args.pace}"
     decisions = 0 if args.seconds else DEMO_OBJECTS * args.trials

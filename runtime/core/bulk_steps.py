@@ -27,7 +27,7 @@ from .stream_arrays import DecisionTables, MarkArrays, WalkArrays
 from .window import DecisionWindows
 from .window_kernels import WindowArrays
 
-ROWS_PER_BATCH = 65536
+ROWS_PER_BATCH = 65536  # fewer and longer ways through Python; memory for them is a megabyte per 18 000
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 _KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}

@@ -50,6 +50,8 @@ NS_PER_S = 1_000_000_000
 class Observers:
     """Who observes a run: `watch` after every block, with the run and the block's output; `prepared` once, before arming.
 
+    `uploaded` is called when the device has the plan, before the first kernel is needed: what compiles them elsewhere can be waited for.
+
     A watcher that only looks (`acts` is False) gets what a compiled turn brought all at once.
     """
 
@@ -57,6 +59,7 @@ class Observers:
     prepared: Callable[[LiveRun], None] | None = None
     stop: Stop | None = None
     acts: bool = True
+    uploaded: Callable[[], None] | None = None
 
 
 NO_OBSERVERS = Observers()
@@ -81,7 +84,7 @@ def run_live(
     failed: list[Connection] = []
 
     def prepare(opened: Link) -> Connection:
-        return open_session(opened, recorder, plan, bundle, profile.clock.tick_hz, failed)
+        return open_session(opened, recorder, plan, bundle, profile.clock.tick_hz, failed, observers.uploaded)
 
     try:
         connection = prepare(link)
@@ -156,7 +159,13 @@ def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoi
 
 
 def open_session(
-    link: Link, recorder: AnyRecorder | None, plan: Plan, bundle: Bundle, tick_hz: int, failed: list[Connection]
+    link: Link,
+    recorder: AnyRecorder | None,
+    plan: Plan,
+    bundle: Bundle,
+    tick_hz: int,
+    failed: list[Connection],
+    uploaded: Callable[[], None] | None = None,
 ) -> Connection:
     """Open a session, check that it is the right device, and bring it to where ARM can follow; one that breaks goes to `failed`."""
     connection = Connection(link) if recorder is None else Connection(link, recorder.add_command, recorder.add_answer)
@@ -165,6 +174,8 @@ def open_session(
         check_device(facts, plan, bundle, tick_hz)
         check_scene(facts, bundle)
         connection.upload(plan, bundle)
+        if uploaded is not None:
+            uploaded()
         connection.synchronise()
         connection.decoder.use_kernels()
     except BaseException:

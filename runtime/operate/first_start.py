@@ -14,14 +14,16 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 from pans.runtime.errors import PansError
 
-from .warm import JOBS, PATIENCE_S, Job, cache_folder, start
+from .warm import JOBS, PATIENCE_S, Job, cache_folder, compile_settling, start
 
 LARGEST = "core"  # the job of the other process
+LATER = ("live.loop", "live.lasting", "monitor.snapshot", "record.parted_recorder", "watch.attendants", "watch.host")
 BESIDE = "link"  # what this process compiles meanwhile
 PACKAGES = ("core", "decide", "wire", "turn")  # whose sources the largest kernels are made from
 
@@ -57,6 +59,18 @@ def _begin() -> subprocess.Popen[str] | None:
         if stamp is not None and not stamp.exists():
             return start(Job(LARGEST, ("-m", "pans.runtime.operate.warm", LARGEST)))
     return None
+
+
+def load_ahead() -> None:
+    """Load what a run needs besides, while its port opens: nothing of it has to be loaded between there and ARM."""
+    from pans.runtime.record.recorder import load_kernels
+    from pans.runtime.wire.bulk import BulkDecoder
+
+    load_kernels()
+    BulkDecoder().warm_up()
+    compile_settling()
+    for name in LATER:
+        import_module(f"pans.runtime.{name}")
 
 
 def note_compiled() -> None:

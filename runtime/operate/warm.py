@@ -22,6 +22,7 @@ from pans.runtime.cli import say
 from pans.runtime.errors import PansError
 
 if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
     from pans.runtime.core.still import Core
 
 WALKING, STILL = "fashion-adaptive", "fashion10"
@@ -45,28 +46,44 @@ class Job:
 
 def compile_core() -> None:
     """The steps of sequential streams, fixed patterns and walks alike, and the compiled turn."""
+    from pans.runtime.bundle.model import load_bundle
     from pans.runtime.turn import Turn
     from pans.runtime.wire.bulk import BulkDecoder
 
-    steps = _compile_steps(WALKING, WALKING_PROFILE).bulk_steps(1)
+    bundle, _ = load_bundle(WALKING)
+    steps = _compile_steps(bundle, WALKING_PROFILE, _Leaves(bundle)).bulk_steps(1)
     if steps is not None:
         Turn(steps, BulkDecoder()).warm_up()
 
 
 def compile_still() -> None:
     """The back ends of fixed patterns, and the steps of Python's turn."""
-    _compile_steps(STILL, STILL_PROFILE).warm_up_steps()
-
-
-def _compile_steps(name: str, profile: str) -> Core:
     from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.decide.backends import make_decider
+
+    bundle, _ = load_bundle(STILL)
+    _compile_steps(bundle, STILL_PROFILE, make_decider(bundle)).warm_up_steps()
+
+
+class _Leaves:
+    """What compiled steps ask of the back end of an automaton, whose own kernels another process compiles."""
+
+    name = "automaton"
+
+    def __init__(self, bundle: Bundle) -> None:
+        from pans.runtime.decide.automaton import leaf_verdicts, walked_within
+
+        assert bundle.automaton is not None
+        self.automaton = walked_within(bundle, bundle.automaton, 0.0, None)
+        self.n_features, self.n_classes = self.automaton.n_bits, self.automaton.n_classes
+        self.labels, self.probabilities = leaf_verdicts(self.automaton, 0.0)
+
+
+def _compile_steps(bundle: Bundle, profile: str, decider: Any) -> Core:
     from pans.runtime.core.plan import build_plan
     from pans.runtime.core.still import Core
-    from pans.runtime.decide.backends import make_decider
     from pans.runtime.instrument.profile import load_profile
 
-    bundle, _ = load_bundle(name)
-    decider = make_decider(bundle)
     plan = build_plan(load_profile(profile), bundle, automaton=getattr(decider, "automaton", None))
     core = Core(plan, decider, 1, 0)
     core.warm_up()
@@ -87,7 +104,7 @@ def compile_link() -> None:
     rates = np.full(1, 0.01)
     ChannelWatch(1, rates).warm_up()
     DeadChannelTest(rates, 1e9, 1e9).warm_up()
-    _compile_settling()
+    compile_settling()
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "warm.pansrec", {}) as recorder:
         recorder.close({})
     if hasattr(os, "sched_getaffinity"):
@@ -95,7 +112,7 @@ def compile_link() -> None:
             pass
 
 
-def _compile_settling() -> None:
+def compile_settling() -> None:
     """What is done with what a call of the compiled turn has brought."""
     import numpy as np
 

@@ -80,11 +80,7 @@ class Recorder:
         first = (self._commands, self._answers, self._messages, self._decisions)
         self._in_order = (*first, self._timings, self._timing_runs)
         self._log = LogEncoder()
-        from .kernels import pack_messages, pack_stamped  # numba is loaded only by who records
-
-        self._pack, self._pack_stamped = pack_messages, pack_stamped
-        pack_messages(self._messages.array, np.zeros((0, 2), np.int64), 0, 0, 0, self._messages.array, 0)
-        pack_stamped(self._messages.array, np.zeros((0, 4), np.int64), 0, self._messages.array, 0)
+        self._pack, self._pack_stamped = _packing()
         self._n_decisions = 0
         self._n_blocks = 0
         self._version = version = version_for(header)
@@ -364,6 +360,21 @@ class Recorder:
             f"{self.path}: the recording stops after {self._end} bytes: {reason}",
             remedy="make room on the disk; what was written before is readable",
         )
+
+
+def load_kernels() -> None:
+    """Compile or load what a recorder needs, which it would do when it is made."""
+    _packing()
+    LogEncoder()
+
+
+def _packing() -> tuple[Any, Any]:
+    from .kernels import pack_messages, pack_stamped  # numba is loaded only by who records
+
+    none = np.zeros(0, np.uint8)
+    pack_messages(none, np.zeros((0, 2), np.int64), 0, 0, 0, none, 0)
+    pack_stamped(none, np.zeros((0, 4), np.int64), 0, none, 0)
+    return pack_messages, pack_stamped
 
 
 def _create(beside: Path, path: Path) -> Any:

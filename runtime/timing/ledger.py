@@ -175,7 +175,8 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     """
     granted: dict[str, Any] = {}
     interval = sys.getswitchinterval()
-    gc.collect()
+    if gc.isenabled():  # else all is as it was loaded, and to look through it takes 50 ms
+        gc.collect()
     if not _heap.frozen:
         gc.freeze()
     gc.disable()
