@@ -87,7 +87,7 @@ class LogEncoder:
         """Take the next rows, DECISION_DTYPE (n,), n at most BLOCK_ROWS, and return the payload that holds them."""
         runs, verdicts, exposures, codes = self._take(rows)
         head = _HEAD.pack(len(runs), len(verdicts), len(codes))
-        return b"".join((head, runs, verdicts, codes, exposures if exposures.any() else b""))
+        return b"".join((head, runs.data, verdicts.data, codes.data, exposures.data if exposures.any() else b""))
 
     def update(self, rows: NDArray[np.void]) -> None:
         """Take the next rows, DECISION_DTYPE (n,), for their hash alone."""
@@ -165,10 +165,10 @@ class _LogHash:
         runs, verdicts, exposures, codes = parts
         if not len(runs):
             return
-        self._verdicts.update(verdicts)
-        self._exposures.update(exposures)
+        self._verdicts.update(verdicts.data)
+        self._exposures.update(exposures.data)
         self._walks = self._walks or bool(exposures.any())
-        self._codes.update(codes)
+        self._codes.update(codes.data)
         start = 0
         if runs["continues"][0] and len(self._open):
             start = 1

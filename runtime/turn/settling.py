@@ -41,7 +41,7 @@ def add_rows(rows, first, marked, photons_of, plan, sums, photons, table, trials
     numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
     truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
     n_clicks, n_walked, n_right = np.int64(0), np.int64(0), np.int64(0)
-    n_photons, n_silent, n_unsure, n_known = 0, 0, 0, 0
+    n_photons, n_silent, n_unsure, n_known = np.int64(0), 0, 0, np.int64(0)
     total, per_decision, object_before, n_objects = photons[0], plan[0], np.int64(-1), 0
     i, n, room = np.int64(first), np.int64(rows.size), objects.shape[0]
     while i < n and n_objects < room:  # the decisions in a row on one object share all that it tells
@@ -74,7 +74,8 @@ def add_rows(rows, first, marked, photons_of, plan, sums, photons, table, trials
                 trials[trial, 1] += right
                 well += right
             i += 1
-        n_photons += i - begun if lit else 0
+        if lit:
+            n_photons += i - begun
         if not known or i == begun:
             continue
         n_known += i - begun
