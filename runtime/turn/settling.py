@@ -25,7 +25,7 @@ LONGEST, UNCERTAINTY, LATE, BLAME, N_JUDGED = 0, 5, 6, 7, 10
 STEP, ENDED_NS, UNSURE_NS, LOOK, N_MARKED = range(5)
 IS_LATE, IS_AHEAD = 1, 2
 _ABSTAINED, _AMBIGUOUS = np.uint32(DecisionFlag.ABSTAINED), np.uint32(DecisionFlag.AMBIGUOUS)
-_NO_LABEL = NO_LABEL
+_NO_LABEL, _U = NO_LABEL, np.uint64
 
 
 @outer
@@ -69,9 +69,9 @@ def add_rows(rows, first, marked, photons_of, plan, sums, photons, table, trials
             if known:
                 right = np.int64(label == truth)
                 if label != _NO_LABEL:
-                    table[truth, label] += 1
-                trials[trial, 0] += 1
-                trials[trial, 1] += right
+                    table[_U(truth), _U(label)] += 1
+                trials[_U(trial), 0] += 1
+                trials[_U(trial), 1] += right
                 well += right
             i += 1
         if lit:

@@ -153,8 +153,8 @@ def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-de
     exposure = np.int64(load8(kept, payload + _U(16)))
     slot, here, n_dark = exposure % dark_slot.size, exposure % lit.size, 0
     start, n_lit = payload + _U(stream.BLOCK_HEADER), np.int64(0)
-    for i in range(count):
-        n_lit += lit[here + i]
+    for i in range(_U(here), _U(here + count)):  # of places that cannot be negative numba makes one addition for many
+        n_lit += lit[i]
     if n_lit == count:
         _all_seen(kept, start, count * np.int64(width), np.int64(width), seen)
     for byte in range(n_bytes if n_lit < count else 0):
