@@ -26,6 +26,7 @@ from pans.trainer.options import Options
 from .exposure import top_limits
 from .imaging import bleached_patterns
 
+AT_TOP = 1e-5  # relative distance at which a pixel is as bright as the top level: some steps of float32
 KAIMING_A = 1.2  # paper, appendix on the training procedure
 
 
@@ -36,7 +37,8 @@ class ActiveIllumination(nn.Module):
     exposures that the profile allows. With `levels` set, the forward pass shows whole levels, and the gradient passes the
     rounding straight through; the photoelectrons of the top level are then trained too.
 
-    Transmissions may have one more column, the light that dark pixels bring where a full one gives 1 (imaging.py).
+    Transmissions may have one more column, the light that dark pixels bring where a full one gives 1 (imaging.py). The top level is
+    dimmed by what it leaks; with `pulled` the pixels that stand at it raise it by what they lack, from its lower limit too.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class ActiveIllumination(nn.Module):
         self.log_top = nn.Parameter(torch.tensor(math.log(top_limits[1])))
         self.top_limits = top_limits
         self.levels: int | None = None
+        self.pulled = False
         self.bleaching = NO_BLEACHING  # what the patterns do to the objects, shown in their order
 
     def start_quantising(self, levels: int) -> None:
@@ -63,12 +66,15 @@ class ActiveIllumination(nn.Module):
 
     def top(self) -> Tensor:
         """Photoelectrons of the brightest level, inside its limits."""
-        low, high = self.top_limits
-        return self.log_top.exp().clamp(low, high)
+        top = self.log_top.exp()
+        inside = top.clamp(*self.top_limits)
+        return top + (inside - top).detach() if self.pulled else inside
 
     def dim_to_top(self) -> None:
         """Take brighter pixels back to the brightest level: beyond it no gradient would ever make them darker again."""
         with torch.no_grad():
+            if self.pulled:  # at a limit, from which the next gradient may bring it back
+                self.log_top.clamp_(*(math.log(limit) for limit in self.top_limits))
             bound = math.sqrt(self.top_limits[1] if self.levels is None else float(self.top()))
             self.weight.clamp_(-bound, bound)
 
@@ -84,9 +90,14 @@ class ActiveIllumination(nn.Module):
         light = self.weight**2
         if self.levels is None:
             return light.clamp(max=self.top_limits[1])
-        step = self.top() / (self.levels - 1)
+        top = self.top()
+        step = top / (self.levels - 1)
         level = (light / step).clamp(max=self.levels - 1)
-        return (level + (level.round() - level).detach()) * step
+        shown: Tensor = (level + (level.round() - level).detach()) * step
+        if self.pulled:
+            at_top = light.detach() >= (1 - AT_TOP) * top.detach()
+            shown = shown + at_top * (top - top.detach())
+        return shown
 
     def forward(self, transmission: Tensor, floor: float = 0.0) -> Tensor:
         """Return photoelectrons (n, d_f) of objects with `transmission` (n, pixels), black lifted to `floor`."""

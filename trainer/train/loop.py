@@ -151,6 +151,7 @@ class Run:
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
         if data.optics is not None and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(FINE_LEVELS)
+            self.encoder.pulled = True
         self.head = new_head(options, data.n_outputs, data.image_shape, self.random)
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)

@@ -68,3 +68,38 @@ def test_patterns_bleach_in_training_as_they_do_elsewhere(dose: float, mixed: bo
     np.testing.assert_allclose(bleached_patterns(law, light).numpy(), bleached(law, light.numpy()), rtol=1e-9)
     small = light.float()[:3, :2].double().requires_grad_()
     assert torch.autograd.gradcheck(lambda x: bleached_patterns(law, x), (small,), eps=1e-6 * min(1.0, dose), rtol=1e-3)
+
+
+def test_pixels_at_the_brightest_level_raise_it_by_what_they_lack():
+    random = torch.Generator().manual_seed(2)
+    encoder = ActiveIllumination(2, 42, (0.1, 2.0), random)
+    encoder.start_quantising(1 << 16)
+    encoder.pulled = True
+    with torch.no_grad():
+        encoder.weight[0, 3], encoder.weight[1, 5] = 1.0, -1.0  # brighter than the level of 0.1: they are dimmed to it
+    encoder.dim_to_top()
+    seen = through(TABLE, torch.rand((1, 42), generator=random), SHAPE)
+    encoder(seen).sum().backward()
+    found = float(encoder.log_top.grad)
+    # the light that a level one part in a thousand brighter brings, with the two pixels as bright as it
+    before = float(encoder(seen).detach().double().sum())
+    with torch.no_grad():
+        encoder.log_top += 1e-3
+        encoder.weight[0, 3], encoder.weight[1, 5] = encoder.top().sqrt(), -encoder.top().sqrt()
+    more = float(encoder(seen).detach().double().sum()) - before
+    assert found == pytest.approx(more / 1e-3, rel=0.02)
+
+
+def test_training_can_raise_the_brightest_level_from_its_least():
+    encoder = ActiveIllumination(1, 42, (0.1, 2.0), torch.Generator().manual_seed(2))
+    encoder.start_quantising(1 << 16)
+    encoder.pulled = True
+    one = torch.zeros(1, 43)
+    one[0, 7], one[0, 42] = 1.0, 0.002  # an object of one pixel, and what dark pixels leak on it
+    optimiser = torch.optim.Adam(encoder.parameters(), lr=0.02)
+    for _ in range(150):
+        optimiser.zero_grad()
+        (encoder(one) - 0.7).square().sum().backward()
+        optimiser.step()
+        encoder.dim_to_top()
+    assert float(encoder(one).detach()) == pytest.approx(0.7, rel=0.05)
