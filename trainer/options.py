@@ -20,7 +20,7 @@ STRAIGHT_THROUGH = ("ste", "identity")  # from the first epoch to the last
 ESTIMATOR_NAMES = (*STRAIGHT_THROUGH, "exact", "local", "disarm", "loo")  # estimators.py
 ENCODERS = ("active", "coherent", "incoherent")
 PICTURE_HEADS = ("picture", "decoder")  # heads.py
-HEADS = ("mlp", "conv", *PICTURE_HEADS)
+HEADS = ("mlp", "deep", "conv", *PICTURE_HEADS)
 # (gain on the relative excess, least weight). Firm: the full rate from an excess of 20 % on, and a weight never so small that it
 # would not be back in time; it meets tight budgets. Gentle: the light is spent first and given back late, which found better patterns.
 BUDGETS = {"firm": (5.0, 3e-4), "gentle": (1.0, 1e-5)}
@@ -29,7 +29,7 @@ DEFAULT_ALPHA = 3e-4  # weight of the illumination that costs little accuracy on
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What to train. `alpha` weighs the illumination; `photons` and `clicks` are targets per inference, held by weights."""
+    """What to train. `alpha` weighs the illumination; `photons`, `clicks` and `illumination` are targets per inference, held by weights."""
 
     features: int
     alpha: float | None = None
@@ -69,6 +69,7 @@ class Options:
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
     outcomes: int = 2  # of an exposure; 3: no photon, one, two or more, on a detector that counts
     spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (concentration.py)
+    illumination: float | None = None  # of patterns that are sent: sum of their intensities
 
 
 SLOPE_MAX = 1e6  # times the light that is meant: far beyond what annealing needs
@@ -104,7 +105,7 @@ def check_options(options: Options, profile: Profile) -> None:
     for name, allowed in CHOICES.items():
         if getattr(options, name) not in allowed:
             raise UsageError(f"{_flag(name)} is {getattr(options, name)!r}, allowed: {', '.join(allowed)}")
-    for name in ("alpha", "photons", "clicks", "light", "input_photons"):
+    for name in ("alpha", "photons", "clicks", "illumination", "light", "input_photons"):
         value = getattr(options, name)
         if value is not None and not (value <= LIGHT_MAX and (value > 0 or (name == "alpha" and value == 0))):
             raise UsageError(f"{_flag(name)} is {value:g}, allowed: above 0, at most {LIGHT_MAX:g}")
@@ -135,6 +136,8 @@ def _check_together(options: Options) -> None:
             f"--clicks is {options.clicks}, allowed: below {options.features * (options.outcomes - 1)}, "
             f"{'one click' if options.outcomes == 2 else f'{options.outcomes - 1} photons'} per pattern at most"
         )
+    if options.illumination is not None and options.encoder != "active":
+        raise UsageError(f"--illumination: a {options.encoder} encoder sends no light", remedy="--input-photons N")
     most = int(math.log(EXACT_WORDS_MAX, options.outcomes) + 1e-9)
     if options.estimator == "exact" and options.features > most:
         raise UsageError(
@@ -225,3 +228,9 @@ def plain_options(options: Options) -> dict[str, Any]:
 def same_options(found: dict[str, Any], options: Options) -> bool:
     """Return whether `found` (of `plain_options`, perhaps of an earlier version) means `options`: new ones at their defaults."""
     return plain_options(Options(features=options.features)) | found == plain_options(options)
+
+
+def differing_options(options: Options) -> dict[str, Any]:
+    """Return what the options are besides the plain ones of as many patterns: finished parts kept by it outlive options that come later."""
+    plain = plain_options(Options(features=options.features))
+    return {key: value for key, value in plain_options(options).items() if key == "features" or value != plain[key]}

@@ -34,7 +34,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="another draw of a drawn task (default 0); the page of draw 0 names the finished cells of others beside its own",
     )
-    words = "of frontier: how many seeds each row is measured with (default 5); finished ones are kept"
+    words = "of frontier, and of FashionMNIST and MNIST in equal-photons: how many seeds per row (default 5); finished ones are kept"
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help=words)
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help=f"finished rows (default: {CACHE})")
     words = "write NAME.json, the pictures and the tables of NAME.md there; what NAME.md says around the tables stays"

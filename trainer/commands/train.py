@@ -169,7 +169,8 @@ def _options(args: argparse.Namespace, task: Task, profile: Profile) -> Options:
         raise UsageError(f"--encoder active: {task.name} lies behind a fibre", remedy="use --encoder coherent")
     best = "exact" if min(args.outcomes or 2, 16) ** args.features <= EXACT_WORDS_MAX else "local"
     estimator = args.estimator or ("ste" if is_picture else best)
-    alpha = args.alpha if args.alpha is not None or args.photons is not None else DEFAULT_ALPHA
+    budgets = (args.photons, args.illumination)
+    alpha = args.alpha if args.alpha is not None or any(one is not None for one in budgets) else DEFAULT_ALPHA
     given: dict[str, Any] = {"optics": stated_tolerance(profile) if encoder == "active" else None}
     given |= {name: value for name in AS_GIVEN if (value := getattr(args, name)) is not None}
     if encoder != "active":

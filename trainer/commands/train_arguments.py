@@ -20,6 +20,7 @@ AUTOMATON = "automaton"
 NUMBERS = (
     ("input_photons", "N", "mean photoelectrons that reach a passive encoder in one exposure"),
     ("clicks", "C", "clicks per decision to aim for, beside either"),
+    ("illumination", "L", "photoelectrons to send per decision, summed over all pixels of all patterns"),
     ("epochs", "E", "passes over the training objects (default 60)"),
     ("restarts", "R", "trainings; the best on validation stays"),
     ("starts", "S", "runs of the first stage per restart; the best goes on"),
@@ -177,5 +178,5 @@ def _add_of_fixed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--budget",
         choices=tuple(BUDGETS),
-        help="how strictly --photons and --clicks hold during training (default firm)",
+        help="how strictly --photons, --clicks and --illumination hold during training (default firm)",
     )

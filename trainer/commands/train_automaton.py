@@ -61,6 +61,7 @@ FOREIGN = (
         "estimator",
         "head",
         "alpha",
+        "illumination",
         "budget",
         "input_photons",
         "restarts",

@@ -90,7 +90,7 @@ def _fill(args: argparse.Namespace, recipe: Recipe) -> list[str]:
     for name in ("copies", "soft"):  # not those of a public set whose name the folder bears
         if recipe.encoder == AUTOMATON and getattr(args, name) is None:
             setattr(args, name, 0)
-    if args.photons is None and args.clicks is None and getattr(args, "alpha", None) is None:
+    if all(getattr(args, name, None) is None for name in ("photons", "clicks", "alpha", "illumination")):
         args.photons = recipe.photons
         return [f"{recipe.photons:g} photons per decision: a first guess (--photons N for another budget)"]
     return []
@@ -108,7 +108,7 @@ def finish(args: argparse.Namespace, task: Task, profile: Profile, figures: Mapp
     """Warn of a budget that was not met, compare with direct imaging at equal photons, and name the next commands."""
     photons = figures["photons_mean"]
     if args.encoder != AUTOMATON:  # whose own words tell it
-        warn_of_budget(args, figures["clicks_mean"], photons)
+        warn_of_budget(args, figures["clicks_mean"], photons, figures["illumination"])
     words, payload = [], {}
     if task.light == "transmission" and photons >= LEAST_PHOTONS:
         direct = compared(task, photons, args.seed or 0)
@@ -136,9 +136,9 @@ def compared_words(found: dict[str, Any]) -> str:
     )
 
 
-def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float) -> None:
+def warn_of_budget(args: argparse.Namespace, clicks: float, photons: float, illumination: float) -> None:
     """Warn where the finished sensor is far from the budget."""
-    for name, found in (("clicks", clicks), ("photons", photons)):
+    for name, found in (("clicks", clicks), ("photons", photons), ("illumination", illumination)):
         wanted = getattr(args, name)
         if wanted is not None and abs(found / wanted - 1) > BUDGET_OFF:
             warn(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 from torch import Tensor
 
-from pans.trainer.model.heads import CHANNELS, EPSILON, ConvHead, DecoderHead, Heads, MlpHead, PictureHead
+from pans.trainer.model.heads import CHANNELS, EPSILON, ConvHead, DecoderHead, DeepHead, Heads, MlpHead, PictureHead
 
 OPSET = 17  # the newest of IR version 8
 IR_VERSION = 8  # onnxruntime 1.18 reads up to 10, and every later one reads this
@@ -54,7 +54,7 @@ def head_onnx(head: Heads, click_mean: F64) -> tuple[bytes, tuple[int, ...]]:
         nodes, constants = _conv(head, np.diag(weight), bias)
     else:
         folded = {"w1": weight.astype(np.float32), "b1": bias.astype(np.float32)}
-        of_head = {MlpHead: _mlp, PictureHead: _picture, DecoderHead: _decoder}[type(head)]
+        of_head = {MlpHead: _mlp, DeepHead: _deep, PictureHead: _picture, DecoderHead: _deep}[type(head)]
         nodes, constants = of_head(head, folded)  # type: ignore[operator]
     n_outputs = math.prod(head.image_shape) if isinstance(head, PictureHead) else head.output.out_features
     return model_bytes("head", nodes, constants, len(click_mean), n_outputs), dead
@@ -78,7 +78,7 @@ def _mlp(head: MlpHead, folded: dict[str, NDArray[Any]]) -> Graph:
     return [*_hidden("clicks"), _gemm(2, "hidden", "scores")], folded | _float32("w2 b2", head.output)
 
 
-def _decoder(head: DecoderHead, folded: dict[str, NDArray[Any]]) -> Graph:
+def _deep(head: DeepHead, folded: dict[str, NDArray[Any]]) -> Graph:
     nodes = [*_hidden("clicks"), _gemm(2, "hidden", "sums2"), _relu("sums2", "hidden2"), _gemm(3, "hidden2", "scores")]
     return nodes, folded | _float32("w2 b2", head.second) | _float32("w3 b3", head.output)
 

@@ -4,6 +4,7 @@ Owns the digital back end in torch; never samples. A head takes click means (n, 
 (n, classes), or pixels (n, height * width); `changed` gives them for every word that differs in one click.
 
 - `MlpHead`: one hidden layer, the paper's (512 units).
+- `DeepHead`: two hidden layers, the paper's for cells (512 and 512 units).
 - `ConvHead`: convolutions along the patterns, kernel 15 as in the paper's comparison, for any number of patterns.
 - `PictureHead`: an image decoder, from clicks to a coarse picture and by transposed convolutions to the full one.
 - `DecoderHead`: an image decoder of two hidden layers, the paper's (512 and 512 units); a seventh of the other's time per picture.
@@ -106,6 +107,19 @@ class MlpHead(_DenseHead):
         _start(generator, self.hidden, self.output)
 
 
+class DeepHead(_DenseHead):
+    """Two hidden layers with ReLU, scores (paper, cells: 512 and 512 hidden units)."""
+
+    def __init__(self, n_features: int, n_hidden: int, n_outputs: int, generator: torch.Generator) -> None:
+        super().__init__(n_features, n_features, n_hidden)
+        self.second = nn.Linear(n_hidden, n_hidden)
+        self.output = nn.Linear(n_hidden, n_outputs)
+        _start(generator, self.hidden, self.second, self.output)
+
+    def rest(self, hidden: Tensor) -> Tensor:
+        return super().rest(torch.relu(self.second(hidden)))
+
+
 class ConvHead(_Head):
     """Two convolutions along the patterns that halve the length, one hidden layer, scores."""
 
@@ -147,22 +161,17 @@ class PictureHead(_Head):
         return picture[:, 0, : self.image_shape[0], : self.image_shape[1]].flatten(1)
 
 
-class DecoderHead(_DenseHead):
+class DecoderHead(DeepHead):
     """Two hidden layers with ReLU, pixels (paper: d_f, 512, 512, 784)."""
 
     def __init__(self, n_features: int, n_hidden: int, image_shape: Shape, generator: torch.Generator) -> None:
-        super().__init__(n_features, n_features, n_hidden)
+        super().__init__(n_features, n_hidden, image_shape[0] * image_shape[1], generator)
         self.image_shape = image_shape
-        self.second = nn.Linear(n_hidden, n_hidden)
-        self.output = nn.Linear(n_hidden, image_shape[0] * image_shape[1])
-        _start(generator, self.hidden, self.second, self.output)
-
-    def rest(self, hidden: Tensor) -> Tensor:
-        return super().rest(torch.relu(self.second(hidden)))
 
 
 Decoders = PictureHead | DecoderHead  # what returns pictures
-Heads = MlpHead | ConvHead | Decoders
+Heads = MlpHead | DeepHead | ConvHead | Decoders
+OF_CLASSES = {"mlp": MlpHead, "deep": DeepHead, "conv": ConvHead}
 
 
 def new_head(options: Options, n_outputs: int, image_shape: Shape, random: torch.Generator) -> Heads:
@@ -170,8 +179,7 @@ def new_head(options: Options, n_outputs: int, image_shape: Shape, random: torch
     if options.head in PICTURE_HEADS:
         decoder = PictureHead if options.head == "picture" else DecoderHead
         return decoder(options.features, options.hidden, image_shape, random)
-    kind = ConvHead if options.head == "conv" else MlpHead
-    return kind(options.features, options.hidden, n_outputs, random)
+    return OF_CLASSES[options.head](options.features, options.hidden, n_outputs, random)
 
 
 def _start(generator: torch.Generator, *layers: nn.Module) -> None:

@@ -156,7 +156,9 @@ class Run:
         self.epoch = 0
         steps = options.epochs * math.ceil(data.n_fit / options.batch)
         self.dual_rate = min(DUAL_RATE_MAX, max(DUAL_RATE, DUAL_TRAVEL / steps))
-        self.weights = {"photons": 1e-3, "clicks": 1e-3}  # of the budgets; they follow the excess
+        self.weights = dict.fromkeys(
+            ("photons", "clicks", "illumination"), 1e-3
+        )  # of the budgets; they follow the excess
         self.optimiser = self._new_optimiser()
 
     # ---- the loop ----
@@ -232,7 +234,7 @@ class Run:
         penalty = (self.options.alpha or 0.0) * illumination
         if self.options.spread and isinstance(self.encoder, ActiveIllumination):
             penalty = penalty + self.options.spread * concentration(self.encoder.patterns())
-        for name, measured in (("photons", photons), ("clicks", clicks)):
+        for name, measured in (("photons", photons), ("clicks", clicks), ("illumination", illumination)):
             target = getattr(self.options, name)
             if target is not None:
                 penalty = penalty + self.weights[name] * measured

@@ -96,18 +96,21 @@ def test_the_course_of_an_automaton_is_written_and_drawn(letters, tmp_path):
 
 
 def test_a_sensor_without_light_is_not_compared(capsys):
-    figures = {"clicks_mean": 0.0, "photons_mean": 0.0}
-    args = argparse.Namespace(task="t", encoder="active", out="t.pans", clicks=None, photons=10.0, seed=0)
+    figures = {"clicks_mean": 0.0, "photons_mean": 0.0, "illumination": 0.0}
+    budgets = {"clicks": None, "photons": 10.0, "illumination": 5.0}
+    args = argparse.Namespace(task="t", encoder="active", out="t.pans", **budgets, seed=0)
     found = train_own.finish(args, bars_task(20), load_profile("ideal"), figures)
     assert found.payload == {}
     assert "next:" in found.words
-    assert "--photons 10 was not met" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "--photons 10 was not met" in told
+    assert "--illumination 5 was not met" in told
 
 
 def test_a_budget_that_was_not_met_is_told(capsys):
-    train_own.warn_of_budget(argparse.Namespace(clicks=None, photons=10.0), clicks=3.0, photons=12.0)
+    train_own.warn_of_budget(argparse.Namespace(clicks=None, photons=10.0, illumination=None), 3.0, 12.0, 90.0)
     assert "--photons 10 was not met: a decision takes 12.00" in capsys.readouterr().err
-    train_own.warn_of_budget(argparse.Namespace(clicks=3.0, photons=None), clicks=3.1, photons=12.0)
+    train_own.warn_of_budget(argparse.Namespace(clicks=3.0, photons=None, illumination=None), 3.1, 12.0, 90.0)
     assert capsys.readouterr().err == ""
 
 

@@ -12,7 +12,7 @@ from pans.runtime.errors import PansError
 from pans.trainer.export import onnx_heads
 from pans.trainer.export.onnx_heads import DEAD_VARIANCE, IR_VERSION, fold_normalisation, head_onnx
 from pans.trainer.export.writer import Description, compare, export, reference_scores
-from pans.trainer.model.heads import EPSILON, ConvHead, MlpHead
+from pans.trainer.model.heads import EPSILON, ConvHead, DeepHead, MlpHead
 
 RNG = np.random.default_rng(0)
 
@@ -140,3 +140,11 @@ def test_a_convolutional_head_is_exported_and_compared(d_f, tmp_path):
     assert done.dead_patterns == (0,)
     assert done.score_difference <= 1e-5
     assert done.words_compared == (1 << d_f if d_f <= 12 else 10_000)
+
+
+def test_a_head_of_two_hidden_layers_is_exported_and_compared(tmp_path):
+    done = written(
+        tmp_path / "deep.pans", DeepHead(5, 8, 4, torch.Generator().manual_seed(0)).eval(), np.full(5, 0.3), 5
+    )
+    assert done.score_difference <= 1e-5
+    assert done.words_compared == 32

@@ -31,7 +31,7 @@ def test_the_picture_heads_give_pictures_of_the_wanted_shape(kind, made):
     assert head(torch.zeros(3, 4)).shape == (3, 54)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "conv", "picture", "decoder"])
+@pytest.mark.parametrize("kind", ["mlp", "deep", "conv", "picture", "decoder"])
 def test_flipped_is_a_pass_of_every_flipped_word(kind):
     head = head_of(kind, 4).double()
     clicks = torch.randint(0, 2, (6, 4), generator=torch.Generator().manual_seed(2)).double()
@@ -44,7 +44,7 @@ def test_flipped_is_a_pass_of_every_flipped_word(kind):
             assert torch.allclose(found[:, i], head(other, mean), atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "conv", "picture", "decoder"])
+@pytest.mark.parametrize("kind", ["mlp", "deep", "conv", "picture", "decoder"])
 def test_heads_start_from_the_generator_alone(kind):
     torch.manual_seed(1)
     first = head_of(kind, 6)

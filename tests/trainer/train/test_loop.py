@@ -91,12 +91,15 @@ def test_another_seed_gives_other_patterns(task):
     assert not np.array_equal(first.quantised.pattern_levels, other.quantised.pattern_levels)
 
 
-@pytest.mark.parametrize(("name", "low", "high"), [("clicks", 0.8, 1.4), ("photons", 1.4, 3.0)])
-def test_budgets_pull_towards_their_target(task, name, low, high):
+@pytest.mark.parametrize(
+    ("name", "target", "low", "high"),
+    [("clicks", 1.1, 0.8, 1.4), ("photons", 2.2, 1.4, 3.0), ("illumination", 8.0, 6.0, 10.0)],
+)
+def test_budgets_pull_towards_their_target(task, name, target, low, high):
     free, held = [], []
     options = replace(SMALL, epochs=40, alpha=0.0, batch=32)
     train(task, PROFILE, options, report=free.append)
-    train(task, PROFILE, replace(options, **{name: 1.1 if name == "clicks" else 2.2}), report=held.append)
+    train(task, PROFILE, replace(options, **{name: target}), report=held.append)
     assert getattr(free[-1], name) > 1.3 * getattr(held[-1], name)
     assert low < getattr(held[-1], name) < high
 
