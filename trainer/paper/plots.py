@@ -55,7 +55,7 @@ def _finish(figure: Any, axes: Any, path: Path, title: str, legend: str | None =
 
 def accuracy_against_photons(path: Path, name: str, rows: Rows) -> None:
     """Draw the first 200 test images against clicks, as the paper does, and all of them against photons."""
-    from matplotlib.ticker import ScalarFormatter
+    from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
     figure, (left, right) = new_figure()
     for kind, style in (("simulation", "o--"), ("experiment", "s:")):
@@ -70,8 +70,10 @@ def accuracy_against_photons(path: Path, name: str, rows: Rows) -> None:
         one = row["all"]["1"]
         _beside(right, str(row["features"]), one["photons_mean"], 100 * one["accuracy_mean"], (4, -10))
     right.set(xlabel="photons per decision", xscale="log", title="all test images, at equal photons (numbers: d_f)")
+    right.margins(0.08)  # so that the numbers at the ends stay inside
+    right.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 50, 100, 200, 500]))
+    right.xaxis.set_minor_locator(NullLocator())
     right.xaxis.set_major_formatter(ScalarFormatter())
-    right.xaxis.set_minor_formatter(ScalarFormatter())
     _finish(figure, (left, right), path, "SIMULATED", "best", ylabel="accuracy, %")
 
 
@@ -88,8 +90,11 @@ def measure_over_patterns(path: Path, name: str, rows: Rows) -> None:
         axis.plot([r.features for r in printed], [r.values[i] for r in printed], "o--", color=f"C{i}", alpha=0.6)
         if mine := [row for row in rows if row["dark"] == dark]:
             _plot(axis, mine, "features", "value", color=f"C{i}", label=f"dark counts {dark:g}")
-    title = f"{name}: ours solid, the paper's dashed (SIMULATED)"
-    _finish(figure, axis, path, title, "best", xlabel="patterns", ylabel=table.measure)
+    whose = "ours solid, the paper's dashed" if any(row.values for row in table.rows) else "ours"
+    unit = "" if table.measure == "SSIM" else ", %"
+    _finish(
+        figure, axis, path, f"{name}: {whose} (SIMULATED)", "best", xlabel="patterns, d_f", ylabel=table.measure + unit
+    )
 
 
 # ---- trained rows ----

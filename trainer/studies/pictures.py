@@ -40,7 +40,6 @@ def sequence(path: Path, found: Row, margin: float) -> None:
     for label, (name, colour) in enumerate(zip(found["classes"], _COLOURS)):
         axes[2].plot(np.arange(n) + 0.5, outputs[:, label], color=colour, lw=0.9, label=name)
     axes[2].set(ylabel="outputs", ylim=(0, 1))
-    axes[2].legend(loc="upper right", fontsize=7, ncols=4)
     truth, decided = np.array(found["truth"]), outputs.argmax(axis=1)
     for y, labels in ((1, truth), (0, decided)):
         for label, colour in enumerate(_COLOURS):
@@ -49,6 +48,8 @@ def sequence(path: Path, found: Row, margin: float) -> None:
     axes[3].set(yticks=[0, 1], yticklabels=["decided", "truth"], ylim=(-0.6, 1.6), xlabel="frame")
     for axis in axes:
         axis.set_xlim(0, n)
+    names = axes[2].get_legend_handles_labels()  # below all axes: the outputs fill theirs
+    figure.legend(*names, loc="outside lower center", ncols=len(_COLOURS), fontsize=8)
     figure.suptitle(
         "cells in passing, one shot of ten patterns per frame; truth is empty in between (SIMULATED)", fontsize=10
     )
