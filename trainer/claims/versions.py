@@ -55,5 +55,5 @@ def _recipe(name: str, row: Row) -> Options | None:
         printed = (one for one in table_of(name).rows if one.features == row["features"])
         return next((passive_recipes.recipe(name, one, row["dark"]) for one in printed), None)
     if name == "equal-photons":
-        return (equal.recipe if row["way"] == "PANS" else equal.light_recipe)(row["task"], row["asked"])
+        return equal.recipe_of_row(row)
     return None

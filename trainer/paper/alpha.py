@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.outputs import replace_file
-from pans.trainer.options import Options, plain_options
+from pans.trainer.options import Options, differing_options
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.history import follow
 from pans.trainer.verdicts import against, claim
@@ -57,7 +57,7 @@ def course_of(asked: Asked, features: int, alpha: float) -> Row | None:
         final = measure(TASK, task, course.trained)
         return {"features": features, "alpha": alpha, "epochs": course.columns(), "final": final}
 
-    found = kept(path, plain_options(options), make, collect=asked.collect)
+    found = kept(path, differing_options(options), make, collect=asked.collect)
     if found is not None:
         final = found["final"]
         asked.report(

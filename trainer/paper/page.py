@@ -38,8 +38,8 @@ Draw = Callable[[Path], None]
 class Asked:
     """One page: finished parts lie in `cache`; `rows` are the only numbers of patterns wanted; with `collect` nothing is made.
 
-    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are of the tables over dark counts alone; `seeds` (how many) and
-    `results` (folder of other pages, whose rows are taken from there) are of the frontier.
+    `dark` (dark counts wanted) and `data_seed` (draw of the generator) are of the tables over dark counts alone; `seeds` (how many) is of
+    the frontier and of `equal-photons`, `results` (folder of other pages, whose rows are taken from there) of the frontier.
     """
 
     name: str

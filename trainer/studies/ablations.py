@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.options import Options, plain_options
+from pans.trainer.options import Options, differing_options, plain_options
 from pans.trainer.paper.page import Asked, Made, Row, Rows, Table, columns, kept, pages
 from pans.trainer.paper.passive import PROFILE, measure
-from pans.trainer.paper.passive_recipes import load
+from pans.trainer.paper.passive_recipes import CELLS_RATE, CLICKS_AIM_CELLS, load
 from pans.trainer.tasks.registry import Task, load_task
 from pans.trainer.train.loop import train
 from pans.trainer.verdicts import against, claim
@@ -25,6 +25,7 @@ from pans.trainer.verdicts import against, claim
 OBJECTS = 10_000  # training images
 SEEDS = (0, 1, 2)
 CLASSES, FIELD, RELEASE = "fashion-mnist", "mmf-mnist", "mmf-mnist, the release's speckle"
+CELLS = "cells-3"
 
 FEW = Options(features=10, alpha=0.0, photons=15.0, estimator="ste", epochs=20, batch=256, hidden=128)
 MANY = replace(FEW, features=32, photons=40.0, epochs=30, hidden=512)
@@ -40,6 +41,18 @@ SPECKLE = Options(
     head_rate=3e-3,
     encoder="coherent",
     dark=0.01,
+)
+IN_FLOW = Options(  # as the row of the table of cells, `passive_recipes`
+    features=10,
+    alpha=0.0,
+    clicks=CLICKS_AIM_CELLS * 5.92,  # the paper's
+    epochs=30,
+    warm=0.4,
+    polish=0.4,
+    hidden=128,
+    front_rate=CELLS_RATE,
+    head_rate=3e-3,
+    dark=0.0,
 )
 CONSERVING = replace(SPECKLE, clicks=None, conserving=True, input_photons=100.0)
 # without a straight-through stage a cycle of the rates is half as high in front (train/schedule.py): twice the rate makes it the same
@@ -57,7 +70,12 @@ class Arm:
     reference: bool = False
 
 
-HEAD, GRADIENT, START = "Head at d_f = 32", "Gradient at d_f = 10", "Slope and clamp at d_f = 10"
+HEAD, HEAD_OF_CELLS, GRADIENT, START = (
+    "Head at d_f = 32",
+    "Head of cells at d_f = 10",
+    "Gradient at d_f = 10",
+    "Slope and clamp at d_f = 10",
+)
 FIBRE, LOSSLESS = "Digits behind a fibre, clicks held", "Digits behind a fibre, light conserved"
 ARMS = (
     Arm(HEAD, "one hidden layer of 512", MANY, reference=True),
@@ -74,6 +92,9 @@ ARMS = (
     Arm(FIBRE, "field, W complex", replace(SPECKLE, complex_field=True), FIELD),
     Arm(LOSSLESS, "field, W real", CONSERVING, FIELD, reference=True),
     Arm(LOSSLESS, "field, W complex", replace(CONSERVING, complex_field=True), FIELD),
+    Arm(HEAD_OF_CELLS, "one hidden layer of 128", IN_FLOW, CELLS, reference=True),
+    Arm(HEAD_OF_CELLS, "one hidden layer of 512", replace(IN_FLOW, hidden=512), CELLS),
+    Arm(HEAD_OF_CELLS, "two hidden layers of 512", replace(IN_FLOW, head="deep", hidden=512), CELLS),
 )
 
 
@@ -85,7 +106,7 @@ def ablations_page(asked: Asked) -> Made:
             if not asked.wants(arm.options.features):
                 continue
             options = replace(arm.options, seed=seed)
-            made_with = {"images": arm.images, "objects": OBJECTS, "options": _differing(options)}
+            made_with = {"images": arm.images, "objects": OBJECTS, "options": differing_options(options)}
             found = kept(
                 asked.cache / f"ablation-{_name(arm, seed)}.json",
                 made_with,
@@ -107,12 +128,6 @@ def ablations_page(asked: Asked) -> Made:
                 }
             )
     return Made(rows)
-
-
-def _differing(options: Options) -> Row:
-    """What the options are besides the plain ones of as many patterns: options that come later leave finished parts valid."""
-    plain = plain_options(Options(features=options.features))
-    return {key: value for key, value in plain_options(options).items() if key == "features" or value != plain[key]}
 
 
 def _name(arm: Arm, seed: int) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.detection import click_probability, click_words
-from pans.trainer.options import Options, plain_options
+from pans.trainer.options import Options, differing_options
 from pans.trainer.paper.page import Asked, Draw, Made, Row, Rows, Table, columns, kept, pages
 from pans.trainer.paper.passive import PROFILE, light_of
 from pans.trainer.tasks.cells import CLASSES, draw
@@ -103,7 +103,7 @@ def truth_at(offset: int, label: int) -> int:
 def sequence_page(asked: Asked) -> Made:
     """Return rows of single frames and whole passages, one per cell of the sequence, and the sequence."""
     made_with = {
-        "options": plain_options(OPTIONS),
+        "options": differing_options(OPTIONS),
         "cells": [TRAINED, JUDGED, SHOWN],
         "rows": [NEAR_PX, FAR_PX, STEP_PX],
     }

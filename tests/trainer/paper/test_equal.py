@@ -10,12 +10,14 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.options import Options, check_options
+from pans.trainer.options import Options, check_options, same_options
 from pans.trainer.paper import equal, information, swept
+from pans.trainer.paper.active import direct_at
 from pans.trainer.paper.page import Asked
 from pans.trainer.paper.passive_recipes import basis_of, recipe
 from pans.trainer.paper.tables import UNPRINTED
 from pans.trainer.tasks.registry import Objects, Task
+from pans.trainer.train import head_fit
 
 
 def columns(n, side, n_classes, seed=0, light="transmission"):
@@ -30,6 +32,7 @@ def columns(n, side, n_classes, seed=0, light="transmission"):
 
 def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypatch):
     monkeypatch.setattr(equal, "TASKS", ("columns",))
+    monkeypatch.setattr(equal, "SETS", ())
     monkeypatch.setattr(equal, "PHOTONS", (3.0,))
     monkeypatch.setattr(equal, "NETWORK_EPOCHS_ELSE", 1)
     loaded = []
@@ -57,6 +60,48 @@ def test_all_ways_get_the_same_photons_and_are_measured_once(tmp_path, monkeypat
         left = {row["way"] for row in equal.equal_page(Asked("equal-photons", tmp_path, collect=True)).rows}
         assert left == set(rows) - {way}  # made in another way, it counts as not made
         path.write_text(kept)
+
+
+def test_public_sets_have_a_training_per_seed_and_their_means_stand_beside_direct_imaging(tmp_path, monkeypatch):
+    monkeypatch.setattr(equal, "TASKS", ())
+    monkeypatch.setattr(equal, "SETS", ("mnist",))
+    monkeypatch.setattr(equal, "SET_PHOTONS", (5.0, 10.0))
+    monkeypatch.setattr(equal, "MEAN_TRANSMISSION", {"mnist": 0.4})  # of the images below, nearly
+    monkeypatch.setattr(equal, "SET_FEATURES", 3)
+    small = {"epochs": 6, "hidden": 8, "batch": 50, "front_rate": 3e-2, "head_rate": 1e-2}
+    monkeypatch.setattr(equal, "SET_SCHEDULE", small)
+    monkeypatch.setattr(head_fit.fit_head_exactly, "__defaults__", (50, head_fit.RATE))
+    drawn = dataclasses.replace(columns(400, 6, 3), name="mnist")
+    monkeypatch.setattr(equal, "_task", lambda *_: drawn)
+    said = []
+    assert equal.equal_page(Asked("equal-photons", tmp_path, collect=True, seeds=1, report=said.append)).rows == []
+    assert len(said) == 4  # both budgets at both levels
+    rows = equal.equal_page(Asked("equal-photons", tmp_path, seeds=1, report=lambda _line: None)).rows
+    of = {(row["way"], row["asked"]): row for row in rows}
+    assert len(of) == 4 + 1  # and what was trained for 10 photons, dimmed to 5
+    for key in ("photons", "illumination"):
+        assert of["dimmed", 5.0][key] == pytest.approx(of["held to photons", 10.0][key] / 2)
+    assert of["dimmed", 5.0]["clicks"] < of["held to photons", 10.0]["clicks"]
+    assert of["held to illumination", 10.0]["options"]["illumination"] == pytest.approx(10 / 0.4)
+    assert all(same_options(row["options"], equal.recipe_of_row(row)) for row in rows)
+    again = equal.equal_page(Asked("equal-photons", tmp_path, seeds=2, collect=True)).rows
+    assert json.dumps(again) == json.dumps(rows)
+    other = [row | {"seed": 1, "value": row["value"] + 3} for row in rows]
+    table = equal.equal_tables(rows + other)[-1]
+    assert [row["trainings"] for row in table.rows] == [2] * 5
+    first = table.rows[0]
+    assert (first["way"], first["value"]) == (
+        "held to photons",
+        pytest.approx(of["held to photons", 5.0]["value"] + 1.5),
+    )
+    assert first["error_seeds"] == pytest.approx(1.5)  # of the mean of two that differ by 3
+    there = direct_at("mnist", first["photons"])
+    errors = (1.5, first["error_objects"], 100 * there["accuracy_se_objects"])
+    assert first["at_photons"]["error"] == pytest.approx(sum(error**2 for error in errors) ** 0.5)
+    assert first["at_photons"]["ahead"] == pytest.approx(first["value"] - 100 * there["accuracy_mean"])
+    light = drawn.test.images.mean() / 255 * first["illumination"]  # what direct imaging detects of as much light
+    assert first["at_illumination"]["photons"] == pytest.approx(light)
+    assert len(table.claims) == 6
 
 
 def test_ours_is_held_against_the_better_direct_way():
