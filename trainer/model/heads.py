@@ -171,7 +171,7 @@ class DecoderHead(DeepHead):
 
 Decoders = PictureHead | DecoderHead  # what returns pictures
 Heads = MlpHead | DeepHead | ConvHead | Decoders
-OF_CLASSES = {"mlp": MlpHead, "deep": DeepHead, "conv": ConvHead}
+OF_CLASSES: dict[str, type[MlpHead | DeepHead | ConvHead]] = {"mlp": MlpHead, "deep": DeepHead, "conv": ConvHead}
 
 
 def new_head(options: Options, n_outputs: int, image_shape: Shape, random: torch.Generator) -> Heads:

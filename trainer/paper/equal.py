@@ -204,8 +204,8 @@ def equal_tables(rows: Rows) -> list[Table]:
     ours = [way for way in WAYS if way not in DIRECT]
     claims = [claim(f"`{way}`", "the better direct way", [r for r in compared if r["way"] == way]) for way in ours]
     heading = "## Beside the better direct way"
-    found = [Table(columns("equal"), ordered), Table(columns("ahead"), compared, heading, claims)]
-    return found + (_set_tables(sets) if sets else [])
+    tables = [Table(columns("equal"), ordered), Table(columns("ahead"), compared, heading, claims)]
+    return tables + (_set_tables(sets) if sets else [])
 
 
 def ahead(row: Row, rows: Rows) -> Row | None:
