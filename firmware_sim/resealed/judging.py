@@ -152,7 +152,7 @@ def _base_files() -> dict[str, _Kind]:
 
 
 def _bundles() -> list[bytes]:
-    """The shipped bundle, a table alone, passive optics, a head that gives pictures back, automata of bits and of bytes."""
+    """The shipped bundle, a table alone, passive optics, pictures, photon numbers, automata of bits and of bytes."""
     shipped, _ = load_bundle(SHIPPED / "fashion10.pans")
     facts: dict[str, Any] = {"task": "small", "provenance": {"seed": 1, "losses": [0.5, 0.25]}}
     picture = make_bundle(
@@ -163,10 +163,19 @@ def _bundles() -> list[bytes]:
         back_end=BackEnd(head_onnx=shipped.head_onnx),
         **facts,
     )
+    table = np.random.default_rng(3).normal(size=(3**4, 2))
+    numbers = make_bundle(
+        name="numbers",
+        classes=("a", "b"),
+        image_shape=(2, 2),
+        optics=Shown(2, np.eye(4, dtype=np.int64), 0.2),
+        back_end=BackEnd(table=table, outcomes=3),
+        **facts,
+    )
     automata = [small_automaton_bundle(levels) for levels in (2, 8)]
     return [
         bundle_bytes(bundle)
-        for bundle in (shipped, small_setup()[1], small_setup()[1], passive_bundle(), picture, *automata)
+        for bundle in (shipped, small_setup()[1], small_setup()[1], passive_bundle(), picture, numbers, *automata)
     ]
 
 

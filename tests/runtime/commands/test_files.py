@@ -296,6 +296,24 @@ def test_a_bundle_from_arrays(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert run(capsys, "verify", out)[0] == 0
 
 
+def test_a_bundle_of_photon_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, words = tmp_path / "numbers.pans", make_inputs(tmp_path)
+    np.save(tmp_path / "p.npy", np.array([[0.2, 0.0], [0.2, 0.2]]))
+    np.save(tmp_path / "t.npy", np.arange(18.0).reshape(9, 2) % 5)
+    code, found = run(capsys, *words, "--outcomes", "3", "--profile", "dmd-qcmos", "-o", out, "--json")
+    assert (code, found["exposure_us"]) == (0, pytest.approx(2000.0))
+    assert load_bundle(out)[0].table[7].tolist() == [14 % 5, 15 % 5]
+    code, told = run(capsys, "info", out, "--json")
+    assert (told["photon_number_max"], told["table_rows"]) == (2, 9)
+    code, found = run(capsys, *words, "--outcomes", "4", "-o", tmp_path / "never.pans", "--json")
+    assert code == 2
+    assert "(4**d_f, classes) = (16, 2)" in found["error"]["message"]
+    with pytest.raises(SystemExit, match="2"):
+        run(capsys, *words, "--outcomes", "17", "-o", tmp_path / "never.pans", "--json")
+    assert "'17' is not a whole number from 2 to 16" in capsys.readouterr().out
+    assert not (tmp_path / "never.pans").exists()
+
+
 def test_a_bundle_from_a_head(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("onnx")
     from onnx import TensorProto, helper, numpy_helper
