@@ -2,8 +2,8 @@
 
 Owns the measurement and its report; instrument and echo are simulators in processes of their own. The device holds finished blocks back
 until the receive window lets them out, and each GRANT that moves the window by one releases exactly one. What is timed is the live
-loop's own path, from making the GRANT: until the click block is decoded, checked and in sequence (`command to click block`), and until it
-is decided and accounted for (`command to decision`). The raw echo sends as many bytes and gets as many back through the same kind of
+loop's own path, from making the GRANT: until the click block is decoded and checked (`command to click block`), and until it is
+decided and accounted for (`command to decision`). The raw echo sends as many bytes and gets as many back through the same kind of
 link, once waiting in an ordinary read, and once awake, as the live loop waits for an answer (LinkReader). All
 alternate in short turns, so that whatever else the machine does hits all of them.
 """
@@ -32,7 +32,8 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.live import LiveRun, RunConfig
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.messages import ClickBlock, DeviceState, Frame, FrameBlock, Opcode
+from pans.runtime.wire.frame import Messages
+from pans.runtime.wire.messages import DeviceState, Frame, Opcode
 
 from .rows import BenchOptions, Row
 
@@ -114,7 +115,7 @@ def _echo_once(link: Link, request: bytes, answer_bytes: int, timeout_s: float) 
 
 
 class _NotingCore(Core):
-    """A core that notes when a click block reached it: decoded, checked and in sequence."""
+    """A core that notes when a click block reached it, decoded and checked."""
 
     block_ns = 0
 
@@ -122,9 +123,9 @@ class _NotingCore(Core):
         """The device has long finished, which would settle all blocks that have not been asked for."""
         return Output([], [], None)
 
-    def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
+    def step_messages(self, messages: Messages, place: int) -> tuple[int, Output]:
         self.block_ns = time.perf_counter_ns()
-        return super()._take(block, n_exposures, end_tick)
+        return super().step_messages(messages, place)
 
 
 class _RoundTrip:
