@@ -149,9 +149,9 @@ class CompiledTurns:
             chunks = self._gathered(poll_s)
             if chunks:
                 pieces = [(piece, at_ns) for at_ns, data in chunks for piece in turn.decoder.pieces(data)]
-                data = np.frombuffer(b"".join([piece for piece, _ in pieces]), np.uint8)
+                data = np.frombuffer(bytearray().join([piece for piece, _ in pieces]), np.uint8)  # writable, not copied
                 self._lend(turn)
-                ended = turn.feed(data.copy(), np.array([(len(piece), at_ns) for piece, at_ns in pieces], np.int64))
+                ended = turn.feed(data, np.array([(len(piece), at_ns) for piece, at_ns in pieces], np.int64))
                 self._settle(turn, outputs)
                 self._go_on(turn, ended, outputs, turn.feed_on)
         connection.take_pongs()
