@@ -358,15 +358,18 @@ class FlowCore(Follower):
         self.n_passages = (self.n_passages + 1) & 0xFFFFFFFF
         self.put_row(decision, passage, out)
 
+    def pulse(self, number: int, leave_tick: int) -> Action:
+        """Return the pulse that decision `number` asks for, whose object left at `leave_tick`."""
+        tick = leave_tick + self.limits.gate_delay_ticks
+        return Action(number, tick, self.limits.gate_ticks, self.settings.gate_channel)
+
     def put_row(self, decision: Decision, passage: Passage, out: Rows) -> None:
         """Say a decision, ask for its pulse, and compare it with the truth."""
         out.decisions.append(decision)
         out.passages.append(passage)
         gated = decision.label in self.gated
         if gated:
-            pulse_tick = passage.leave_tick + self.limits.gate_delay_ticks
-            action = Action(decision.number, pulse_tick, self.limits.gate_ticks, self.settings.gate_channel)
-            out.actions.append(action)
+            out.actions.append(self.pulse(decision.number, passage.leave_tick))
         self.matcher.add_decision(decision, passage, gated)
 
     def _sum_clicks(self, first: int) -> int:

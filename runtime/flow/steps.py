@@ -6,14 +6,21 @@ state. `settle` gives the core, in order, what it would have seen by itself: its
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as kernels
 from pans.runtime.core.bulk_steps import decision_tables
-from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag, Output, Passage, Rows
+from pans.runtime.core.decision import (
+    DECISION_DTYPE,
+    Action,
+    CoreEvent,
+    Decision,
+    DecisionFlag,
+    Output,
+    Passage,
+    Rows,
+)
 from pans.runtime.core.plan import Plan
 from pans.runtime.wire import walk as place
 from pans.runtime.wire.messages import NO_OBJECT, FrameBlock
@@ -28,7 +35,7 @@ I64 = npt.NDArray[np.int64]
 PARTS = 4  # of the memory for decisions: a call that goes on fills one after the other (turn/banks.py)
 ROWS_MORE = 512  # of a part, beside those of a block
 MOST_BLOCKS = 4096  # whose empty frames have not been told yet: as many as the turn keeps times of (turn/rings.py)
-N_PASSAGE, N_EDGES = 5, 5
+LEAVE, N_PASSAGE, N_EDGES = 3, 5, 5  # of core.decision.Passage, in its order; of kernels.count_edges
 _LARGEST = (1 << 62) - 1
 _GAP = int(DecisionFlag.GAP)
 
@@ -104,6 +111,21 @@ class FlowSteps:
         first, self._told = self._told, int(reported[columns.TOLD])
         return self.walk.empty[np.arange(first, self._told) % MOST_BLOCKS].tolist()
 
+    def pulses(self, rows: slice) -> list[Action]:
+        """Return the pulses that `rows` of the walk's ask for, in order."""
+        core, labels = self.core, self.walk.rows["label"][rows]
+        places = np.flatnonzero(np.isin(labels, sorted(core.gated))) if core.gated else ()
+        numbers, leaves = self.walk.rows["index"][rows], self.walk.passages[rows, LEAVE]
+        return [core.pulse(int(numbers[place]), int(leaves[place])) for place in places]
+
+    def watch(self, empty: list[int] | None) -> list[CoreEvent]:
+        """Let the guard see what the empty field gave with a block; return what it found with that, and with objects before."""
+        core, guard = self.core, self.core.guard
+        if guard is None:
+            return []
+        told = core.watched_frames if empty is None else empty[1]
+        return list(core.watch_empty(guard, told, np.array([] if empty is None else empty[2:], np.int64)))
+
     def settle(
         self, rows: slice, behind: int, end_tick: int, empty: list[int] | None, block: FrameBlock | None
     ) -> Output:
@@ -112,7 +134,7 @@ class FlowSteps:
         `rows` of the walk's are its decisions, `empty` what the empty field gave with it; `block` is for the guard of dark frames.
         """
         core, walk, guard = self.core, self.walk, self.core.guard
-        events: list[Any] = [] if block is None or guard is None else guard.take(block)
+        events: list[CoreEvent] = [] if block is None or guard is None else [*guard.take(block)]
         out = Rows()
         decided = zip(walk.rows[rows].tolist(), walk.passages[rows].tolist(), walk.counts[rows])
         for row, passage, counts in decided:
@@ -120,10 +142,8 @@ class FlowSteps:
             if guard is not None and not decision.flags & _GAP:
                 guard.take_object(counts, NO_OBJECT)
             core.put_row(decision, Passage(*passage), out)
-        if core.watches_empty and guard is not None:
-            told = core.watched_frames if empty is None else empty[1]
-            channels = np.array([] if empty is None else empty[2:], np.int64)
-            events = core.watch_empty(guard, told, channels)
+        if core.watches_empty:
+            events = self.watch(empty)
         core.matcher.settle(behind)
         found = out.output()
         return Output(found.decisions, events, end_tick, found.passages, found.actions)

@@ -278,17 +278,21 @@ class CompiledTurns:
             self._settle_commands(turn)
         if counts.messages > counts.steps:
             self._settle_marks(turn)
-        recorder = run.recorder
+        self._record(turn)
+        if counts.steps:
+            self._settle_blocks(turn, outputs)
+        if self.settled is not None:
+            self.settled(turn, outputs[-1] if counts.steps else NOTHING)
+
+    def _record(self, turn: Turn) -> None:
+        """Record what a call took and sent."""
+        recorder, counts = self._run.recorder, turn.counts
         if recorder is not None:
             recorder.add_stamped(Kind.MESSAGES, turn.kept, turn.messages)
             if counts.answers:
                 recorder.add_stamped(Kind.ANSWERS, turn.kept, turn.answers)
             if counts.shows:
                 recorder.add_stamped(Kind.COMMANDS, turn.kept, turn.shows)
-        if counts.steps:
-            self._settle_blocks(turn, outputs)
-        if self.settled is not None:
-            self.settled(turn, outputs[-1] if counts.steps else NOTHING)
 
     def _settle_marks(self, turn: Turn) -> None:
         """Let the core know of the marks of a call."""

@@ -123,13 +123,29 @@ class _FlowSettling(CompiledTurns):
             for mark in turn.marks():
                 self._core.remember(mark)
 
+    def _record(self, turn: Turn) -> None:
+        """Record decisions, too, and send the pulses that they ask for: before all else, since their time runs."""
+        super()._record(turn)
+        run, steps = self._run, turn.steps
+        assert isinstance(steps, FlowSteps)
+        if turn.counts.steps and run.recorder is not None:
+            run.recorder.add_decisions(turn.rows)
+        if turn.counts.steps and (pulses := steps.pulses(turn.place)):
+            run.gates.take(pulses)
+            run.pulse()
+
+    def _look_ahead_for_pulses(self, turn: Turn) -> None:
+        """Pulses of what has come meanwhile do not wait until all before it is settled."""
+
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
         run, blocks = self._run, turn.blocks
         if run.connection.link.virtual:
             blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
         for block, output in settled_blocks(turn):
-            arrival_ns, decoded_ns, decided_ns = blocks[block, : ring.DECIDED + 1].tolist()
-            run.book(output, (arrival_ns, decoded_ns, decided_ns), outputs)
+            if output is not None:
+                arrival_ns, decoded_ns, decided_ns = blocks[block, : ring.DECIDED + 1].tolist()
+                run.book(output, (arrival_ns, decoded_ns, decided_ns), outputs, kept=True)
+            self._look_ahead_for_pulses(turn)
         try:
             run.take([])
         except LinkError as error:  # met while pulses were sent
@@ -149,9 +165,27 @@ class LastingFlowTurns(_FlowSettling, LastingTurns):
     def __init__(self, run: LiveRun, core: FlowCore) -> None:
         super().__init__(run, core)
         self._prompt = self._wakes = bool(core.gated)
+        self._early = 0  # banks behind that which is settled that are recorded already
+        self._recorded = False  # whether that one is
+
+    def _settle(self, turn: Turn, outputs: list[Output]) -> None:
+        self._recorded = self._early > 0
+        self._early -= self._recorded
+        super()._settle(turn, outputs)
+
+    def _record(self, turn: Turn) -> None:
+        if not self._recorded:
+            super()._record(turn)
+
+    def _look_ahead_for_pulses(self, turn: Turn) -> None:
+        call = self._call
+        while self._wakes and call is not None and call.published > self._early + 1:
+            self._early += 1
+            with turn.shown_ahead(self._early):
+                super()._record(turn)
 
 
-def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output]]:
+def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
     """Let the core of a flow see what a call brought; yield, with its number, each block of which something came."""
     steps, blocks = turn.steps, turn.blocks
     assert isinstance(steps, FlowSteps)
@@ -160,13 +194,17 @@ def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output]]:
     behind, first_row, row = _blocks_behind(turn), turn.place.start, 0
     empty = {told[0]: told for told in steps.told(turn.state)}
     marks = _marks_of(turn)
-    some = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
-    some |= np.isin(behind, list(empty)) | by_block
-    some[-1] = True
+    decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
+    some = decided | np.isin(behind, list(empty)) | by_block
+    decided[-1] = some[-1] = True
     for block in np.flatnonzero(some).tolist():
         end_tick, stop, place = blocks[block, ring.END_TICK : ring.MESSAGES + 1].tolist()
         while marks and marks[-1][0] < place:
             core.remember(marks.pop()[1])
+        if not decided[block] and not by_block:
+            events = steps.watch(empty[int(behind[block])])
+            yield block, Output([], events, end_tick) if events else None
+            continue
         frames = decode_frames(_payload(turn, place - 1)) if by_block else None
         following = int(behind[block])
         rows = slice(first_row + row, first_row + stop)

@@ -37,7 +37,7 @@ from pans.runtime.timing.page_faults import ThreadCounts
 from pans.runtime.turn.eligible import excluded
 
 from .compiled import CompiledTurns
-from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice, Turns
+from .config import AUTO, COMPILED, PYTHON, RunConfig, RunResult, TurnChoice, Turns
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .lasting import LastingTurns
 from .reconnect import Recovery, Refusals, reconnect_run
@@ -153,6 +153,8 @@ def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoi
     why = "asked for" if wanted == PYTHON else excluded(core, link, drives=drives)
     if wanted == COMPILED and why:
         raise UsageError(f"--turn compiled: {why}", remedy="--turn auto takes Python's turn here")
+    if not why and wanted == AUTO and not link.virtual and getattr(core, "gated", None):
+        why = "pulses that decisions ask for leave sooner from it"  # docs/measurements/flow.md has both
     if why:
         return TurnChoice(PYTHON, why)
     return TurnChoice(COMPILED, "virtual time: what was read at once is taken at once" if link.virtual else "")

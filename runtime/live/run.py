@@ -76,16 +76,13 @@ class LiveRun(Reconciled):
         self.lateness = Lateness(plan, self.timing.deadline_ns, connection.link, recorder)
         self.realtime: dict[str, Any] = {}
         self.page_faults: dict[str, int] = {}  # of the loop's thread while armed
-        self.ended = ""
-        self.link_lost = False
-        self.reconnects = 0
+        self.ended, self.link_lost, self.reconnects = "", False, 0
         self.turned_s = time.monotonic()  # the loop's heartbeat: when it turned last
         self.stops = False  # the device is being told to go dark
         self.outage_ns: int | None = None  # since when there has been no block
         self.decoded: Counter[str] = Counter()  # what the connections that are gone have counted
         self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
-        self.armed_after_s = 0.0
-        self.start_ns = self.last_data_ns = 0
+        self.armed_after_s, self.start_ns, self.last_data_ns = 0.0, 0, 0
         self.failed: list[Connection] = []  # those that broke before they could be armed
         self.taken_here = 0  # messages of the present connection that the core was given, or came before ARM
         self.recorder = recorder
@@ -313,18 +310,23 @@ class LiveRun(Reconciled):
             except LinkError as error:
                 self._broken = error
 
-    def book(self, output: Output, times_ns: tuple[int, int, int], outputs: list[Output]) -> None:
-        """Account for what a step brought: `times_ns` when it arrived, was decoded and decided."""
-        self._account(output, times_ns)
+    def book(self, output: Output, times_ns: tuple[int, int, int], outputs: list[Output], kept: bool = False) -> None:
+        """Account for what a step brought, and when that came, was decoded and decided; `kept`: recorded, and pulses sent."""
+        self._account(output, times_ns, kept)
         if output.block_end_tick is not None:
             self.check_tick(output.block_end_tick, times_ns[0])
             self.block_came(times_ns[0])
-        if output.actions and self._broken is None:
-            try:
-                self._act(self.now_ns())
-            except LinkError as error:
-                self._broken = error
+        if output.actions and not kept:
+            self.pulse()
         outputs.append(output)
+
+    def pulse(self) -> None:
+        """Send the pulses that wait, unless nothing more can be sent."""
+        try:
+            if self._broken is None:
+                self._act(self.now_ns())
+        except LinkError as error:
+            self._broken = error
 
     def block_came(self, arrival_ns: int) -> None:
         """Note that the stream goes on."""
@@ -349,7 +351,7 @@ class LiveRun(Reconciled):
         now_ns = self.now_ns()
         self._account(output, (now_ns, now_ns, now_ns))
 
-    def _account(self, output: Output, times_ns: tuple[int, int, int]) -> None:
+    def _account(self, output: Output, times_ns: tuple[int, int, int], kept: bool = False) -> None:
         """Judge, tally and record one step's output; windows given up at the end of the plan have no exposure to be late for."""
         for event in output.events:
             self.journal.take(event)
@@ -357,7 +359,8 @@ class LiveRun(Reconciled):
                 self.journal.take(self.lateness.lost(event, self.connection, self.now_ns()))
         if not output.decisions:
             return
-        self.gates.take(output.actions)
+        if not kept:
+            self.gates.take(output.actions)
         end_ns = uncertainty_ns = 0
         clock = self.connection.known_clock()
         if output.block_end_tick is not None and not output.passages:
@@ -365,13 +368,11 @@ class LiveRun(Reconciled):
         for place, decision in enumerate(output.decisions):
             if output.passages and output.block_end_tick is not None:  # a time of its own, and its number is no mark's
                 end_ns, uncertainty_ns = clock.to_host_ns(output.passages[place].leave_tick)
-            if (
-                end_ns - uncertainty_ns > times_ns[0]
-            ):  # what has arrived has happened: a tick in the future hides no lateness
-                end_ns = times_ns[0]
+            if end_ns - uncertainty_ns > times_ns[0]:
+                end_ns = times_ns[0]  # what has arrived has happened: a tick in the future hides no lateness
             mark = None if output.passages else self.core.marks.get(decision.object)
             self.tally.add(decision, float("nan") if mark is None else mark.photons)
-            if self.recorder is not None:
+            if self.recorder is not None and not kept:
                 self.recorder.add_decision(decision)
             if output.block_end_tick is None:
                 continue

@@ -7,7 +7,8 @@ is begun by `lasting`; the properties then show one bank at a time, `show_bank`,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -138,6 +139,11 @@ class Turn:
 
     def _show(self, bank: int, banks: int, reported: I64, state: I64) -> None:
         """Let the properties show `bank` of `banks`, and bring the core to where its `state` is."""
+        self._look_at(bank, banks, reported, state)
+        if self.counts.messages:
+            self.steps.store(state)
+
+    def _look_at(self, bank: int, banks: int, reported: I64, state: I64) -> None:
         self.reported, self.state = reported, state
         self._row = len(self._walk.rows) // banks * bank
         self._n_rows = int(state[core_kernels.N_ROWS]) - self._row
@@ -147,8 +153,6 @@ class Turn:
             first[_FIRST:] = [len(part) // banks * bank for part in self._parts]
         self.first = Counts(*first)
         self.counts = Counts(*[count - begin for count, begin in zip(counts, first)])
-        if self.counts.messages:
-            self.steps.store(state)
 
     # -- a call that goes on -------------------------------------------------------------------------------------------
 
@@ -172,6 +176,17 @@ class Turn:
         """Show the next bank of a call that goes on, which has been published."""
         bank = int(self.control[ring.TAIL]) % ring.N_BANKS
         self._show(bank, ring.N_BANKS, self.rings.heads[bank], self.rings.states[bank])
+
+    @contextmanager
+    def shown_ahead(self, banks: int) -> Iterator[None]:
+        """Let the properties show the published bank so many behind the next one meanwhile; the core stays where it is."""
+        before = self.reported, self.state, self._row, self._n_rows, self.first, self.counts
+        bank = (int(self.control[ring.TAIL]) + banks) % ring.N_BANKS
+        self._look_at(bank, ring.N_BANKS, self.rings.heads[bank], self.rings.states[bank])
+        try:
+            yield
+        finally:
+            self.reported, self.state, self._row, self._n_rows, self.first, self.counts = before
 
     def show_rest(self) -> None:
         """Show the bank that a call, now ended, has not published; all others have been taken."""

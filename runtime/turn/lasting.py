@@ -76,7 +76,7 @@ class LastingCall:
         """Let the turn show each bank that has been published, one after the other; it is taken when the next one is asked for."""
         turn = self._turn
         assert turn is not None
-        for _ in range(int(ask(turn.control, READY)) - int(turn.control[ring.TAIL])):
+        for _ in range(self.published):
             turn.show_bank()
             try:
                 yield
@@ -84,10 +84,15 @@ class LastingCall:
                 ask(turn.control, TAKEN)
 
     @property
+    def published(self) -> int:
+        """How many banks wait to be taken, that under way among them."""
+        assert self._turn is not None
+        return int(ask(self._turn.control, READY)) - int(self._turn.control[ring.TAIL])
+
+    @property
     def is_behind(self) -> bool:
         """Whether more than one bank waits to be taken."""
-        assert self._turn is not None
-        return int(ask(self._turn.control, READY)) - int(self._turn.control[ring.TAIL]) > 1
+        return self.published > 1
 
     def end(self) -> int | None:
         """Stop the call; return why it ended, None where it does not stop."""

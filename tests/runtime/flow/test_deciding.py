@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,7 @@ from pans.runtime.flow.steps import FlowSteps
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.instrument.dead_channels import DeadChannelTest
 from pans.runtime.live.flow_run import settled_blocks
+from pans.runtime.live.loop import choose_turn
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import system
 from pans.runtime.turn.engine import Turn
@@ -50,7 +54,7 @@ def by_turn(core: FlowCore, plan: Plan, data: bytes, cuts: list[int]) -> Output:
         ended = turn.feed(np.concatenate([*pieces, np.zeros(0, np.uint8)]), reads)
         while True:
             for _, came in settled_blocks(turn) if turn.counts.steps else ():
-                output = joined(output, came)
+                output = output if came is None else joined(output, came)
             for mark in turn.marks() if not turn.counts.steps else ():
                 core.remember(mark)
             if ended == ring.ALL_TAKEN:
@@ -114,6 +118,15 @@ def test_the_guard_finds_the_same_at_the_same_exposures(dark: bool) -> None:
     assert found.events == by_one(one, data).events
     assert len(found.events) > 1, "a rate of twenty times the expected one was not seen"
     assert state_of(other) == state_of(one)
+
+
+def test_pulses_at_real_pace_are_python_s_unless_asked_otherwise() -> None:
+    gated = make(decider=TABLES[1], gate_classes=("a",))
+    with socket.socket() as port:
+        link: Any = SimpleNamespace(virtual=False, fileno=port.fileno, now_ns=time.perf_counter_ns)
+        assert "leave sooner" in choose_turn("auto", gated, link, drives=False).why
+        assert choose_turn("compiled", gated, link, drives=False).taken == "compiled"
+        assert choose_turn("auto", make(decider=TABLES[1]), link, drives=False).taken == "compiled"
 
 
 def test_what_has_no_compiled_turn_says_why() -> None:
