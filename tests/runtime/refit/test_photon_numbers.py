@@ -1,4 +1,4 @@
-"""Refits over photon numbers: table and head of the old bundle are wrong, the new ones nearly the best that these numbers allow."""
+"""Refits over photon numbers: table, head or posteriors of the old bundle are wrong, the new ones nearly the best that there can be."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundles import made_bundle
+from automata import random_automaton
+from bundles import automaton_bundle, made_bundle
 from heads import affine_head
 
 from pans.runtime.bundle.model import Bundle
@@ -92,3 +93,30 @@ def test_several_shots_are_refitted_through_the_head_and_claim_no_noise() -> Non
 
 def _others(clicks: Labelled) -> tuple[Any, ...]:
     return (clicks.truth, clicks.object_id, clicks.shots, (), True, {}, clicks.light)
+
+
+def test_an_automaton_over_numbers_comes_near_the_exact_posteriors() -> None:
+    bundle = automaton_bundle(random_automaton(5, slots=3, width=3, classes=2, outcomes=3))
+    automaton = bundle.automaton
+    assert automaton is not None
+    rng = np.random.default_rng(6)
+    rates = rng.dirichlet([1.0, 1.0, 1.0], (2, automaton.n_slots))  # P(number) of a slot, by class
+    truth = np.arange(4000) % 2
+    upto = rates[truth].cumsum(axis=2)[:, :, :-1]
+    counts = (rng.random((4000, automaton.n_slots))[:, :, None] >= upto).sum(axis=2)
+    clicks = Labelled(counts, truth, np.arange(4000), 1, (), True, {}, Light(math.nan, math.nan))
+    rows = rows_of(bundle, clicks)
+    found = fitted(rows.evidence, Kind(("bias",), rows=True), np.ones(4000, bool))
+    new = rebuilt(bundle, rows, found, clicks, {}).bundle.automaton
+    assert new is not None
+    assert (new.counts, new.n_outcomes) == (True, 3)
+    mass = np.zeros(automaton.posteriors.shape)  # by hand: every word of numbers, walked to its leaf
+    for word in product(range(3), repeat=automaton.n_slots):
+        node, step = 0, 0
+        while node < automaton.n_states:
+            node, step = int(automaton.successors[node, word[step]]), step + 1
+        mass[node] += np.prod(rates[:, np.arange(automaton.n_slots), word], axis=1)
+    often = mass.sum(axis=1) > 0.05  # of leaves that a hundred objects or more came to
+    exact = mass[often] / mass[often].sum(axis=1, keepdims=True)
+    before = np.abs(automaton.posteriors[often] - exact).mean()
+    assert np.abs(new.posteriors[often] - exact).mean() < 0.05 < before
