@@ -71,11 +71,10 @@ def marginal_scores(table: NDArray[Any], chances: F64, count: int) -> F64:
 
 def demand_click_patterns(bundle: Bundle) -> None:
     """Raise ValueError unless `bundle` shows fixed patterns and decides among classes by their clicks."""
-    fixed = bundle.automaton is None and bundle.analyser is None and bundle.picture_shape is None
-    if not fixed or bundle.largest > 1:
-        raise ValueError(
-            f"{bundle.name} has no fixed patterns that decide among classes by clicks, allowed: bundles that have"
-        )
+    if bundle.automaton is not None or bundle.analyser is not None or bundle.picture_shape is not None:
+        raise ValueError(f"{bundle.name} has no fixed patterns that decide among classes, allowed: bundles that have")
+    if bundle.largest > 1:
+        raise ValueError(f"{bundle.name} takes photon numbers, allowed: fixed patterns that decide by clicks")
 
 
 def of_first(bundle: Bundle, count: int, probability: F64) -> Bundle:

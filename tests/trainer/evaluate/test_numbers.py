@@ -83,7 +83,7 @@ def test_sums_of_shots_are_convolutions_and_their_head_answers_them() -> None:
 
 
 def test_what_knows_clicks_alone_says_so() -> None:
-    with pytest.raises(ValueError, match="no fixed patterns that decide among classes by clicks"):
+    with pytest.raises(ValueError, match="toy takes photon numbers, allowed: fixed patterns that decide by clicks"):
         demand_click_patterns(BUNDLE)
     with pytest.raises(ValueError, match="toy needs 3 outcomes per exposure, dmd-spad tells 2 apart"):
         light_of(BUNDLE, load_profile("dmd-spad"), IMAGES)
