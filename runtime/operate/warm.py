@@ -144,8 +144,11 @@ def compile_flow() -> None:
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
     from pans.runtime.flow.settings import read_flow
+    from pans.runtime.flow.steps import FlowSteps
     from pans.runtime.instrument.cusum import ChannelWatch
     from pans.runtime.instrument.profile import load_profile
+    from pans.runtime.turn.engine import Turn
+    from pans.runtime.wire.bulk import BulkDecoder
 
     ChannelWatch(1, np.full(1, 0.01)).warm_up(counts=True)
     profile = load_profile("flow-snspd")
@@ -163,8 +166,9 @@ def compile_flow() -> None:
     )
     decider = make_decider(bundle)
     for kind in ("cells", "tape"):
-        _, core, _ = plan_flow(profile, bundle, decider, read_flow(kind), 1, 1.0)
+        plan, core, _ = plan_flow(profile, bundle, decider, read_flow(kind), 1, 1.0)
         core.warm_up()
+        Turn(FlowSteps(core, plan), BulkDecoder()).warm_up()
 
 
 JOBS: Mapping[str, Callable[[], None]] = {
