@@ -197,13 +197,15 @@ def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
     decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
     some = decided | np.isin(behind, list(empty)) | by_block
     decided[-1] = some[-1] = True
-    for block in np.flatnonzero(some).tolist():
-        end_tick, stop, place = blocks[block, ring.END_TICK : ring.MESSAGES + 1].tolist()
+    columns = blocks[:, ring.END_TICK : ring.MESSAGES + 1].tolist()
+    for block, (end_tick, stop, place) in enumerate(columns):
         while marks and marks[-1][0] < place:
             core.remember(marks.pop()[1])
         if not decided[block] and not by_block:
-            events = steps.watch(empty[int(behind[block])])
-            yield block, Output([], events, end_tick) if events else None
+            if some[block]:
+                events = steps.watch(empty[int(behind[block])])
+                yield block, Output([], events, end_tick) if events else None
+            core.matcher.settle(int(behind[block]))
             continue
         frames = decode_frames(_payload(turn, place - 1)) if by_block else None
         following = int(behind[block])
