@@ -11,7 +11,7 @@ import pytest
 from bundles import made_bundle
 from heads import onnx_chain, random_layers
 
-from pans.runtime.api import decide
+from pans import decide
 from pans.runtime.bundle.layers import quantise_head
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_tables import make_adapter

@@ -263,7 +263,7 @@ def test_a_checkpoint_of_another_training_or_no_checkpoint_is_refused(task, tmp_
         ({"clicks": 4.0}, "below 4"),
         ({"estimator": "magic"}, "ste, identity, exact"),
         ({"encoder": "magic"}, "active, coherent"),
-        ({"head": "magic"}, "mlp, conv"),
+        ({"head": "magic"}, "mlp, deep, conv"),
         ({"dark": -1.0}, "--dark"),
         ({"mix": 0.5}, "--shots"),
         ({"polish": 1.5}, "--polish"),
