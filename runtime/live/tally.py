@@ -107,7 +107,7 @@ class RunTally:
         plan, sums, photons = np.array([self.shots, self.distinct]), np.zeros(kernels.N_SUMS, np.int64), np.zeros(1)
         photons[0] = self.photons
         tables = (self.confusion, self._trials, self._runs)
-        stop, n_runs = kernels.add_rows(rows, first, marks.objects, marks.photons, plan, sums, photons, *tables)
+        stop, n_runs = kernels.add_rows(rows, first, marks.objects, marks.photons, plan, sums, photons, tables)
         self._take_sums(stop - first, sums.tolist(), float(photons[0]))
         for number, decided, right in self._runs[:n_runs].tolist():
             mine = self._object_sums(number)

@@ -29,15 +29,16 @@ _NO_LABEL, _U = NO_LABEL, np.uint64
 
 
 @outer
-def add_rows(rows, first, marked, photons_of, plan, sums, photons, table, trials, objects):  # type: ignore[no-untyped-def]
+def add_rows(rows, first, marked, photons_of, plan, sums, photons, tables):  # type: ignore[no-untyped-def]
     """Add rows, DECISION_DTYPE (n,), from `first` on to what decisions add up to; return up to where, and how many runs of one object.
 
-    It ends before a row for which `objects` or `trials` have no room.
+    `tables` are table, trials and objects. It ends before a row for which `objects` or `trials` have no room.
 
     marked int64 and photons_of float32 (MARK_SLOTS,): MarkArrays; plan int64 (2,): K and after how many objects the first one is shown
     again (0: never). photons float64 (1,), table int64 (classes, classes) and trials int64 (m, 2) are added to. sums int64 (N_SUMS,) are
     of these rows alone, and objects int64 (n, 3) is filled from its beginning.
     """
+    table, trials, objects = tables
     numbers, shots, clicks, labels = rows["object"], rows["shot"], rows["clicks"], rows["label"]
     truths, flags, walked = rows["truth"], rows["flags"], rows["exposures"]
     n_clicks, n_walked, n_right = np.int64(0), np.int64(0), np.int64(0)

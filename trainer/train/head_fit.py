@@ -23,6 +23,7 @@ SHARE_OF_SHOTS = 0.3  # of the loss, for all numbers of shots beside one
 CLICKS = Clicks()
 CHUNK = 2000  # objects per pass where no gradient is needed
 STEPS = 1500
+SAMPLED_EPOCHS = 10
 RATE = 2e-3
 
 
@@ -72,7 +73,6 @@ def fit_head_by_samples(
     loss_of: LossOf,
     random: torch.Generator,
     *,
-    epochs: int = 10,
     batch: int = 512,
     rate: float = 1e-3,
     more: _Shots | None = None,
@@ -81,8 +81,8 @@ def fit_head_by_samples(
     """Fit the head to sampled clicks of objects with click probabilities `p` (n, d_f), with a falling rate."""
     optimiser = torch.optim.Adam(head.parameters(), lr=rate)
     head.eval()
-    for epoch in range(epochs):
-        optimiser.param_groups[0]["lr"] = rate * (1 - epoch / epochs)
+    for epoch in range(SAMPLED_EPOCHS):
+        optimiser.param_groups[0]["lr"] = rate * (1 - epoch / SAMPLED_EPOCHS)
         for which in torch.randperm(len(p), generator=random).split(batch):
             optimiser.zero_grad()
             loss = loss_of(head(readings.sample(p[which], random).float()), target[which]).mean()
