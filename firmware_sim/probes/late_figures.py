@@ -14,11 +14,13 @@ from .attribution import (
     MACHINE,
     OURS,
     PARTLY,
+    WHOSE,
     LateDecision,
     attribute,
     gap_figures,
     late_entry,
     late_table,
+    link_figures,
     verdict_of,
     worked_off,
 )
@@ -39,7 +41,8 @@ def late_figures(outcome: Outcome, deadline_us: float) -> LateFigures:
     late_numbers = [int(event["decision"]) for event in events if event["kind"] == "late"]
     verdicts = [event for event in events if event["kind"] == "blame" and event["what"] == "late"]
     gaps = [gap for log in outcome.logs for gap in log.gaps]
-    found = attribute(timings, late_numbers, gaps, round(deadline_us * 1000))
+    delays = () if outcome.link is None else outcome.link.delays
+    found = attribute(timings, late_numbers, gaps, round(deadline_us * 1000), delays)
     whose = Counter(late.whose for late in found)
     begin_ns = int(timings["device_end_ns"][0]) if len(timings) else 0
     end_ns = int(timings["decided_ns"][-1]) if len(timings) else 1
@@ -49,7 +52,7 @@ def late_figures(outcome: Outcome, deadline_us: float) -> LateFigures:
         "decisions": len(timings),
         "late": len(late_numbers),
         "late_share": len(late_numbers) / max(len(timings), 1),
-        "whose": {name: whose[name] for name in (MACHINE, PARTLY, OURS)},
+        "whose": {name: whose[name] for name in WHOSE},
         "partly_worked_off": sum(worked_off(late, outcome.busy["host"]) for late in found),
         "machine_by_core": _by_core(found),
         "machine_queued": sum(late.queued for late in found if late.whose == MACHINE),
@@ -58,6 +61,7 @@ def late_figures(outcome: Outcome, deadline_us: float) -> LateFigures:
             gap_figures(log, begin_ns, end_ns) | {"stolen_ms": 1000 * outcome.stolen_s[log.core]}
             for log in outcome.logs
         ],
+        "link_probe": None if outcome.link is None else link_figures(outcome.link, begin_ns, end_ns),
         "busy": outcome.busy,
         "other_real_time_programs": list(outcome.others),
     }
@@ -65,7 +69,7 @@ def late_figures(outcome: Outcome, deadline_us: float) -> LateFigures:
 
 
 def unexplained(figures: dict[str, Any]) -> int:
-    """Return how many late decisions neither a gap of the machine nor working one off explains."""
+    """Return how many late decisions no gap of the machine, no delay of the pair beside and no working off explains."""
     whose = figures["whose"]
     return int(whose[PARTLY] - figures["partly_worked_off"] + whose[OURS])
 

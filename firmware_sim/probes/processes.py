@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 PATIENCE_S = 30.0  # longer than any child needs on a loaded machine
 KERNEL_PARENT = 2  # the pid of kthreadd, whose children are threads of the kernel
@@ -82,6 +83,15 @@ class Child:
 def say(**facts: Any) -> None:
     """From within a child: say one JSON object to the process that started it."""
     print(json.dumps(facts), flush=True)
+
+
+def leave_on_sigterm() -> None:
+    """From within a child: SIGTERM raises SystemExit."""
+    signal.signal(signal.SIGTERM, _leave)
+
+
+def _leave(signum: int, frame: object) -> NoReturn:
+    raise SystemExit(0)
 
 
 def wait_until(condition: Callable[[], bool], patience_s: float = PATIENCE_S, every_s: float = 0.001) -> None:

@@ -14,9 +14,9 @@ import os
 import signal
 import sys
 import time
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
-from .processes import Child, say
+from .processes import Child, leave_on_sigterm, say
 
 PRIORITY = 30  # above the simulated instrument (20) and the host's loop (10)
 EVERY_US = 200  # takes some 4 % of a core, and sees gaps of a fifth of the shortest deadline (1 ms)
@@ -114,10 +114,6 @@ def _queued_ns(counters: int) -> int:
     return int(os.pread(counters, 64, 0).split()[1])
 
 
-def _leave(signum: int, frame: object) -> NoReturn:
-    raise SystemExit(0)
-
-
 def main(core: int, priority: int, every_us: int, late_us: int) -> None:
     """Watch a core; the process of `SchedulingProbe`."""
     os.sched_setaffinity(0, {core})
@@ -125,7 +121,7 @@ def main(core: int, priority: int, every_us: int, late_us: int) -> None:
     gc.freeze()
     gc.disable()
     gaps: list[tuple[int, int, int, int]] = []
-    signal.signal(signal.SIGTERM, _leave)
+    leave_on_sigterm()
     say(ready=True)
     began_ns, began_cpu_ns = time.perf_counter_ns(), time.process_time_ns()
     wakes = watch(every_us * 1000, late_us * 1000, gaps)

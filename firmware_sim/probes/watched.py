@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from pans.runtime.cli import say
 
+from .link_probe import LinkLog, LinkProbe
 from .processes import processor_s, real_time_programs, start_command, stolen_s, tail
 from .scheduling_probe import EVERY_US, ProbeLog, SchedulingProbe
 
@@ -28,6 +29,7 @@ class Watched(NamedTuple):
     """Where the two processes run: `pin` the cores of host and instrument (None: anywhere), and how the cores are probed.
 
     `awake` binds the two loops alone and keeps their cores from halting (--core). `finished` are the exit codes of a run that gave figures.
+    `link`, "pty" or "tcp", is probed by a pair of processes beside, between the two cores; "" leaves that out.
     """
 
     pin: tuple[int, int] | None
@@ -35,6 +37,7 @@ class Watched(NamedTuple):
     canary_us: int = EVERY_US
     seconds: float = 0.0  # that the run takes once it is armed
     finished: tuple[int, ...] = FINISHED
+    link: str = ""
 
     def awake_on(self, which: int) -> list[str]:
         """Options that pin the loop of host (0) or instrument (1) to its core."""
@@ -53,6 +56,7 @@ class Outcome(NamedTuple):
     logs: tuple[ProbeLog, ...]
     busy: dict[str, float]
     stolen_s: dict[int, float]  # by core, as the hypervisor tells in /proc/stat, while the probes were there
+    link: LinkLog | None  # what the pair beside saw
     others: tuple[str, ...]  # further programs of real-time priority on this computer: then it was not quiet
 
 
@@ -65,6 +69,7 @@ def run_watched(
     """
     cores = sorted(os.sched_getaffinity(0) if watched.pin is None else set(watched.pin))
     probes: list[SchedulingProbe] = []
+    pair: LinkProbe | None = None
     simulator: subprocess.Popen[str] | None = None
     host: subprocess.Popen[str] | None = None
     try:
@@ -78,20 +83,26 @@ def run_watched(
                 raise RuntimeError(f"the simulator ended with {simulator.wait()}: {tail(folder / 'simulator.txt')}")
         if watched.canary_us:
             probes = [SchedulingProbe(core, every_us=watched.canary_us) for core in cores]
+        if watched.link and watched.canary_us and watched.pin is not None:
+            pair = LinkProbe(watched.link, watched.pin)
         stolen_before = stolen_s(cores)
         words = [*run_words(url), "--out", str(folder / "out"), "--json", *watched.awake_on(0)]
         host = start_command(words, folder / "host.txt", watched.bound_to(0))
-        busy, others = _wait(host, simulator, watched.seconds, {probe.pid for probe in probes})
+        known = {probe.pid for probe in probes} | ({pair.pid} if pair is not None else set())
+        busy, others = _wait(host, simulator, watched.seconds, known)
         out, _ = host.communicate()
         if host.returncode not in watched.finished:
             raise RuntimeError(f"the host ended with {host.returncode}: {tail(folder / 'host.txt')}")
         stolen = {core: since - stolen_before[core] for core, since in stolen_s(cores).items()}
         logs = tuple(probe.end() for probe in probes)
+        link = None if pair is None else pair.end()
         summary = json.loads(out)
-        return Outcome(summary, Path(summary["recording"]), logs, busy, stolen, others)
+        return Outcome(summary, Path(summary["recording"]), logs, busy, stolen, link, others)
     finally:
         for probe in probes:
             probe.kill()
+        if pair is not None:
+            pair.kill()
         for process in (host, simulator):
             if process is not None:
                 _end(process)
@@ -123,7 +134,7 @@ def _wait(
             samples.append((elapsed, *(processor_s(pid) for pid in pids)))
         except OSError:  # it has just ended
             break
-        others |= real_time_programs(probes | set(pids), frozenset(pids))
+        others |= real_time_programs(probes | set(pids), frozenset(probes | set(pids)))
         if elapsed > told + PROGRESS_S:
             told = elapsed
             say(f"{elapsed:6.0f} s")

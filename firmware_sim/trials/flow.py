@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.firmware_sim.options import option
-from pans.firmware_sim.probes.attribution import MACHINE, OURS, PARTLY
+from pans.firmware_sim.probes.attribution import LINK, MACHINE, OURS, PARTLY
 from pans.firmware_sim.probes.late_figures import late_figures
 from pans.firmware_sim.probes.processes import has_real_time
 from pans.firmware_sim.probes.scheduling_probe import EVERY_US
@@ -83,7 +83,7 @@ def carry_out(job: Job, folder: Path) -> Outcome:
         words += ["--deadline-us", str(job.deadline_us)] if job.deadline_us else []
         return [*words, *job.more]
 
-    watched = Watched(job.pin, awake=job.awake, canary_us=job.canary_us, seconds=job.seconds)
+    watched = Watched(job.pin, awake=job.awake, canary_us=job.canary_us, seconds=job.seconds, link=job.link)
     return run_watched(words, run_words, watched, folder)
 
 
@@ -100,8 +100,8 @@ def report(job: Job, outcome: Outcome) -> dict[str, Any]:
         "job": {key: str(value) if isinstance(value, Path) else value for key, value in facts.items()},
         **figures,
         "run": {key: outcome.summary[key] for key in KEPT if key in outcome.summary},
-        "explained": [entry for entry in entries if entry["whose"] == MACHINE][:TOLD],
-        "unexplained": [entry for entry in entries if entry["whose"] != MACHINE][:TOLD],
+        "explained": [entry for entry in entries if entry["whose"] in (MACHINE, LINK)][:TOLD],
+        "unexplained": [entry for entry in entries if entry["whose"] not in (MACHINE, LINK)][:TOLD],
     }
     return result | {"broken": broken_bars(result)}
 

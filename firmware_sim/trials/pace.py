@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pans.firmware_sim.options import option
+from pans.firmware_sim.probes.attribution import LINK, MACHINE
 from pans.firmware_sim.probes.late_figures import late_figures, unexplained
 from pans.firmware_sim.probes.processes import has_real_time
 from pans.firmware_sim.probes.scheduling_probe import EVERY_US
@@ -87,9 +88,9 @@ class Settings:
     canary_us: int = option(EVERY_US, f"period of the scheduling probes, 0: none (default {EVERY_US})")
     more: tuple[str, ...] = option((), "after --: further words for `pans run` and `pans demo`", flag="more", nargs="*")
 
-    def watched(self, seconds: float) -> Watched:
+    def watched(self, seconds: float, link: str) -> Watched:
         """Where and for how long the processes of one run are."""
-        return Watched(self.pin, self.awake, self.canary_us, seconds, FINISHED)
+        return Watched(self.pin, self.awake, self.canary_us, seconds, FINISHED, link)
 
 
 # ---- the parts ----
@@ -182,13 +183,13 @@ def _run(settings: Settings, scratch: Path, profile: Path, bundle: str, link: st
     def run_words(url: str) -> list[str]:
         return ["run", str(bundle_path(Path(bundle))), "--device", url, *fixed]
 
-    return run_watched(instrument, run_words, settings.watched(settings.seconds), scratch)
+    return run_watched(instrument, run_words, settings.watched(settings.seconds, link), scratch)
 
 
 def _row(name: str, link: str, outcome: Outcome, deadline_us: float) -> dict[str, Any]:
     figures, entries = late_figures(outcome, deadline_us)
     load = os.getloadavg()[0]
-    told = [entry for entry in entries if entry["whose"] != "machine"]
+    told = [entry for entry in entries if entry["whose"] not in (MACHINE, LINK)]
     return {
         "name": name,
         "link": link,
@@ -222,7 +223,7 @@ def objects_broken(row: dict[str, Any]) -> list[str]:
     broken = []
     if row["unexplained"] / n > OURS:
         broken.append(
-            f"{row['unexplained']} of {n} late without a gap of the machine that explains it, allowed {OURS:g}"
+            f"{row['unexplained']} of {n} late without a gap of the machine or its link that explains it, allowed {OURS:g}"
         )
     if row["late_share"] > LATE and row["unexplained"]:
         broken.append(f"late {row['late_share']:.2g}, allowed {LATE:g} or what the probes saw")
@@ -257,7 +258,7 @@ def row_words(row: dict[str, Any]) -> str:
     worst = max((gaps["largest_ms"] for gaps in row["gaps"]), default=0.0)
     text = (
         f"{row['name']:<32} {row['link']:<4} decisions {row['decisions']:>7}  late {row['late']:>5} "
-        f"(machine {whose['machine']}, partly {whose['partly']}, ours {whose['ours']})  "
+        f"({', '.join(f'{name} {number}' for name, number in whose.items())})  "
         f"p50 {latency['p50']:.0f} p99 {latency['p99']:.0f} max {latency['max']:.0f} us  largest gap {worst:.1f} ms"
     )
     if "missed" in row:

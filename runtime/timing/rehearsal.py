@@ -115,8 +115,8 @@ def rehearse(machine: Machine, seconds: float = SECONDS, tell: Told = lambda sha
         arms = arms_of(granted == GRANTED)
         turns = {arm.name: Turns() for arm in arms}
         turn_s = seconds * (1 - CORE_SHARE - WORK_SHARE) / (ROUNDS * sum(len(arm.kinds) for arm in arms))
-        with closing(Sender()) as pipe, closing(Sender(terminal=True)) as terminal:
-            senders = {"pipe": pipe, "terminal": terminal}
+        with ExitStack() as stack:
+            senders = {kind: stack.enter_context(closing(Sender(kind))) for kind in ("pipe", "terminal")}
             for sender in senders.values():
                 sender.bind(device)
             for number in range(ROUNDS):

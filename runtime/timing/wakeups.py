@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 import random
 import select
+import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -90,17 +91,15 @@ def work_times(seconds: float, pause_s: float) -> list[int]:
 class Sender:
     """Another process that sends stamps, as an instrument sends bytes; `close` ends it.
 
-    Through a pipe, or through a terminal: bytes of a terminal, as those of every serial port, are handed on by a worker of the kernel.
+    Through a pipe, through a terminal, whose bytes a worker of the kernel hands on, as those of every serial port, or through TCP on this
+    computer. `pause_s` are the shortest and the longest pause between two stamps.
     """
 
-    def __init__(self, *, terminal: bool = False) -> None:
-        import tty  # POSIX
-
-        code = _SENDER.format(low=PAUSE_S[0], high=PAUSE_S[1], priority=SENDER_PRIORITY)
+    def __init__(self, through: str = "pipe", pause_s: tuple[float, float] = PAUSE_S) -> None:
+        code = _SENDER.format(low=pause_s[0], high=pause_s[1], priority=SENDER_PRIORITY)
         words = [sys.executable, "-S", "-c", code]
-        theirs, self._ours = os.openpty() if terminal else reversed(os.pipe())
-        if terminal:
-            tty.setraw(self._ours)
+        self._pause_s = sum(pause_s) / 2
+        theirs, self._ours = _ENDS[through]()
         self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=theirs, bufsize=0)
         os.close(theirs)
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
@@ -114,24 +113,27 @@ class Sender:
 
     def wakes(self, seconds: float) -> list[int]:
         """Wait for stamps for about `seconds`; return how long after each stamp this thread had it."""
+        return [came - sent for sent, came in self.stamps(seconds)]
+
+    def stamps(self, seconds: float) -> Iterator[tuple[int, int]]:
+        """Wait for stamps for about `seconds`; yield when each was taken, and when this thread had it."""
         assert self._child.stdin is not None
-        count = max(1, round(seconds / (sum(PAUSE_S) / 2 + 60e-6)))  # a sleep takes about 60 us longer than asked for
-        file, clock, late, data = self._ours, time.perf_counter_ns, list[int](), b""
+        count = max(1, round(seconds / (self._pause_s + 60e-6)))  # a sleep takes about 60 us longer than asked for
+        file, clock, data, unpack = self._ours, time.perf_counter_ns, b"", _STAMP.unpack
         waiting = select.poll()
         waiting.register(file, select.POLLIN)
         self._child.stdin.write(f"{count}\n".encode())
-        while len(late) < count and waiting.poll(PATIENCE_MS):
+        while count and waiting.poll(PATIENCE_MS):
             try:
                 piece = os.read(file, _STAMP.size - len(data))
             except OSError:  # a terminal whose other end is closed
                 break
             now, data = clock(), data + piece
             if len(data) == _STAMP.size:
-                late.append(now - _STAMP.unpack(data)[0])
-                data = b""
+                yield unpack(data)[0], now
+                data, count = b"", count - 1
             elif not piece:
                 break  # it has ended
-        return late
 
     def close(self) -> None:
         """End it; idempotent."""
@@ -147,3 +149,27 @@ class Sender:
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
+
+
+def _pipe() -> tuple[int, int]:
+    ours, theirs = os.pipe()
+    return theirs, ours
+
+
+def _terminal() -> tuple[int, int]:
+    import tty  # POSIX
+
+    theirs, ours = os.openpty()
+    tty.setraw(ours)
+    return theirs, ours
+
+
+def _tcp() -> tuple[int, int]:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        theirs = socket.create_connection(listener.getsockname())
+        ours, _ = listener.accept()
+    theirs.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return theirs.detach(), ours.detach()
+
+
+_ENDS = {"pipe": _pipe, "terminal": _terminal, "tcp": _tcp}

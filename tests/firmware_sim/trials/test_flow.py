@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pans.firmware_sim.probes.attribution import (
     CATCH_UP,
+    LINK,
     MACHINE,
     ON_TIME_SHARE,
     OURS,
@@ -23,10 +24,12 @@ from pans.firmware_sim.probes.attribution import (
     attribute,
     gap_figures,
     late_table,
+    link_figures,
     united,
     verdict_of,
     worked_off,
 )
+from pans.firmware_sim.probes.link_probe import Delay, LinkProbe
 from pans.firmware_sim.probes.processes import real_time_programs
 from pans.firmware_sim.probes.scheduling_probe import MAX_GAPS, Gap, ProbeLog, SchedulingProbe
 from pans.firmware_sim.trials import figures_text
@@ -67,8 +70,12 @@ def gap(begin_us: int, end_us: int, core: int = 0, queued_us: int = 0) -> Gap:
     return Gap(core, (begin_us - 100) * US, begin_us * US, end_us * US, queued_us * US)
 
 
-def judged(timings: NDArray[np.void], number: int, *gaps: Gap) -> LateDecision:
-    (found,) = attribute(timings, [number], gaps, DEADLINE_NS)
+def delay(sent_us: int, came_us: int, usual_us: int = 50) -> Delay:
+    return Delay(sent_us * US, (sent_us + usual_us) * US, came_us * US)
+
+
+def judged(timings: NDArray[np.void], number: int, *gaps: Gap, delays: tuple[Delay, ...] = ()) -> LateDecision:
+    (found,) = attribute(timings, [number], gaps, DEADLINE_NS, delays)
     assert found.number == number
     return found
 
@@ -108,6 +115,16 @@ def test_only_gaps_that_the_decision_could_still_feel_count() -> None:
     long_ago = rows((1000, 300), (9000, 1400))
     assert judged(long_ago, 1, gap(1400, 1900)).whose == OURS  # over for longer than it takes to catch up
     assert judged(long_ago, 1, gap(4000, 7000)).whose == MACHINE
+
+
+def test_what_the_pair_beside_saw_late_counts_where_the_cores_were_there() -> None:
+    assert judged(THREE, 2, delays=(delay(3050, 3500),)).whose == LINK  # 400 us beyond the usual 50
+    assert judged(THREE, 2, delays=(delay(3051, 3500),)).whose == PARTLY
+    assert judged(THREE, 2, delays=(delay(1800, 2250),)).whose == OURS  # before a decision on time
+    both = judged(THREE, 2, gap(3100, 3300), delays=(delay(3200, 3500),))
+    assert (both.whose, both.away_ns, both.held_ns) == (LINK, 200 * US, 400 * US)
+    assert judged(THREE, 2, gap(3100, 3500), delays=(delay(3050, 3500),)).whose == MACHINE
+    assert worked_off(judged(THREE, 2, delays=(delay(3050, 3400),)), 0.34)
 
 
 def test_a_gap_in_which_the_core_ran_something_else_is_told() -> None:
@@ -179,8 +196,8 @@ def test_the_runs_own_verdicts_beside_whose_it_was() -> None:
     ]
     found = attribute(rows((1000, 1300), (3000, 1400)), [0, 1], [gap(1100, 1600)], DEADLINE_NS)
     assert late_table(found, verdicts) == {
-        "none": {MACHINE: 1, PARTLY: 0, OURS: 0},
-        "host": {MACHINE: 0, PARTLY: 0, OURS: 1},
+        "none": {MACHINE: 1, LINK: 0, PARTLY: 0, OURS: 0},
+        "host": {MACHINE: 0, LINK: 0, PARTLY: 0, OURS: 1},
     }
 
 
@@ -217,6 +234,30 @@ def test_a_probe_that_is_kept_from_its_core_notes_from_when_to_when() -> None:
     assert watched.wakes > 100
     assert 0 < watched.own_share < 1
     assert len(watched.gaps) < MAX_GAPS
+
+
+@needs_real_time
+@pytest.mark.parametrize("link", ["tcp", "pty"])
+def test_a_pair_whose_receiver_is_held_notes_what_came_late(link: str) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    probe = LinkProbe(link, (cores[0], cores[1]))
+    try:
+        time.sleep(0.15)
+        os.kill(probe.pid, signal.SIGSTOP)
+        stopped_ns = time.perf_counter_ns()
+        time.sleep(0.05)
+        continued_ns = time.perf_counter_ns()
+        os.kill(probe.pid, signal.SIGCONT)
+        time.sleep(0.15)
+        watched = probe.end()
+    finally:
+        probe.kill()
+    assert any(one.sent_ns < stopped_ns + 5_000 * US and one.came_ns > continued_ns for one in watched.delays)
+    assert all(one.sent_ns <= one.due_ns <= one.came_ns for one in watched.delays)
+    assert watched.messages > 100
+    assert 0 < watched.usual_ns < 200 * US
+    figures = link_figures(watched, stopped_ns, continued_ns + 1)
+    assert figures["largest_ms"] >= 45
 
 
 @needs_real_time
