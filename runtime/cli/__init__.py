@@ -15,6 +15,7 @@ from .command import (
     EXIT_USAGE,
     Command,
     add_force,
+    add_new_bundle,
 )
 from .main import main
 from .talk import emit, note, say, warn
@@ -29,6 +30,7 @@ __all__ = [
     "EXIT_USAGE",
     "Command",
     "add_force",
+    "add_new_bundle",
     "emit",
     "main",
     "note",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 EXIT_FINE, EXIT_ALERT, EXIT_USAGE, EXIT_DEVICE, EXIT_TIMING, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 EXIT_INTERNAL = 70  # a fault of pans itself: EX_SOFTWARE of sysexits.h
@@ -27,3 +28,9 @@ class Command:
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Add `--force`, of every command that writes files."""
     parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def add_new_bundle(parser: argparse.ArgumentParser, metavar: str = "OUT.pans") -> None:
+    """Add `-o` and `--force` of a command whose work is a bundle."""
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar=metavar, help="the bundle to write")
+    add_force(parser)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pans.runtime import __version__
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, add_force, emit
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_USAGE, Command, add_new_bundle, emit
 from pans.runtime.errors import DamagedFileError, UsageError, as_usage_error
 from pans.runtime.ranges import Range
 from pans.runtime.safe_text import one_line
@@ -184,8 +184,7 @@ def _configure_bundle(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--task", default="custom", metavar="NAME", help="what is decided (default: custom)")
     parser.add_argument("--name", metavar="NAME", help="the bundle's name (default: that of the output file)")
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.pans", help="the file to write")
-    add_force(parser)
+    add_new_bundle(parser)
 
 
 def _bundle(args: argparse.Namespace) -> int:

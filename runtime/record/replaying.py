@@ -1,26 +1,27 @@
 """A recording decided again: from its raw messages to decisions, with the same core as in the live run.
 
 Owns the way from a recording back to a core and the frames' order; never judges. `replay` returns the number of decisions, the hash
-of their log, which is the recorded one when nothing has changed, and how far they agree with a recording that was cut off.
+of their log, which is the recorded one when nothing has changed, and how far they agree with a recording that was cut off. A `ClickLog`
+notes the clicks behind each decision on the way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.bulk_steps import BulkSteps
 from pans.runtime.core.dark_guard import recorded_guard
-from pans.runtime.core.decision import DECISION_DTYPE, Decision
+from pans.runtime.core.decision import DECISION_DTYPE, Decision, DecisionFlag
 from pans.runtime.core.follower import Follower, Place
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.verdict import Decider
+from pans.runtime.decide.verdict import Decider, Verdict, Verdicts, verdicts_of
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.make import recorded_flow_core, replayed_figures
@@ -34,19 +35,55 @@ from .parts import place_of
 from .recording import Recording
 from .sent_plan import TICK_HZ, Sent, automaton_of, never_armed, sent_to_device, walk_dose
 
+ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
 SHOTS = Range(1, 1 << 20, whole=True)
 # what a header, or commands, of another hand than ours may raise where a run is rebuilt from them
 _NOT_REBUILT = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MalformedMessage)
 
 
-class Asked(Protocol):
-    """What stands between the core and its back end in a replay, and is told of the decisions: `PictureLog`, or refit's `ClickLog`."""
+class ClickLog:
+    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
+
+    def __init__(self) -> None:
+        self._decider: Decider | None = None
+        self.counts: list[NDArray[np.int64]] = []
+        self.decisions: list[Decision] = []
+        self.shots = 1
 
     def over(self, decider: Decider) -> Decider:
         """Return the back end that the core is to ask."""
+        self._decider = decider
+        self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
+        return self
+
+    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
+        """As `Decider`."""
+        self.counts.append(counts.copy())
+        self.shots = shots
+        return self._back_end.decide(counts, shots)
+
+    def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
+        """Decide many at once, as the compiled steps ask for."""
+        self.counts += list(counts.copy())
+        self.shots = shots
+        return verdicts_of(self._back_end, counts, shots)
+
+    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
+        """As `Decider`."""
+        return self._back_end.scores_batch(counts, shots)
+
+    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
+        """As `Decider`."""
+        return self._back_end.decide_batch(counts, shots)
 
     def note(self, decisions: Sequence[Decision]) -> None:
-        """Take the decisions in their order."""
+        """Take the decisions in their order: those that were asked for, in the order of asking."""
+        self.decisions += [one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(ASKED)]
+
+    @property
+    def _back_end(self) -> Decider:
+        assert self._decider is not None
+        return self._decider
 
 
 class Replayed(NamedTuple):
@@ -68,7 +105,7 @@ class Replayed(NamedTuple):
         return max(0, self.decisions - self.recorded)
 
 
-def replay(recording: Recording, bundle: Bundle, pictures: Asked | None = None) -> Replayed:
+def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
     """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked."""
     if never_armed(recording):
         return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True)
@@ -82,7 +119,7 @@ def replay(recording: Recording, bundle: Bundle, pictures: Asked | None = None) 
 class _Log:
     """The log of a replay; `sha256_as_far` is its hash after as many decisions as are recorded, "" while there are fewer."""
 
-    def __init__(self, n_recorded: int, pictures: Asked | None) -> None:
+    def __init__(self, n_recorded: int, pictures: ClickLog | None) -> None:
         self.decisions = 0
         self.sha256_as_far = ""
         self._n_recorded, self._pictures = n_recorded, pictures
@@ -117,7 +154,7 @@ def replayed_flow(recording: Recording, bundle: Bundle) -> tuple[PassageFigures,
     return replayed_figures(core, recording.events()), core.matcher.confusion
 
 
-def _replayed(recording: Recording, bundle: Bundle, pictures: Asked | None) -> tuple[Core | FlowCore, _Log]:
+def _replayed(recording: Recording, bundle: Bundle, pictures: ClickLog | None) -> tuple[Core | FlowCore, _Log]:
     """Drive a core through `recording`; return it and the log of its decisions."""
     core, steps, sent = _rebuilt(recording, bundle, pictures)
     log = _Log(recording.n_decisions, pictures)
@@ -133,7 +170,7 @@ def _replayed(recording: Recording, bundle: Bundle, pictures: Asked | None) -> t
 
 
 def _rebuilt(
-    recording: Recording, bundle: Bundle, pictures: Asked | None
+    recording: Recording, bundle: Bundle, pictures: ClickLog | None
 ) -> tuple[Core | FlowCore, BulkSteps | None, Sent]:
     """Return the core of the run, its compiled steps where they give all that is asked for, and what the device was sent.
 

@@ -13,68 +13,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.container import MIB, open_regular
 from pans.runtime.core.decision import Decision, DecisionFlag
-from pans.runtime.decide.verdict import Decider, Verdict, Verdicts, verdicts_of
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.record import Recording, read_recording, replay
 from pans.runtime.record.parts import is_of_parts, parts_in
+from pans.runtime.record.replaying import ASKED, ClickLog
 from pans.runtime.wire.messages import MalformedMessage, MessageType, decode_welcome, unpack_body
 
 from .labels import Labels
 
-_ASKED = DecisionFlag.NOT_FINITE | DecisionFlag.AMBIGUOUS  # abstained after the back end had been asked
-_TRUSTED = DecisionFlag.ABSTAINED | _ASKED
-
-
-class ClickLog:
-    """Stands between a core and its back end, whichever, and remembers the clicks of every decision that it is asked for."""
-
-    def __init__(self) -> None:
-        self._decider: Decider | None = None
-        self.counts: list[NDArray[np.int64]] = []
-        self.decisions: list[Decision] = []
-        self.shots = 1
-
-    def over(self, decider: Decider) -> Decider:
-        """Return the back end that the core is to ask."""
-        self._decider = decider
-        self.name, self.n_features, self.n_classes = decider.name, decider.n_features, decider.n_classes
-        return self
-
-    def decide(self, counts: NDArray[np.int64], shots: int) -> Verdict:
-        """As `Decider`."""
-        self.counts.append(counts.copy())
-        self.shots = shots
-        return self._back_end.decide(counts, shots)
-
-    def verdicts(self, counts: NDArray[np.int64], shots: int) -> Verdicts:
-        """Decide many at once, as the compiled steps ask for."""
-        self.counts += list(counts.copy())
-        self.shots = shots
-        return verdicts_of(self._back_end, counts, shots)
-
-    def scores_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.float32]:
-        """As `Decider`."""
-        return self._back_end.scores_batch(counts, shots)
-
-    def decide_batch(self, counts: ArrayLike, shots: int) -> NDArray[np.int64]:
-        """As `Decider`."""
-        return self._back_end.decide_batch(counts, shots)
-
-    def note(self, decisions: Sequence[Decision]) -> None:
-        """Take the decisions in their order: those that were asked for, in the order of asking."""
-        self.decisions += [
-            one for one in decisions if not one.flags & DecisionFlag.ABSTAINED or one.flags & int(_ASKED)
-        ]
-
-    @property
-    def _back_end(self) -> Decider:
-        assert self._decider is not None
-        return self._decider
+_TRUSTED = DecisionFlag.ABSTAINED | ASKED
 
 
 class Light(NamedTuple):

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
+from pans.runtime.cli import EXIT_FINE, Command, add_new_bundle, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
@@ -42,8 +42,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="the scene starts over after N objects (a simulated one says so itself)",
     )
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW.pans", help="the bundle to write")
-    add_force(parser)
+    add_new_bundle(parser, metavar="NEW.pans")
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -27,8 +27,8 @@ from pans.runtime.link.base import open_link
 from pans.runtime.live import LiveRun, Observers, RunConfig, RunResult, run_live
 from pans.runtime.live.config import PYTHON
 from pans.runtime.live.continuous import Stop
+from pans.runtime.record.replaying import ClickLog
 
-from .clicks import ClickLog
 from .evidence import F64, log_softmax
 
 _SEED = re.compile(r"([?&]seed=)(\d+)")

@@ -9,7 +9,7 @@ import argparse
 import math
 from pathlib import Path
 
-from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_force, emit
+from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, Command, add_new_bundle, emit
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
@@ -62,8 +62,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--drive", default="auto", choices=DRIVES, help="of an automaton: who chooses each pattern")
     parser.add_argument("--resume", action="store_true", help="go on from NEW.pans.tune.json")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW.pans", help="the bundle to write")
-    add_force(parser)
+    add_new_bundle(parser, metavar="NEW.pans")
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
-from pans.runtime.cli import add_force
+from pans.runtime.cli import add_new_bundle
 from pans.trainer.options import BUDGETS, ENCODERS, ESTIMATOR_NAMES, HEADS, Options
 
 from .arguments import add_data_dir, add_order_and_bleach, add_threads
@@ -108,8 +108,7 @@ def configure_train(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="of your own images: choose nothing from them, take the options and defaults as they are",
     )
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
-    add_force(parser)
+    add_new_bundle(parser)
 
 
 def _add_of_automata(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,8 @@ from pans.runtime import SHIPPED
 from pans.runtime.bundle import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.record import read_recording, replay
-from pans.runtime.refit.clicks import ClickLog, Labelled, labelled_clicks
+from pans.runtime.record.replaying import ClickLog
+from pans.runtime.refit.clicks import Labelled, labelled_clicks
 from pans.runtime.refit.labels import read_labels
 from pans.runtime.refit.words import words_of
 
