@@ -12,7 +12,8 @@ its lease runs out.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,44 +95,63 @@ def run_live(
     run = LiveRun(connection, plan, core, len(bundle.classes), config, recorder, started_ns)
     run.failed = failed
     try:
-        core.warm_up()
-        run.turn_choice = choose_turn(config.turn, core, link, drives=run.driver is not None)
-        if run.turn_choice.taken == COMPILED:
-            run.compiled = _compiled_turns(run, core, prompt=observers.acts and observers.watch is not None)
-            run.compiled.prepare()  # before the heap is touched: loading kernels takes memory
-        elif isinstance(core, Core):
-            core.warm_up_steps()
-        reader = connection.reader.thread_id
-        wanted = config.realtime and not link.virtual
-        with (
-            busy_core(None if link.virtual else config.core) as awake,
-            arm_realtime(wanted, [] if reader is None else [reader]) as granted,
-        ):
-            run.realtime = granted | awake | {"turn": run.turn_choice.words()}
-            counts = ThreadCounts()
-            try:
-                if observers.prepared is not None:
-                    observers.prepared(run)
-                run.arm()
-                counts.restart()  # the first exposure begins when ARM has had its time to arrive
-                _until_ended(run, recovery, prepare, observers)
-            except KeyboardInterrupt as interrupt:
-                run.ended = str(interrupt) or INTERRUPTED
-            except RecordingError:
-                run.drop_recorder()
-                raise
-            finally:  # whatever went wrong: light off first
-                try:
-                    run.halt()
-                finally:
-                    apart = {} if run.compiled is None else run.compiled.page_faults
-                    run.page_faults = apart or counts.since()
-                    run.stop()
+        _warm_up(run, prompt=observers.acts and observers.watch is not None)
+        with _granted(run):
+            _light_on(run, recovery, prepare, observers)
         return _result(run, profile)
     finally:
         if run.compiled is not None:
             run.compiled.close()
         run.connection.close()
+
+
+def _warm_up(run: LiveRun, *, prompt: bool) -> None:
+    """Choose the turn and load what it needs; with `prompt` a watcher acts."""
+    core, link = run.core, run.connection.link
+    core.warm_up()
+    run.turn_choice = choose_turn(run.config.turn, core, link, drives=run.driver is not None)
+    if run.turn_choice.taken == COMPILED:
+        run.compiled = _compiled_turns(run, core, prompt=prompt)
+        run.compiled.prepare()  # before the heap is touched: loading kernels takes memory
+    elif isinstance(core, Core):
+        core.warm_up_steps()
+
+
+@contextmanager
+def _granted(run: LiveRun) -> Iterator[None]:
+    """What the machine grants to a run at real pace, as long as it lasts; `run.realtime` says what that is."""
+    link, reader = run.connection.link, run.connection.reader.thread_id
+    with (
+        busy_core(None if link.virtual else run.config.core) as awake,
+        arm_realtime(run.config.realtime and not link.virtual, [] if reader is None else [reader]) as granted,
+    ):
+        run.realtime = granted | awake | {"turn": run.turn_choice.words()}
+        yield
+
+
+def _light_on(
+    run: LiveRun, recovery: Recovery | None, prepare: Callable[[Link], Connection], observers: Observers
+) -> None:
+    """From arming to dark: however it ends, the device is told to stop."""
+    counts = ThreadCounts()
+    try:
+        if observers.prepared is not None:
+            observers.prepared(run)
+        run.arm()
+        counts.restart()  # the first exposure begins when ARM has had its time to arrive
+        _until_ended(run, recovery, prepare, observers)
+    except KeyboardInterrupt as interrupt:
+        run.ended = str(interrupt) or INTERRUPTED
+    except RecordingError:
+        run.drop_recorder()
+        raise
+    finally:  # whatever went wrong: light off first
+        try:
+            run.halt()
+        finally:
+            apart = {} if run.compiled is None else run.compiled.page_faults
+            run.page_faults = apart or counts.since()
+            run.stop()
 
 
 def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> Turns:
