@@ -186,9 +186,9 @@ def _check_bleach(options: Options) -> None:
 
 def check_order(order: str | None, options: Options) -> None:
     """Refuse --order where there is none, before anything is trained."""
-    if order and (options.encoder != "active" or options.head != "mlp" or options.bleach or options.outcomes > 2):
+    if order and (options.encoder != "active" or options.head != "mlp" or options.bleach):
         raise UsageError(
-            "--order is for patterns that are sent, clicks and the head mlp; trained through bleaching, they have an order already",
+            "--order is for patterns that are sent and the head mlp; trained through bleaching, they have an order already",
             remedy="leave --order out",
         )
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, note
+from pans.runtime.cli import EXIT_FINE, Command, add_new_bundle, emit, note
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
@@ -43,14 +43,13 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", metavar="T", help="as of `pans train` (default: what the bundle was trained on)")
     parser.add_argument("--profile", metavar="P", help="default: what the bundle was trained for")
     add_data_dir(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.pans", help="the bundle to write")
-    add_force(parser)
+    add_new_bundle(parser)
 
 
 def _order(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
     from pans.trainer.evaluate.held_out import Conditions, held_out_of, trained_bleaching
-    from pans.trainer.evaluate.shown import of_first, patterns_within, training_clicks
+    from pans.trainer.evaluate.shown import of_first, patterns_within, training_readings
     from pans.trainer.tasks.remembered import remembered_task
 
     check_outputs([args.out], inputs=[args.bundle, args.task, args.profile], force=args.force)
@@ -78,7 +77,7 @@ def _order(args: argparse.Namespace) -> int:
         kept = new.n_features
         if args.dose_cap is not None:
             kept = patterns_within(new, args.dose_cap)
-            new = of_first(new, kept, training_clicks(new, held_out.profile, held_out.task.train))
+            new = of_first(new, kept, training_readings(new, held_out.profile, held_out.task.train))
     digest = write_bundle(new, args.out, force=args.force)
     rows = _rows(bundle, order, kept)
     payload = {

@@ -86,6 +86,13 @@ class Light:
     chain: Chain | None = None  # what links exposures: None without afterpulses
     numbers: Numbers | None = None  # of a bundle that takes photon numbers
 
+    @property
+    def chances(self) -> F64:
+        """P(reading) of every exposure by itself, float64 (objects, d_f, outcomes): of no click and a click, or of photon numbers."""
+        if self.numbers is not None:
+            return self.numbers.chances
+        return np.stack([1 - self.probability, self.probability], axis=2)
+
     def counts(self, shots: int, rng: np.random.Generator, rows: slice = slice(None)) -> NDArray[np.int64]:
         """Draw the clicks of `shots` exposures of every pattern, int64 (objects, d_f), for the objects in `rows`."""
         if self.numbers is not None:

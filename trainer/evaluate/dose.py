@@ -20,7 +20,7 @@ from pans.runtime.imaging import NO_BLEACHING
 
 from .accuracy import Measured
 from .held_out import Conditions, HeldOut, measure, trials_needed
-from .shown import of_first, patterns_within, training_clicks
+from .shown import of_first, patterns_within, training_readings
 from .walks import MeasuredWalks
 
 CURVE_PARTS = (1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 1.0)  # of the most that a walk may take
@@ -60,14 +60,14 @@ class Knowledge:
 
     def __init__(self, bundle: Bundle, held_out: HeldOut) -> None:
         self._bundle, self._held_out = bundle, held_out
-        self._clicks: F64 | None = None
+        self._readings: F64 | None = None
 
     @property
-    def clicks(self) -> F64:
-        """Click probabilities of training objects, (n, d_f)."""
-        if self._clicks is None:
-            self._clicks = training_clicks(self._bundle, self._held_out.profile, self._held_out.task.train)
-        return self._clicks
+    def readings(self) -> F64:
+        """P(reading) of training objects, (n, d_f, outcomes)."""
+        if self._readings is None:
+            self._readings = training_readings(self._bundle, self._held_out.profile, self._held_out.task.train)
+        return self._readings
 
 
 def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, eta: float = 1.0) -> Capped:
@@ -82,7 +82,7 @@ def within_cap(bundle: Bundle, cap: float, held_out: HeldOut, known: Knowledge, 
     own = cap / eta if eta > 0 else math.inf
     if bundle.automaton is None:
         count = patterns_within(bundle, own)
-        found = bundle if count == bundle.n_features else of_first(bundle, count, known.clicks)
+        found = bundle if count == bundle.n_features else of_first(bundle, count, known.readings)
         return Capped(found, cap, count, None)
     most = held_out.profile.projector.automaton_states or STATES_MAX
     automaton = capped(bundle.automaton, bundle.state_light(), min(own, CAP_MAX), most)

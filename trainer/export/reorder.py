@@ -1,7 +1,7 @@
 """A bundle whose patterns are shown in another order: tables, heads and golden vectors go with them.
 
 Owns the permutation of every back end; which order is ordering.py's. The bundle is made anew, so that all its golden vectors are
-computed and its table is held against its head. It decides on the same clicks of the same patterns as before.
+computed and its table is held against its head. It decides on the same readings of the same patterns as before.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.layers import Int8Head, Layer, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.refit.onnx_chain import chain_onnx
-from pans.trainer.evaluate.shown import demand_click_patterns
+from pans.trainer.evaluate.shown import demand_fixed_patterns
 
 from .ordering import Order
 
@@ -26,7 +26,7 @@ def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) ->
     ValueError for what is no order of its patterns, for a bundle without fixed patterns, and for a head that is no plain chain of layers.
     """
     places = [int(place) for place in order]
-    demand_click_patterns(bundle)
+    demand_fixed_patterns(bundle)
     if sorted(places) != list(range(bundle.n_features)):
         raise ValueError(f"{places[:20]} is no order of {bundle.n_features} patterns")
     return make_bundle(
@@ -51,9 +51,10 @@ def order_facts(order: Order, bundle: Bundle) -> dict[str, Any]:
 
 
 def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
-    table = None if bundle.table is None else bundle.table[_old_rows(places)]
+    outcomes = bundle.largest + 1
+    table = None if bundle.table is None else bundle.table[_old_rows(places, outcomes)]
     if bundle.head_onnx is None:
-        return BackEnd(table=table)
+        return BackEnd(table=table, outcomes=outcomes)
     layers = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
     if layers is None:
         raise ValueError(
@@ -66,13 +67,13 @@ def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
         from .int8_onnx import int8_onnx  # and the package onnx, which nothing else here needs
 
         quantised = int8_onnx(int8)
-    return BackEnd(chain_onnx((first, *layers[1:])), table, int8, quantised)
+    return BackEnd(chain_onnx((first, *layers[1:])), table, int8, quantised, outcomes)
 
 
-def _old_rows(places: list[int]) -> NDArray[np.int64]:
-    """The row of the old table for each of the new one: click i was that of pattern places[i]."""
-    word = np.arange(1 << len(places), dtype=np.int64)
-    return np.asarray(sum(((word >> new) & 1) << old for new, old in enumerate(places)), np.int64)
+def _old_rows(places: list[int], outcomes: int) -> NDArray[np.int64]:
+    """The row of the old table for each of the new one: digit i was that of pattern places[i]."""
+    word = np.arange(outcomes ** len(places), dtype=np.int64)
+    return np.asarray(sum(word // outcomes**new % outcomes * outcomes**old for new, old in enumerate(places)), np.int64)
 
 
 def _int8(head: Int8Head, places: list[int]) -> Int8Head:

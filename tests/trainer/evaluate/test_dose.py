@@ -20,7 +20,7 @@ from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.dose import Knowledge, caps_of, dose_curve, figures_of, within_cap
 from pans.trainer.evaluate.dose_picture import draw_dose
 from pans.trainer.evaluate.held_out import Conditions, HeldOut
-from pans.trainer.evaluate.shown import of_first, patterns_within, training_clicks
+from pans.trainer.evaluate.shown import of_first, patterns_within, training_readings
 from pans.trainer.evaluate.walks import walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -97,8 +97,8 @@ def test_walks_before_samples_that_bleach_are_those_of_all_words(mixed: bool) ->
 def test_a_table_of_the_first_patterns_sums_over_the_others() -> None:
     bundle = fixed()
     assert bundle.table is not None
-    clicks = training_clicks(bundle, IDEAL, TASK.train)
-    found = of_first(bundle, 2, clicks)
+    readings = training_readings(bundle, IDEAL, TASK.train)
+    clicks, found = readings[:, :, 1], of_first(bundle, 2, readings)
     assert found.table is not None
     assert found.n_features == 2
     for seen in range(4):
@@ -120,8 +120,8 @@ def test_a_head_of_the_first_patterns_takes_the_mean_of_the_others() -> None:
     levels = RNG.integers(1, 16, (14, 6))
     facts = {"levels": 16, "pattern_levels": levels, "photons_per_level": 0.1}
     bundle = made_bundle(14, 3, image_shape=(2, 3), head_onnx=chain_onnx(layers), **facts)
-    clicks = training_clicks(bundle, IDEAL, TASK.train)
-    found = of_first(bundle, 4, clicks)
+    readings = training_readings(bundle, IDEAL, TASK.train)
+    clicks, found = readings[:, :, 1], of_first(bundle, 4, readings)
     assert found.head_onnx is not None
     assert found.table is not None  # of 4 patterns it can be made
     words = np.array(list(itertools.product((0, 1), repeat=4)))

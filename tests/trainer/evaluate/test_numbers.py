@@ -14,7 +14,6 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of, sampled_shares
 from pans.trainer.evaluate.held_out import trials_needed
 from pans.trainer.evaluate.numbers import Numbers
-from pans.trainer.evaluate.shown import demand_click_patterns
 
 PROFILE = load_profile("dmd-qcmos")
 D_F, OUTCOMES, PIXELS = 2, 3, 16
@@ -82,9 +81,7 @@ def test_sums_of_shots_are_convolutions_and_their_head_answers_them() -> None:
     assert numbers.counts(2, np.random.default_rng(3), slice(5, 9)).shape == (4, 2)
 
 
-def test_what_knows_clicks_alone_says_so() -> None:
-    with pytest.raises(ValueError, match="toy takes photon numbers, allowed: fixed patterns that decide by clicks"):
-        demand_click_patterns(BUNDLE)
+def test_a_detector_that_only_clicks_is_refused() -> None:
     with pytest.raises(ValueError, match="toy needs 3 outcomes per exposure, dmd-spad tells 2 apart"):
         light_of(BUNDLE, load_profile("dmd-spad"), IMAGES)
     assert trials_needed(BUNDLE) is None

@@ -75,7 +75,7 @@ def test_the_order_takes_what_tells_most_next(by: str) -> None:
 def test_sampled_words_estimate_the_same_information() -> None:
     probability = RNG.random((24, 4)) ** 2
     known = _Samples(np.tile(LABELS, 60), 3, 0)
-    many = np.tile(probability, (60, 1))
+    many = np.tile(np.stack([1 - probability, probability], axis=2), (60, 1, 1))
     for number in range(3):
         wanted = [bits_of(probability[:, [*range(number), j]]) for j in range(number, 4)]
         assert known.bits_with(many[:, number:]) == pytest.approx(wanted, abs=0.03)

@@ -14,7 +14,6 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.instrument.count_law import CountLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
-from pans.trainer.export.ordering import information_order
 from pans.trainer.export.writer import export_trained
 from pans.trainer.options import Options
 from pans.trainer.train.loop import train
@@ -40,5 +39,3 @@ def test_trained_numbers_are_exported_as_they_were_trained(tmp_path: Path) -> No
     assert found.accuracy_mean > 1.5 / len(task.classes)
     mean = trained.click_mean.numpy() * 3  # of the training objects, which the test objects are like
     assert np.allclose(mean, light_of(bundle, profile, task.train.images).probability.mean(axis=0), atol=0.02)
-    with pytest.raises(ValueError, match="by clicks"):
-        information_order(bundle, profile, task.train, by="information")

@@ -18,7 +18,7 @@ from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.held_out import Conditions, HeldOut, as_trained, measure, trained_bleaching
-from pans.trainer.evaluate.shown import training_clicks
+from pans.trainer.evaluate.shown import training_readings
 from pans.trainer.export.writer import export_trained
 from pans.trainer.model.encoders import ActiveIllumination, new_encoder
 from pans.trainer.options import Options, check_options, check_order
@@ -51,8 +51,8 @@ def test_the_encoder_is_trained_on_the_light_that_is_judged(bleach: str) -> None
         assert float(encoder.illumination()) == pytest.approx(bundle.illumination(), rel=1e-6)
     np.testing.assert_allclose(found, wanted.photoelectrons, rtol=1e-5)
     assert (wanted.photoelectrons[:, 2] < 0.8 * light_of(bundle, IDEAL, IMAGES).photoelectrons[:, 2]).all()
-    clicks = training_clicks(bundle, IDEAL, Objects(IMAGES, np.zeros(9, np.int64)))
-    np.testing.assert_array_equal(clicks, wanted.probability)
+    readings = training_readings(bundle, IDEAL, Objects(IMAGES, np.zeros(9, np.int64)))
+    np.testing.assert_array_equal(readings[:, :, 1], wanted.probability)
 
 
 @pytest.mark.parametrize(
