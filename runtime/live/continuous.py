@@ -96,6 +96,11 @@ def _is_loading(frame: FrameType | None) -> bool:
     return False
 
 
+def _outlives_its_terminal(number: int) -> bool:
+    """Whether this is the end of the terminal, and nohup has been asked that it ends nothing."""
+    return number == getattr(signal, "SIGHUP", None) and signal.getsignal(number) is signal.SIG_IGN
+
+
 @contextmanager
 def stop_signals(*, continuous: bool) -> Iterator[Stop]:
     """Turn SIGTERM, SIGINT and SIGHUP into a `Stop`, and put the handlers back afterwards; in the main thread only, else none comes."""
@@ -103,8 +108,8 @@ def stop_signals(*, continuous: bool) -> Iterator[Stop]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    names = [name for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)]
-    before = {getattr(signal, name): signal.signal(getattr(signal, name), stop.ask) for name in names}
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.signal(number, stop.ask) for number in numbers if not _outlives_its_terminal(number)}
     try:
         yield stop
     finally:

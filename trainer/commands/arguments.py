@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -34,6 +35,19 @@ def add_order_and_bleach(parser: argparse.ArgumentParser) -> None:
 def add_threads(parser: argparse.ArgumentParser, consequence: str = "; changes the rounding") -> None:
     """Add --threads, the number of threads of torch."""
     parser.add_argument("--threads", type=int, default=1, metavar="T", help=f"of torch (default 1){consequence}")
+
+
+def interruptible(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """Return the work of a command, which SIGTERM and SIGHUP interrupt as Ctrl-C does: what is finished is kept, exit code 130."""
+
+    @functools.wraps(run)
+    def guarded(args: argparse.Namespace) -> int:
+        from pans.runtime.live.continuous import stop_signals
+
+        with stop_signals(continuous=False):
+            return run(args)
+
+    return guarded
 
 
 def torch_with(threads: int, what: str = "training") -> Any:

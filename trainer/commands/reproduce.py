@@ -17,6 +17,8 @@ from pans.trainer.paper import Asked, Made, Page, rewrite_page, write_page
 from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
+from .arguments import interruptible
+
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 SEEDS_MAX = 100
 THREADS_MAX = 1024
@@ -151,7 +153,7 @@ def _check(name: str, args: argparse.Namespace) -> None:
 REPRODUCE = Command(
     "the paper's tables and figures, ours beside the paper's",
     _configure,
-    _run,
+    interruptible(_run),
     examples=(
         "pans reproduce list",
         "pans reproduce fashion-mnist -o out",

@@ -21,7 +21,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs, file_identity
 from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
 
-from .arguments import add_data_dir, add_threads, needing, torch_with
+from .arguments import add_data_dir, add_threads, interruptible, needing, torch_with
 
 TRIALS_MAX = 1_000_000
 JOURNAL_LINE_MAX_BYTES = 1 << 20
@@ -200,6 +200,6 @@ def _check_same(study: Any, base: Options, data_sha256: str) -> None:
 SWEEP = Command(
     "search training options with optuna, in several processes or machines",
     _configure,
-    _run,
+    interruptible(_run),
     examples=("pans sweep parts --features 6 --storage study.log --trials 50",),
 )

@@ -7,7 +7,6 @@ imported when the command runs, not before. All accuracies here are SIMULATED th
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -27,7 +26,7 @@ from pans.trainer.options import (
     plain_options,
 )
 
-from .arguments import needing, stated_tolerance, torch_with, usage_errors
+from .arguments import interruptible, needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
 from .evaluate import passive_light, words_of
 from .train_arguments import AS_GIVEN, AUTOMATON, DEFAULT_PROFILE, OF_AUTOMATA, configure_train
@@ -63,6 +62,7 @@ def _train(args: argparse.Namespace) -> int:
     from pans.runtime.instrument.profile import load_profile
     from pans.trainer.device import computing_on
     from pans.trainer.tasks.registry import load_task
+    from pans.trainer.train.checkpoint import timed
     from pans.trainer.train.loop import train
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
@@ -71,10 +71,14 @@ def _train(args: argparse.Namespace) -> int:
     options = _options(args, task, profile)
     check_order(args.order, options)
     check_options(options, profile)
-    started = time.perf_counter()
     history = _history(args, options, checkpoint, chosen.task)
     try:
-        with usage_errors(), _progress(options) as show, computing_on(args.device):
+        with (
+            usage_errors(),
+            _progress(options) as show,
+            computing_on(args.device),
+            timed(checkpoint, resume=args.resume) as watch,
+        ):
 
             def report(epoch: EpochReport) -> None:
                 show(epoch)
@@ -85,14 +89,14 @@ def _train(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
-    exported = _export(args, task, profile, trained, time.perf_counter() - started, chosen.facts)
+    exported = _export(args, task, profile, trained, watch.seconds(), chosen.facts)
     answer, words = _figures(exported, trained, task, profile)
     checkpoint.unlink(missing_ok=True)
     if history is not None:
         shown = trained.quantised.patterns() if trained.quantised else None
         for path in history.write(args.history, shown, task.image_shape, force=args.force):
             say(f"wrote {path}")
-    seconds = time.perf_counter() - started
+    seconds = watch.seconds()
     payload = {"bundle": str(args.out), **answer, "seconds": seconds, "simulated": True}
     if own and task.target == "class":
         after = finish(args, task, profile, answer)
@@ -224,7 +228,7 @@ def _epoch_line(epoch: EpochReport, options: Options) -> str:
 TRAIN = Command(
     "train patterns and head through a profile, and export a bundle",
     configure_train,
-    _train,
+    interruptible(_train),
     examples=(
         "pans train parts --features 6 --profile my-lab.toml -o parts.pans",
         "pans train fashion-mnist --features 10 --photons 8 -o fashion.pans",

@@ -7,7 +7,6 @@ are exact expectations, SIMULATED through the profile.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -93,6 +92,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     from pans.trainer.adaptive.train import train_automaton
     from pans.trainer.device import computing_on, keep_freed_memory
     from pans.trainer.tasks.registry import load_task
+    from pans.trainer.train.checkpoint import timed
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
@@ -105,13 +105,17 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
     if args.teacher is not None and not for_task(options, task.name).soft:
         raise UsageError("--teacher: no soft targets are wanted", remedy="add --soft 0.5, say, or leave it out")
     keep_freed_memory()
-    started = time.perf_counter()
     course: list[Progress] = []
     if args.history is not None:
         with needing("--history", "plot"):
             import matplotlib  # noqa: F401
     try:
-        with usage_errors(), _progress() as show, computing_on(args.device):
+        with (
+            usage_errors(),
+            _progress() as show,
+            computing_on(args.device),
+            timed(checkpoint, resume=args.resume) as watch,
+        ):
 
             def take(told: Progress) -> None:
                 course.append(told)
@@ -128,7 +132,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
                 teacher=args.teacher,
                 start=start,
             )
-            exported = _export(args, trained, task, profile, time.perf_counter() - started, chosen.facts)
+            exported = _export(args, trained, task, profile, watch.seconds(), chosen.facts)
     except KeyboardInterrupt:
         say(f"interrupted; the last whole step is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
@@ -139,7 +143,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
         for path in write_course(args.history, course, force=args.force):
             say(f"wrote {path}")
     after = finish(args, task, profile, asdict(exported.measured)) if own else After({}, "")
-    _answer(args, trained, exported, time.perf_counter() - started, after)
+    _answer(args, trained, exported, watch.seconds(), after)
     return EXIT_FINE
 
 

@@ -1,13 +1,18 @@
 """Checkpoints: the state of a training on disk, so that an interrupted one goes on to the same result.
 
-Owns the file and the check that it belongs to this training; never knows what the state means. The file is torch's own and is read
-with `weights_only`: tensors and plain values, nothing that could run code.
+Owns the file, the check that it belongs to this training, and the time that all its processes took; never knows what the state means.
+The file is torch's own and is read with `weights_only`: tensors and plain values, nothing that could run code.
 """
 
 from __future__ import annotations
 
 import io
-from dataclasses import asdict
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +25,41 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
+@dataclass(frozen=True, slots=True)
+class Stopwatch:
+    """Seconds of a training: those of the processes before this one, and its own since `began`."""
+
+    before: float
+    began: float
+
+    def seconds(self) -> float:
+        """Return the sum so far."""
+        return self.before + time.perf_counter() - self.began
+
+
+_WATCH: ContextVar[Stopwatch | None] = ContextVar("stopwatch of the training that is under way", default=None)
+
+
+@contextmanager
+def timed(path: Path, *, resume: bool) -> Iterator[Stopwatch]:
+    """Yield the time of a training; the checkpoints written meanwhile hold it, and with `resume` it goes on from that in `path`."""
+    watch = Stopwatch(_seconds_in(path) if resume else 0.0, time.perf_counter())
+    token = _WATCH.set(watch)
+    try:
+        yield watch
+    finally:
+        _WATCH.reset(token)
+
+
+def _seconds_in(path: Path) -> float:
+    """Return the seconds that a checkpoint tells, 0 where it tells none; what is no checkpoint is refused by who reads it."""
+    try:
+        told = torch.load(path, map_location="cpu", weights_only=True)["seconds"]
+    except Exception:  # a damaged or foreign file makes torch raise almost anything
+        return 0.0
+    return float(told) if isinstance(told, float) and 0 <= told < math.inf else 0.0
+
+
 def _identity(options: DataclassInstance, data_sha256: str) -> dict[str, Any]:
     plain = {key: str(value) for key, value in asdict(options).items()} | {"data": data_sha256}
     return plain | {"restarts": "1"} if "restarts" in plain else plain
@@ -27,8 +67,9 @@ def _identity(options: DataclassInstance, data_sha256: str) -> dict[str, Any]:
 
 def write_checkpoint(path: Path, options: DataclassInstance, data_sha256: str, state: dict[str, Any]) -> None:
     """Write `state` (nested dicts and lists of tensors and plain values) to `path`, whole or not at all."""
-    file = io.BytesIO()
-    torch.save({"identity": _identity(options, data_sha256), **state}, file)
+    file, watch = io.BytesIO(), _WATCH.get()
+    spent = {} if watch is None else {"seconds": watch.seconds()}
+    torch.save({"identity": _identity(options, data_sha256), **spent, **state}, file)
     replace_file(path, file.getbuffer())
 
 

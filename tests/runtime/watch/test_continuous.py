@@ -119,6 +119,20 @@ def test_signals_become_words_while_somebody_looks() -> None:
             asked.ask(signum, None)
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs SIGHUP")
+def test_nohup_keeps_what_runs_beyond_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_signals(continuous=False) as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.word
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        with stop_signals(continuous=False), pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture(scope="module")
 def bundle_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bundle") / "grid.pans"

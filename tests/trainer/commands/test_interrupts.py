@@ -1,0 +1,65 @@
+"""A training that is terminated: exit code 130, its checkpoint, and the time of all its processes after `--resume`."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the train extra")
+
+from trainings import bars_task, short_fits  # noqa: E402, F401 - a fixture
+
+from pans.runtime.bundle.model import load_bundle  # noqa: E402
+from pans.runtime.cli import main  # noqa: E402
+from pans.trainer.train import checkpoint  # noqa: E402
+
+FIXED = ["--features", "2", "--epochs", "2", "--batch", "64", "--hidden", "8"]
+AUTOMATON = ["--encoder", "automaton", "--photons", "3", "--exposures", "3", "--states", "4", "--epochs", "1"]
+
+
+@pytest.mark.usefixtures("short_fits")
+@pytest.mark.parametrize(("module", "words"), [("train.loop", FIXED), ("adaptive.train", AUTOMATON)])
+def test_a_terminated_training_says_so_and_goes_on(
+    module: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = bars_task()
+    parts = {"train_images": task.train.images, "train_labels": task.train.labels}
+    np.savez(tmp_path / "bars.npz", **parts, test_images=task.test.images, test_labels=task.test.labels)
+    before, out = signal.getsignal(signal.SIGTERM), tmp_path / "bars.pans"
+    command = ["train", str(tmp_path / "bars.npz"), *words, "--as-is", "-o", str(out), "--json"]
+
+    def killed(*given: Any) -> None:
+        checkpoint.write_checkpoint(*given)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(f"pans.trainer.{module}.write_checkpoint", killed)
+    assert main(command) == 130
+    assert json.loads(capsys.readouterr().out)["error"]["exit"] == 130
+    assert signal.getsignal(signal.SIGTERM) is before
+    monkeypatch.undo()
+
+    state = tmp_path / "bars.pans.checkpoint"
+    saved = torch.load(state, weights_only=True)
+    assert 0 < saved["seconds"] < 600
+    torch.save(saved | {"seconds": 5000.0}, state)  # as of processes that took long
+    assert main([*command, "--resume"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert 5000 < answer["seconds"] < 5600
+    assert load_bundle(out)[0].provenance["training_seconds"] >= 5000
+    assert not state.exists()
+
+
+def test_seconds_of_a_strange_checkpoint_count_nothing(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    for told in (float("nan"), -1.0, "long", float("inf")):
+        torch.save({"seconds": told}, state)
+        with checkpoint.timed(state, resume=True) as watch:
+            assert watch.before == 0.0
+    state.write_bytes(b"nothing")
+    with checkpoint.timed(state, resume=True) as watch:
+        assert watch.before == 0.0
