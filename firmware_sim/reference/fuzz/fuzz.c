@@ -1,5 +1,6 @@
 /* Strange bytes and frames at the core: `fuzz SECONDS SEED`, built with address and undefined-behaviour sanitizers.
  *
+ * The seconds are of processor time: on a busy machine, or when it is stopped, a run takes longer and does as much.
  * Random bytes, damaged frames, and frames with a right CRC whose numbers stand at the edges; time passes by jumps, the line takes any number of
  * bytes, and now and then a device begins anew with other limits. Everything that it sends must be whole frames with a right CRC, in time.
  * Ends with 1 and the seed when something is wrong, and prints what was done.
@@ -16,6 +17,7 @@
 
 #define LARGEST_FRAME (MAX_PAYLOAD + HEADER_BYTES + CRC_BYTES)
 #define SESSION 0x5EED
+#define MOST_FACTS 9
 
 static struct {
     uint64_t dice, tick, exposures, frames_in, frames_out, bytes_in, armed, blocks, devices;
@@ -71,7 +73,7 @@ static size_t hw_read(void *self, uint8_t *bytes, size_t room)
 static size_t hw_write(void *self, const uint8_t *bytes, size_t count)
 {
     (void)self, (void)bytes;
-    return count; /* bytes of pans_turn are not looked at: they would have to be put in order with those of pans_output */
+    return (size_t)roll(count + 1); /* bytes of pans_turn are not looked at: they would have to be put in order with those of pans_output */
 }
 
 static void hw_store(void *self, const struct pans_pixels *pixels)
@@ -312,6 +314,19 @@ static void listen(struct pans_device *device)
     }
 }
 
+/* Facts of WELCOME besides: as many as there is room for are told. */
+static const struct pans_fact *any_facts(void)
+{
+    static char text[600];
+    static struct pans_fact facts[MOST_FACTS];
+    memset(text, 'x', sizeof text);
+    text[roll(sizeof text)] = '\0';
+    text[sizeof text - 1] = '\0';
+    for (size_t i = 0; i < MOST_FACTS; i++)
+        facts[i] = (struct pans_fact){text + roll(sizeof text), roll(2) ? text : NULL, number(64)};
+    return facts;
+}
+
 static struct pans_limits any_limits(void)
 {
     bool parallel = roll(3) == 0;
@@ -324,6 +339,8 @@ static struct pans_limits any_limits(void)
         .buffer_messages = 1 + (uint32_t)roll(20), .block_bytes = 39 + (uint32_t)roll(300), .payload_bytes = roll(2) ? 65536 : 64 + (uint32_t)roll(900),
         .port_bytes = 1 + (uint32_t)roll(300), .gate_outputs = 4, .gate_pulses = (uint16_t)(1 + roll(6)), .epoch = 1, .firmware = "fuzz", .serial = "0",
     };
+    limits.facts = any_facts();
+    limits.n_facts = roll(MOST_FACTS + 1);
     limits.buffer_bytes = limits.block_bytes + limits.block_bytes / 254 + 32 + (uint32_t)roll(2000);
     return limits;
 }
@@ -347,7 +364,7 @@ static void one_life(void)
     decoder_init(&here.decoder, here.heard, sizeof here.heard);
     memset(here.body, 0, sizeof here.body);
     send_frame(device, HELLO, fill(here.body + HEADER_BYTES, "IHH", (uint64_t[]){PANS_SCHEMA, PANS_PROTOCOL, 0}));
-    for (int turn = 0; turn < 3000; turn++) {
+    for (int turn = 0, deaf = 0; turn < 3000; turn++) {
         static const uint8_t UPLOADS[] = {5, 7, 1, 2, 8, 3, 9, 6, 9, 4};
         uint8_t opcode = roll(3) == 0 ? (uint8_t)roll(12) : UPLOADS[(turn / 2) % 10];
         if (roll(3) != 0)
@@ -355,7 +372,12 @@ static void one_life(void)
         else
             send_other(device);
         here.tick += roll(4) == 0 ? roll(400) : roll(3);
-        listen(device);
+        if (deaf == 0)
+            deaf = roll(1500) == 0 ? (int)roll(300) : 0;
+        else
+            deaf--; /* for so long nobody takes what it says */
+        if (deaf == 0)
+            listen(device);
         if (pans_next_tick(device) < here.tick && roll(2) == 0)
             pans_step(device, here.tick, NULL, 0);
         if (here.exposing > 1)
@@ -370,15 +392,16 @@ static void one_life(void)
 int main(int count, char **words)
 {
     double seconds = count > 1 ? strtod(words[1], NULL) : 5;
-    struct timespec began, now;
+    struct timespec used; /* of this process: it begins at 0 */
     here.dice = (count > 2 ? strtoull(words[2], NULL, 10) : 1) * 0x9E3779B97F4A7C15u | 1;
-    clock_gettime(CLOCK_MONOTONIC, &began);
     do {
         one_life();
-        clock_gettime(CLOCK_MONOTONIC, &now);
-    } while ((double)(now.tv_sec - began.tv_sec) + (double)(now.tv_nsec - began.tv_nsec) * 1e-9 < seconds);
-    printf("%llu bytes, %llu frames in, %llu out, %llu armed, %llu exposures, %llu blocks, %llu devices\n", (unsigned long long)here.bytes_in,
-           (unsigned long long)here.frames_in, (unsigned long long)here.frames_out, (unsigned long long)here.armed,
-           (unsigned long long)here.exposures, (unsigned long long)here.blocks, (unsigned long long)here.devices);
+        if (clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &used) != 0)
+            wrong("no clock of processor time");
+    } while ((double)used.tv_sec + (double)used.tv_nsec * 1e-9 < seconds);
+    printf("%llu bytes, %llu frames in, %llu out, %llu armed, %llu exposures, %llu blocks, %llu devices, %lld seconds\n",
+           (unsigned long long)here.bytes_in, (unsigned long long)here.frames_in, (unsigned long long)here.frames_out,
+           (unsigned long long)here.armed, (unsigned long long)here.exposures, (unsigned long long)here.blocks,
+           (unsigned long long)here.devices, (long long)used.tv_sec);
     return 0;
 }
