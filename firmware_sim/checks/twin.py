@@ -6,26 +6,26 @@ Owns the tape of a run and its second reading; never judges the first. `differen
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.core.decision import DECISION_DTYPE, Output
-from pans.runtime.core.plan import Plan
+from pans.runtime.core.decision import DECISION_DTYPE, Decision, Output
 from pans.runtime.core.still import Core
-from pans.runtime.decide.verdict import Decider
+from pans.runtime.flow.core import FlowCore
 from pans.runtime.link.base import Link
 from pans.runtime.live import LiveRun
 from pans.runtime.turn.engine import Limits
 from pans.runtime.turn.streaming import Batch, StreamCore
 
+from .flow_stream import FlowStream
 from .reconciliation import ObservedLink
 
 MOST_SENT = 1 << 15  # bytes in one piece through a socket whose pieces stay apart
 AT_ONCE = Limits(due_ns=0)
+Streamed = StreamCore | FlowStream
 
 
 class TapedLink(ObservedLink):
@@ -70,57 +70,70 @@ class TapedLink(ObservedLink):
 class SocketTwin:
     """A core behind the compiled turn, which reads from a socket what another core is given; `took` is how many messages it took."""
 
-    def __init__(self, plan: Plan, decider: Decider, session: int) -> None:
-        self._streamed = StreamCore(plan, decider, 1, 0, session)
-        self._streamed.warm_up()  # who measures a call does not measure the compiler
+    def __init__(self, streamed: Streamed) -> None:
+        self._streamed = streamed
+        streamed.warm_up()  # who measures a call does not measure the compiler
         self.took = 0
 
-    def takes(self, data: bytes, core: Core) -> str:
-        """Read `data`; return where this core is not where `core` is, "" where they agree."""
+    def takes(self, data: bytes, core: Core | FlowCore, decisions: Sequence[Decision]) -> str:
+        """Read `data`; return where this core is not where `core` is, which made `decisions` of it, "" where they agree."""
         before = self._streamed.core.tracker.counters.messages
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with ours, theirs:
-            for first in range(0, len(data), MOST_SENT):
-                theirs.send(data[first : first + MOST_SENT])
-                for _ in self._streamed.listen(ours.fileno(), AT_ONCE):
-                    pass
+        rows = [batch.rows.copy() for batch in _sent(self._streamed, data)]
         again = self._streamed.core
         self.took = again.tracker.counters.messages - before
-        names = ("n_decisions", "n_abstained", "completed", "last_tick", "jitter_ticks", "contradictions")
-        compared = [(name, getattr(again, name), getattr(core, name)) for name in names]
-        compared += [("stream counters", again.tracker.counters, core.tracker.counters)]
-        compared += [("tallies", again.tallies.tolist(), core.tallies.tolist())]
-        wrong = [f"{what} {one}, Python's {other}" for what, one, other in compared if one != other]
+        wrong = _unlike(again, core) + _unlike_rows(rows, np.array(decisions, DECISION_DTYPE))
         return f"the compiled turn disagrees over {data[:100].hex()}: {'; '.join(wrong)}" if wrong else ""
 
 
 def differences(
-    tape: list[tuple[str, Any]], plan: Plan, decider: Decider, shots: int, core: Core, decisions: NDArray[np.void]
+    tape: list[tuple[str, Any]], streamed: Streamed, core: Core | FlowCore, decisions: NDArray[np.void]
 ) -> list[str]:
-    """Read `tape` once more; return where decisions, counters and tallies are not those of `core`, which read it first."""
-    streamed = StreamCore(plan, decider, shots, 0, 0)
-    rows = [np.zeros(0, DECISION_DTYPE), *(batch.rows.copy() for batch in _read_again(streamed, tape))]
-    found, again = np.concatenate(rows), streamed.core
-    compared = [
-        ("decisions", len(found), len(decisions)),
-        ("stream counters", asdict(again.tracker.counters), asdict(core.tracker.counters)),
+    """Let `streamed` read `tape`; return where decisions, counters and tallies are not those of `core`, which read it first."""
+    rows = [batch.rows.copy() for batch in _read_again(streamed, tape)]
+    return [f"compiled turn: {words}" for words in _unlike(streamed.core, core) + _unlike_rows(rows, decisions)]
+
+
+def _unlike(again: Core | FlowCore, core: Core | FlowCore) -> list[str]:
+    names = ["n_decisions", "n_abstained", "completed", "last_tick", "jitter_ticks", "contradictions"]
+    if isinstance(core, FlowCore):
+        names += ["n_passages", "empty_frames", "dark_frames", "watched_frames"]
+    compared = [(name, getattr(again, name), getattr(core, name)) for name in names]
+    compared += [
+        ("stream counters", again.tracker.counters, core.tracker.counters),
         ("tallies", again.tallies.tolist(), core.tallies.tolist()),
         ("place", again.tracker.position, core.tracker.position),
     ]
-    wrong = [f"compiled turn: {what} {one}, Python's {other}" for what, one, other in compared if one != other]
-    if len(found) == len(decisions) and (differ := np.flatnonzero(found != decisions)).size:
-        wrong.append(f"compiled turn: decision {differ[0]} is {found[differ[0]]}, Python's {decisions[differ[0]]}")
-    return wrong
+    if isinstance(core, FlowCore) and isinstance(again, FlowCore):
+        compared.append(("empty field", again.empty_channels.tolist(), core.empty_channels.tolist()))
+    return [f"{what} {one}, Python's {other}" for what, one, other in compared if one != other]
 
 
-def _read_again(streamed: StreamCore, tape: list[tuple[str, Any]]) -> Iterator[Batch]:
+def _unlike_rows(rows: list[NDArray[np.void]], decisions: NDArray[np.void]) -> list[str]:
+    found = np.concatenate(rows) if rows else np.zeros(0, DECISION_DTYPE)
+    if len(found) != len(decisions):
+        return [f"decisions {len(found)}, Python's {len(decisions)}"]
+    differ = np.flatnonzero(found != decisions)
+    return [f"decision {differ[0]} is {found[differ[0]]}, Python's {decisions[differ[0]]}"] if differ.size else []
+
+
+def _sent(streamed: Streamed, data: bytes) -> Iterator[Batch]:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        yield from _through(streamed, data, ours, theirs)
+
+
+def _through(streamed: Streamed, data: bytes, ours: socket.socket, theirs: socket.socket) -> Iterator[Batch]:
+    for first in range(0, len(data), MOST_SENT):
+        theirs.send(data[first : first + MOST_SENT])
+        yield from streamed.listen(ours.fileno(), AT_ONCE)
+
+
+def _read_again(streamed: Streamed, tape: list[tuple[str, Any]]) -> Iterator[Batch]:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
         for what, facts in tape:
             if what == "bytes":
-                for first in range(0, len(facts), MOST_SENT):
-                    theirs.send(facts[first : first + MOST_SENT])
-                    yield from streamed.listen(ours.fileno(), AT_ONCE)
+                yield from _through(streamed, facts, ours, theirs)
             elif what == "opened":
                 streamed.reopen()
             elif what == "begin":

@@ -19,32 +19,45 @@ from typing import Any
 import numpy as np
 
 from pans.firmware_sim.checks.checkers import Checker, WatchedInstrument
+from pans.firmware_sim.checks.flow_checker import FlowChecker
+from pans.firmware_sim.checks.flow_stream import FlowStream
+from pans.firmware_sim.checks.flowing import KINDS, small_flow
+from pans.firmware_sim.checks.grid_host import GridHost
 from pans.firmware_sim.checks.reconciliation import ObservedLink, reconcile
-from pans.firmware_sim.checks.twin import TapedLink, differences
+from pans.firmware_sim.checks.slow_reads import SlowReads
+from pans.firmware_sim.checks.twin import Streamed, TapedLink, differences
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.options import option
 from pans.firmware_sim.ports.faults import NAMES, parse_faults
 from pans.firmware_sim.ports.faulty import FaultyDevice
-from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
-from pans.firmware_sim.scene.still import scene_from_arrays
+from pans.firmware_sim.ports.virtual import START_NS
+from pans.firmware_sim.scene.moving import SceneFile
+from pans.firmware_sim.scene.still import Scene, scene_from_arrays
 from pans.firmware_sim.testing import small_setup
+from pans.runtime.bundle.model import Bundle
 from pans.runtime.cli import say
-from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
+from pans.runtime.flow.core import FlowCore
+from pans.runtime.instrument.profile import Profile
 from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult, run_live
 from pans.runtime.live.config import AUTO, COMPILED, PYTHON
+from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, Recording, read_recording
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.turn.system import offered
-from pans.runtime.wire.commands import Gate
 
 from . import Report, Trial, figures_text
 
 SHOTS = 1
-MODES = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts")
-GATE_EVERY = 32  # decisions
+STILL = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts")
+MODES = (*STILL, *KINDS)  # objects that stand still, and those in flow
+SLOW_READS = (
+    0.75  # of all, bring what came within a while; of a host that names each state next, fewer: it would be late
+)
+SLOW_READS_DRIVEN = 0.02
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
 GRID_TIMES = {
@@ -59,7 +72,6 @@ GRID_ALL = (
     "loss:0.003,flip:0.003,duplicate:0.003,truncate:0.003,reorder:0.003,drip:0.003,stall:600ms/2s,"
     "disconnect:200ms/2s,pause:300ms/2s,clock_step:2ms/1s,reset:0ms/4s"
 )
-MEMORY_SLACK_KB = 16_384
 BOTH = "both"
 NEVER_ARMED = "the device was lost before it was armed"  # which ends a run: there is nothing to go on with yet
 
@@ -83,6 +95,7 @@ class GridResult:
     case: str
     seed: int
     mode: str
+    turn: str
     frames: int
     ended: str
     reconnects: int
@@ -104,6 +117,43 @@ def case_faults(case: str) -> str:
     return GRID_ALL if case == "all" else f"{case}:{GRID_TIMES[case]}" if case in GRID_TIMES else case
 
 
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What one run is made of: the instrument and what it looks at, the host's plan, core and checker."""
+
+    profile: Profile
+    scene: Scene | SceneFile
+    bundle: Bundle
+    plan: Plan
+    core: Core | FlowCore
+    checker: Checker
+    n_cycles: int
+    streamed: Callable[[], Streamed]  # a second core, behind the compiled turn
+
+    @classmethod
+    def of(cls, mode: str, frames: int) -> Case:
+        """Return a case of one of MODES that gives about `frames` stream messages."""
+        if mode in KINDS:
+            flow = small_flow(mode)
+            n_cycles = max(1, frames // len(plan_blocks(flow.plan)))
+            core = flow.core(n_cycles)
+            checker = FlowChecker(flow)
+            return cls(
+                flow.profile, flow.scene, flow.bundle, flow.plan, core, checker, n_cycles,
+                lambda: FlowStream(flow.core(0), flow.plan, 0),
+            )  # fmt: skip
+        profile, bundle, plan = small_setup(mode)
+        images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
+        scene = scene_from_arrays("grid", images, np.arange(6) % 3, ("a", "b", "c"))
+        per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
+        n_cycles = max(1, frames // per_visit) * plan.cycles_per_object
+        decider = make_decider(bundle, shots=SHOTS, backend=_backend(bundle))
+        return cls(
+            profile, scene, bundle, plan, Core(plan, decider, SHOTS, n_cycles), Checker(plan, SHOTS), n_cycles,
+            lambda: StreamCore(plan, decider, SHOTS, 0, 0),
+        )  # fmt: skip
+
+
 def run_case(
     case: str, seed: int, frames: int, faults_text: str | None = None, turn: str = PYTHON, reads_again: bool = False
 ) -> GridResult:
@@ -111,29 +161,22 @@ def run_case(
 
     `turn` is the loop's; with `reads_again` the compiled turn reads the same bytes from a socket and must give the same.
     """
-    mode = MODES[seed % len(MODES)]
-    profile, bundle, plan = small_setup(mode)
-    checker = Checker(plan, SHOTS)
-    clock = DeviceClock(profile.clock.tick_hz)
-    images = np.random.default_rng(2).integers(0, 256, (6, 2, 2)).astype(np.uint8)
-    scene = scene_from_arrays("grid", images, np.arange(6) % 3, ("a", "b", "c"))
+    started, mode = time.perf_counter(), MODES[seed % len(MODES)]
+    one = Case.of(mode, frames)
+    plan, core, checker = one.plan, one.core, one.checker
+    clock = DeviceClock(one.profile.clock.tick_hz)
 
     def switch_on(epoch: int, tick: int) -> WatchedInstrument:
-        return WatchedInstrument(profile, scene, seed=seed, power_on_tick=tick, epoch=epoch).watch(checker)
+        return WatchedInstrument(one.profile, one.scene, seed=seed, power_on_tick=tick, epoch=epoch).watch(checker)
 
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
     reads_again = reads_again and plan.largest == 1  # photon numbers have no compiled turn
-    link = (TapedLink if reads_again else ObservedLink)(VirtualLink(device, clock, f"grid:{case}"))
-    host = GridHost(checker, plan, frames)
-    per_visit = 1 + len(plan_blocks(plan)) * plan.cycles_per_object
-    config = RunConfig(
-        shots=SHOTS, n_cycles=max(1, frames // per_visit) * plan.cycles_per_object, deadline_us=1e9, turn=turn
-    )
-    started = time.perf_counter()
-    backend = "table" if bundle.automaton is None else "automaton"
-    decider = make_decider(bundle, shots=SHOTS, backend=backend)
-    core = Core(plan, decider, SHOTS, config.n_cycles)
+    slow = SLOW_READS_DRIVEN if plan.drive == "host" else SLOW_READS
+    link = (TapedLink if reads_again else ObservedLink)(SlowReads(device, clock, f"grid:{case}", seed, slow))
+    flow = FlowRun(core, None) if isinstance(core, FlowCore) else None
+    host = GridHost(checker, frames, flow)
+    config = RunConfig(shots=SHOTS, n_cycles=one.n_cycles, deadline_us=1e9, turn=turn)
     recovery = Recovery.of(link, "", 30.0)
 
     def start(run: LiveRun) -> None:
@@ -141,16 +184,16 @@ def run_case(
             link.listen(run)
         host.start(run)
 
-    observers = Observers(host.watch, start)
-    header = {"config": _recorded(plan, profile.clock.tick_hz, backend)}
+    header = {"config": _recorded(one, {} if flow is None else {"flow": flow.header()})}
 
     def live(recorder: Recorder) -> RunResult:
-        return run_live(link, profile, bundle, plan, core, config, recorder, recovery, observers)
+        observers = Observers(host.watch, start)
+        return run_live(link, one.profile, one.bundle, plan, core, config, recorder, recovery, observers)
 
     def disagreements(result: RunResult, recording: Recording) -> Iterator[str]:
-        yield from reconcile(link, checker.books, result, recording, bundle)
+        yield from reconcile(link, checker.books, result, recording, one.bundle)
         if isinstance(link, TapedLink):
-            yield from differences(link.tape, plan, decider, SHOTS, core, recording.decisions())
+            yield from differences(link.tape, one.streamed(), core, recording.decisions())
 
     result = judged(
         live,
@@ -163,6 +206,7 @@ def run_case(
         case=case,
         seed=seed,
         mode=mode,
+        turn="" if result is None else result.turn.taken,
         frames=checker.counts.frames_emitted,
         ended=NEVER_ARMED if result is None else result.ended,
         reconnects=0 if result is None else result.reconnects,
@@ -176,10 +220,15 @@ def run_case(
     )
 
 
-def _recorded(plan: Plan, tick_hz: int, backend: str) -> dict[str, Any]:
+def _backend(bundle: Bundle) -> str:
+    return "table" if bundle.automaton is None else "automaton"
+
+
+def _recorded(one: Case, more: dict[str, Any]) -> dict[str, Any]:
     """What a replay needs to know of the run."""
-    told = {"shots": SHOTS, "tick_hz": tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
-    return told | ({"photon_number_max": plan.largest} if plan.largest > 1 else {})
+    plan, tick_hz = one.plan, one.profile.clock.tick_hz
+    told = {"shots": SHOTS, "tick_hz": tick_hz, "backend": _backend(one.bundle), "drive": plan.drive, "confidence": 0.0}
+    return told | ({"photon_number_max": plan.largest} if plan.largest > 1 else {}) | more
 
 
 def judged(
@@ -221,76 +270,6 @@ def plan_blocks(plan: Plan) -> list[int]:
             firsts.append(slot)
             count = 1
     return firsts
-
-
-class GridHost:
-    """What the grid does besides the ordinary run: it asks for gates, some of them too late, and watches memory."""
-
-    def __init__(self, checker: Checker, plan: Plan, frames: int) -> None:
-        self.checker = checker
-        self.memory_growth_kb = 0
-        self._plan = plan
-        self._decisions = 0
-        self._seen = 0
-        self._frames = frames
-        self._early_kb = 0
-        self._run: LiveRun | None = None
-
-    @property
-    def began(self) -> bool:
-        """Whether the run has come to where it arms the device."""
-        return self._run is not None
-
-    def start(self, run: LiveRun) -> None:
-        """Listen to the run."""
-        self._run = run
-        self.checker.attach(run)
-        note = run.journal.note
-
-        def tapped(kind: str, **facts: Any) -> None:
-            self.checker.on_event(run.connection.session.nonce, {"kind": kind, **facts})
-            note(kind, **facts)
-
-        run.journal.note = tapped  # type: ignore[method-assign]
-
-    def watch(self, run: LiveRun, output: Output) -> None:
-        """After each block: now and then a gate, and a look at the memory."""
-        self._seen += 1
-        if not self._early_kb and self._seen > self._frames // 5:
-            self._early_kb = resident_kb()
-        for _ in output.decisions:
-            self._decisions += 1
-            if (
-                self._decisions % GATE_EVERY == 0
-                and output.block_end_tick is not None
-                and run.connection.session.has_room
-            ):
-                # every other gate is so near that it often comes too late; the duration makes each one unique
-                lead = 50 if self._decisions % (2 * GATE_EVERY) else 100_000
-                gate = Gate(output.block_end_tick + lead, 1 + self._decisions, 0)
-                self.checker.submitted(run.connection.session.nonce, run.next_command_id, gate)
-                run.gate(*gate)
-
-    def finish(self, ended: str) -> None:
-        """After the run: commands that were all acknowledged have one outcome each."""
-        assert self._run is not None
-        session = self._run.connection.session
-        if session.settled and not self._run.link_lost:
-            self._run.journal.refusals(self._run.connection)
-            self.checker.settled(session.nonce, 1 << 32)
-        if ended not in ("completed", "the link was lost within the last object"):
-            self.checker.fail(f"the run did not complete: {ended}")
-        self.memory_growth_kb = resident_kb() - self._early_kb if self._early_kb else 0
-        if self.memory_growth_kb > MEMORY_SLACK_KB:
-            self.checker.fail(f"the process grew by {self.memory_growth_kb} kB over the run")
-
-
-def resident_kb() -> int:
-    """Return the resident memory of this process in kB; 0 where the system does not tell."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
-    except (OSError, ValueError):
-        return 0
 
 
 def turn_of(seed: int, turn: str) -> tuple[str, bool]:

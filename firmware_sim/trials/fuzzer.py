@@ -6,6 +6,8 @@ instrument; structured frames have a right CRC and strange contents. Never chang
 
 from __future__ import annotations
 
+import collections
+import functools
 import random
 import struct
 import time
@@ -13,6 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pans.firmware_sim.checks import flowing
+from pans.firmware_sim.checks.flow_stream import FlowStream
 from pans.firmware_sim.checks.strange import StrangeCommands
 from pans.firmware_sim.checks.twin import SocketTwin
 from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
@@ -21,20 +25,52 @@ from pans.firmware_sim.device.states import MAX_SHOWS
 from pans.firmware_sim.device.upload import MAX_UPLOAD_BYTES
 from pans.firmware_sim.scene.still import Scene, load_scene
 from pans.firmware_sim.testing import following_profile, small_setup
+from pans.runtime.core.decision import Decision
+from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
-from pans.runtime.decide.verdict import Verdicts
+from pans.runtime.decide.backends import make_decider
+from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import LinkError
+from pans.runtime.flow.core import FlowCore
+from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.counts import encode_counts
-from pans.runtime.wire.messages import MessageType, Opcode
+from pans.runtime.wire.messages import Mark, MessageType, Opcode
 from pans.runtime.wire.session import MAX_KEPT, HostSession
 
 # Of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second.
 MAX_CALL_S = 5.0
 NONCE = 0x5EED
+MODES = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", *flowing.KINDS)
 HOST_TYPES = (MessageType.HELLO, MessageType.PING, MessageType.COMMAND, MessageType.GRANT)
 DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
+
+
+@functools.cache
+def _setup(mode: str) -> tuple[Plan, Decider]:
+    _, bundle, plan = small_setup(mode)
+    return plan, make_decider(bundle, shots=1, backend="table" if bundle.automaton is None else "automaton")
+
+
+@functools.cache
+def _flow(mode: str) -> flowing.SmallFlow:
+    return flowing.small_flow(mode)
+
+
+def plan_of(mode: str) -> Plan:
+    """Return the plan of one of MODES."""
+    return _flow(mode).plan if mode in flowing.KINDS else _setup(mode)[0]
+
+
+def fuzzed_core(mode: str) -> Core | FlowCore:
+    """Return a core for the plan of `mode`, without an end."""
+    return _flow(mode).core(0) if mode in flowing.KINDS else Core(*_setup(mode), 1, 0)
+
+
+def fuzzed_stream(mode: str) -> StreamCore:
+    """Return the streaming core for the plan of `mode`, which is no flow's."""
+    return StreamCore(*_setup(mode), 1, 0, NONCE)
 
 
 class CountingInstrument(Instrument):
@@ -69,7 +105,11 @@ class FuzzCounts:
     counting_armed: int = 0
     blocks_accepted: int = 0
     counts_accepted: int = 0  # of these, blocks of photon numbers
-    compiled_messages: int = 0  # through the compiled turn, from a socket
+    walks_accepted: int = 0  # of automata
+    flow_accepted: int = 0  # of objects in flow
+    decisions: int = 0
+    compiled_bytes: int = 0  # that the compiled turn has read from a socket
+    compiled_messages: int = 0  # that it has taken of these
     slowest_call_s: float = 0.0
 
 
@@ -131,16 +171,19 @@ class Fuzzer:
     def _fresh_host(self) -> None:
         self._session = HostSession(NONCE)
         self._session.start(0)
-        self._counting = self._dice.random() < 0.3  # a host whose plan reads photon numbers has no compiled turn
-        _, bundle, plan = small_setup("device-driven-counts" if self._counting else "sequential")
-        self._host_plan = plan
-        self._core = Core(plan, _AnyDecider(bundle.n_features), 1, 0)  # type: ignore[arg-type]
+        mode = self._dice.choice(MODES)
+        self._core, twin = fuzzed_core(mode), None
+        self._host_plan = plan_of(mode)
         self._core.begin(0, 0)
+        self._counting = mode.endswith("counts")
         self._host_decoder = wire.FrameDecoder()
         self._host_decoder.use_kernels()
         self._host_ns = 0
-        without = offered() or self._counting
-        self._twin = None if without else SocketTwin(plan, _AnyDecider(bundle.n_features), NONCE)  # type: ignore[arg-type]
+        if not offered() and not self._counting:  # a host whose plan reads photon numbers has no compiled turn
+            again = fuzzed_core(mode)
+            twin = FlowStream(again, self._host_plan, NONCE) if isinstance(again, FlowCore) else fuzzed_stream(mode)
+            collections.deque(twin.begin(NONCE, 0, 0), 0)
+        self._twin = None if twin is None else SocketTwin(twin)
 
     def _device_takes(self, data: bytes) -> None:
         device = self._device
@@ -159,25 +202,32 @@ class Fuzzer:
 
     def _host_takes(self, data: bytes) -> None:
         started = time.process_time()
-        core = self._core
-        self._host_digests(data)
+        core, decisions = self._core, list[Decision]()
+        self._host_digests(data, decisions)
         self._judge_time(started, "host", data)
+        self.counts.decisions += len(decisions)
         if self._twin is not None and core is self._core:  # else the session has ended within the bytes
             started = time.process_time()
-            wrong = self._twin.takes(data, core)
+            wrong = self._twin.takes(data, core, decisions)
             self._judge_time(started, "compiled turn", data)
+            self.counts.compiled_bytes += len(data)
             self.counts.compiled_messages += self._twin.took
             if wrong:
                 raise LimitBroken(wrong)
 
-    def _host_digests(self, data: bytes) -> None:
+    def _host_digests(self, data: bytes, decisions: list[Decision]) -> None:
         self._host_ns += 1_000_000
+        counts, plan = self.counts, self._host_plan
         for frame in self._host_decoder.feed(data):
             try:
                 if self._session.on_frame(frame, self._host_ns):
                     output = self._core.step(frame)
-                    self.counts.blocks_accepted += output.block_end_tick is not None
-                    self.counts.counts_accepted += self._counting and output.block_end_tick is not None
+                    decisions += output.decisions
+                    accepted = output.block_end_tick is not None
+                    counts.blocks_accepted += accepted
+                    counts.counts_accepted += accepted and self._counting
+                    counts.walks_accepted += accepted and plan.automaton is not None
+                    counts.flow_accepted += accepted and isinstance(self._core, FlowCore)
                 if self._dice.random() < 0.1:
                     self._session.probe(self._host_ns)
                     self._session.submit(Opcode.GATE, b"", may_be_refused=True)
@@ -246,34 +296,19 @@ class Fuzzer:
         return wire.encode_frame(kind, dice.randbytes(dice.choice((0, 1, 8, 36, 300))), session)
 
     def _frame_for_host(self) -> bytes:
-        dice = self._dice
+        dice, plan = self._dice, self._host_plan
         often = MessageType.COUNTS if self._counting else MessageType.CLICKS
-        kind = dice.choice((*DEVICE_TYPES, often, often, dice.randrange(256)))
+        often = MessageType.FRAMES if plan.mode == "parallel" else often
+        kind = dice.choice((*DEVICE_TYPES, often, often, often, often, dice.randrange(256)))
         session = NONCE if dice.random() < 0.97 else self._strange.number(32)
-        tracker = self._core.tracker
-        if kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.COUNTS) and dice.random() < 0.8:
-            count = dice.randrange(1, 6)
-            good = dice.random() < 0.7
-            seq = tracker.next_seq if good else self._strange.number(32)
-            first = tracker.next_exposure + dice.choice((0, 0, 0, 1, 50)) if good else self._strange.number(64)
-            head = (
-                seq,
-                self._strange.number(32),
-                self._strange.number(63),
-                first,
-                self._strange.number(32),
-                self._strange.number(32),
+        if kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.COUNTS) and dice.random() < 0.9:
+            return self._block(MessageType(kind), session)
+        if kind == MessageType.MARK and dice.random() < 0.7:
+            here = self._core.tracker.position
+            tick = here[1] * plan.slot_period_ticks
+            return wire.encode_mark(
+                Mark(here[0], dice.randrange(9), dice.randrange(-1, 3), here[1], tick, 1.0, 9), session
             )
-            if good and dice.random() < 0.7:  # as the plan has it, so that some get as far as the windows
-                cycle, slot = divmod(first, self._host_plan.slots_per_cycle)
-                tick = cycle * self._host_plan.cycle_ticks + int(self._host_plan.slot_offset_ticks[slot])
-                head = (seq, 0, tick, first, self._host_plan.slot_period_ticks, wire.NO_OBJECT)
-            if kind == MessageType.CLICKS:
-                patterns = np.array([dice.choice((0, 1, 2, 3, 0xFFFF)) for _ in range(count)], np.uint16)
-                return wire.encode_clicks(wire.ClickBlock(*head, patterns, np.ones(count, np.uint8)), session)
-            if kind == MessageType.COUNTS:
-                return encode_counts(wire.ClickBlock(*head, *self._numbers(count)), session)
-            return wire.encode_frames(wire.FrameBlock(*head, np.ones((count, dice.choice((1, 8))), np.uint8)), session)
         layouts = {
             MessageType.PONG: "<IQQQ", MessageType.ACK: "<IIIHH", MessageType.STATUS: "<BBHIIQQ", MessageType.MARK: "<IIhHQQf",
             MessageType.WELCOME: "<IHH", MessageType.CLICKS: "<IIQQIHHI", MessageType.FRAMES: "<IIQQIHHI",
@@ -289,22 +324,39 @@ class Fuzzer:
             body += dice.choice((b"\x80", b"\x81\xa1a\x01", b"\xdf\xff\xff\xff\xff", dice.randbytes(20)))
         return wire.encode_frame(kind, bytes(body) + dice.randbytes(dice.choice((0, 0, 0, 1, 9))), session)
 
-    def _numbers(self, count: int) -> tuple[wire.U16, wire.U8, int]:
-        """Stamps of an automaton's plan, photon numbers and the largest one, now and then one that cannot be."""
-        dice = self._dice
-        stamps = np.array([dice.choice((0, 1, 2, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
-        numbers = np.array([dice.choice((0, 0, 1, 2, 2, 3)) for _ in range(count)], np.uint8)
-        return stamps, numbers, 2 if dice.random() < 0.8 else self._strange.number(16)
+    def _block(self, kind: MessageType, session: int) -> bytes:
+        """Exposures of all kinds; most are what the plan has next, so that some get as far as the windows."""
+        dice, plan, tracker = self._dice, self._host_plan, self._core.tracker
+        count = dice.randrange(1, 6)
+        good = dice.random() < 0.8
+        seq = tracker.next_seq if good else self._strange.number(32)
+        first = tracker.next_exposure + dice.choice((0,) * 9 + (1, 50)) if good else self._strange.number(64)
+        cycle, slot = divmod(first, plan.slots_per_cycle)
+        stamps = np.array([dice.choice((0, 1, 2, 3, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
+        if good and dice.random() < 0.9:
+            tick = cycle * plan.cycle_ticks + int(plan.slot_offset_ticks[slot])
+            head = (seq, 0, tick, first, plan.slot_period_ticks, wire.NO_OBJECT)
+            count = dice.randrange(1, 1 + min(plan.block_exposures, plan.slots_per_cycle - slot))
+            wanted = plan.slot_pattern[slot : slot + count]
+            stamps = wanted if plan.automaton is None else np.arange(slot, slot + count, dtype=np.uint16) % 6
+            if dice.random() < 0.2:
+                stamps = np.array([dice.choice((0, 1, 2, 3, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
+        else:
+            number = self._strange.number
+            head = (seq, number(32), number(63), first, number(32), number(32))
+        if kind == MessageType.CLICKS:
+            return wire.encode_clicks(wire.ClickBlock(*head, stamps, self._clicks(count)), session)
+        if kind == MessageType.COUNTS:
+            largest = 2 if dice.random() < 0.8 else self._strange.number(16)
+            numbers = np.array([dice.choice((0, 0, 1, 2, 2, 3)) for _ in range(count)], np.uint8)
+            return encode_counts(wire.ClickBlock(*head, stamps, numbers, largest), session)
+        width = dice.choice((-(-plan.n_patterns // 8), 8))
+        lit = self._clicks(count)[:, None] * np.frombuffer(dice.randbytes(count * width), np.uint8).reshape(
+            count, width
+        )
+        return wire.encode_frames(wire.FrameBlock(*head, np.ascontiguousarray(lit)), session)
 
-
-class _AnyDecider:
-    name, n_classes = "any", 2
-
-    def __init__(self, n_features: int) -> None:
-        self.n_features = n_features
-
-    def decide(self, counts: np.ndarray, shots: int) -> tuple[int, float]:
-        return 0, 0.5
-
-    def verdicts(self, counts: np.ndarray, shots: int) -> Verdicts:
-        return Verdicts(np.zeros(len(counts), np.uint16), np.full(len(counts), 0.5, np.float32))
+    def _clicks(self, count: int) -> wire.U8:
+        """Clicks, uint8 (count,): none, all, or some; in flow objects come and go with them."""
+        often = self._dice.choice((0.0, 0.02, 0.5, 1.0))
+        return np.array([self._dice.random() < often for _ in range(count)], np.uint8)

@@ -87,6 +87,8 @@ def take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask):  # type
     count, width = stream.next_block(buffer, payload, stop, facts)
     if count == 0 or count > facts[columns.MAX_BLOCK] or 8 * width < flow.dark_channels.size:
         return 0
+    if flow.state[NEXT] != first:  # the block before was left out: it did not fit the plan
+        return 0
     tick, period = stream.block_times(buffer, payload)
     if period != facts[columns.PERIOD_TICKS] or load4(buffer, payload + _U(32)) != _NO_OBJECT:
         return 0

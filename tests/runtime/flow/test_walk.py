@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flows import NOTHING, PERIOD_TICKS, SESSION, by_one, make, plan_of, scene, state_of, strange, stream
+from flows import NOTHING, PERIOD_TICKS, SESSION, by_one, frame, make, plan_of, scene, state_of, strange, stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +20,7 @@ from pans.runtime.record import Recorder, read_recording
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.bulk import BulkDecoder
 from pans.runtime.wire.frame import Messages, pack_body
-from pans.runtime.wire.messages import FrameDecoder
+from pans.runtime.wire.messages import FrameDecoder, MessageType
 
 
 def by_many(core: FlowCore, data: bytes, cuts: list[int]) -> Output:
@@ -48,9 +48,12 @@ def test_many_at_once_are_each_one_by_one(data: st.DataObject) -> None:
     tape = {"kind": "tape", "bars_per_s": 20_000.0}
     changes: dict[str, Any] = tape if data.draw(st.booleans()) else {}
     messages = stream(words, block)
-    kinds = ["lost", "twice", "another session", "short", "drops"]
+    kinds = ["lost", "twice", "another session", "short", "drops", "period"]
     for place in sorted(data.draw(st.sets(st.integers(0, len(messages) - 1), max_size=4)), reverse=True):
-        messages[place : place + 1] = strange(data.draw(st.sampled_from(kinds)), messages[place])
+        kind = data.draw(st.sampled_from(kinds))
+        if kind == "period" and frame(messages[place]).type == MessageType.MARK:  # it has none
+            kind = "lost"
+        messages[place : place + 1] = strange(kind, messages[place])
     wire_bytes = b"".join(messages)
     cuts = sorted(data.draw(st.sets(st.integers(1, len(wire_bytes) - 1), max_size=12)))
     one, many = make(block, dark, **changes), make(block, dark, **changes)
