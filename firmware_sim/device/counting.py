@@ -31,6 +31,7 @@ NOISE_STREAMS, SOURCE_STREAMS = (48, 49), (50, 51)  # two uniform numbers make a
 _U = np.uint64
 _MANY = 500.0  # photoelectrons, at which no reading is below the highest edge, 14.5
 _UNIT = 2.0**-53
+MOST_AHEAD = 1024  # exposures of a plan that are drawn at once: an object may stay for as many as the host likes
 GAIN, ADDED, ALIVE, SHIFT, N_CONDITIONS = range(5)
 
 
@@ -203,7 +204,7 @@ class CountedPlan(Counted):
 
     def __init__(self, walked: Walked, largest: int) -> None:
         super().__init__(walked, largest)
-        self.ahead = walked.program.n_slots * walked.program.cycles_per_object
+        self.ahead = min(walked.program.n_slots * walked.program.cycles_per_object, MOST_AHEAD)
 
     def prepare(self, exposure: int) -> bool:
         """Nothing."""

@@ -54,10 +54,7 @@ from . import Report, Trial, figures_text
 SHOTS = 1
 STILL = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts")
 MODES = (*STILL, *KINDS)  # objects that stand still, and those in flow
-SLOW_READS = (
-    0.75  # of all, bring what came within a while; of a host that names each state next, fewer: it would be late
-)
-SLOW_READS_DRIVEN = 0.02
+SLOW_READS = 0.75  # of all, bring what came within a while; not of a host that names each state next: it would be late
 CASES = ("none", *NAMES, "host_stop", "all")
 # Slow faults come more often here than usually: a run lasts some five seconds of virtual time.
 GRID_TIMES = {
@@ -172,7 +169,7 @@ def run_case(
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
     reads_again = reads_again and plan.largest == 1  # photon numbers have no compiled turn
-    slow = SLOW_READS_DRIVEN if plan.drive == "host" else SLOW_READS
+    slow = 0.0 if plan.drive == "host" else SLOW_READS
     link = (TapedLink if reads_again else ObservedLink)(SlowReads(device, clock, f"grid:{case}", seed, slow))
     flow = FlowRun(core, None) if isinstance(core, FlowCore) else None
     host = GridHost(checker, frames, flow)

@@ -108,8 +108,9 @@ class FuzzCounts:
     walks_accepted: int = 0  # of automata
     flow_accepted: int = 0  # of objects in flow
     decisions: int = 0
-    compiled_bytes: int = 0  # that the compiled turn has read from a socket
-    compiled_messages: int = 0  # that it has taken of these
+    compiled_bytes: int = 0  # random ones that the compiled turn has read from a socket
+    compiled_frames: int = 0  # structured ones
+    compiled_messages: int = 0  # that it has taken of both
     slowest_call_s: float = 0.0
 
 
@@ -123,6 +124,7 @@ class Fuzzer:
         self._strange = StrangeCommands(self._dice)
         self._profile = following_profile()
         self._scene: Scene = load_scene("uniform")
+        self._here = (0, 0, 0)  # sequence number and exposure that the host expects next
         self._decoder, self._compiled = wire.FrameDecoder(), wire.FrameDecoder()
         self._compiled.use_kernels()
         self._fresh_device()
@@ -141,7 +143,7 @@ class Fuzzer:
                 raise LimitBroken("the compiled decoder and the plain one disagree")
             self.counts.frames_decoded += len(found)
             self._device_takes(piece)
-            self._host_takes(piece)
+            self.counts.compiled_bytes += len(piece) * self._host_takes(piece)
         self.counts.bytes += len(data)
         if decoder.counters.bytes_in != self.counts.bytes:
             raise LimitBroken(f"the decoder counted {decoder.counters.bytes_in} of {self.counts.bytes} bytes")
@@ -151,9 +153,15 @@ class Fuzzer:
 
     def structured_frames(self, count: int) -> None:
         """Send `count` frames with a right CRC at the instrument and at the host, and what the instrument answers at the host."""
+        at_host = count - count // 2
         for _ in range(count // 2):
             self._device_takes(self._frame_for_device())
-            self._host_takes(self._frame_for_host())
+        while at_host:
+            bunch = min(at_host, self._dice.choice((1, 1, 3, 12)))  # that come in one read
+            self._here = self._core.tracker.position
+            frames = b"".join([self._frame_for_host() for _ in range(bunch)])
+            self.counts.compiled_frames += bunch * self._host_takes(frames)
+            at_host -= bunch
         self.counts.frames += count
         self._check_limits(self._device.decoder)
         if self._dice.random() < 0.02:
@@ -200,20 +208,22 @@ class Fuzzer:
         if taken_s > MAX_CALL_S:
             raise LimitBroken(f"the {who} took {taken_s:.1f} s over {data[:100].hex()}, allowed {MAX_CALL_S}")
 
-    def _host_takes(self, data: bytes) -> None:
+    def _host_takes(self, data: bytes) -> bool:
+        """Let the host take bytes; return whether the compiled turn read them too, and agreed."""
         started = time.process_time()
         core, decisions = self._core, list[Decision]()
         self._host_digests(data, decisions)
         self._judge_time(started, "host", data)
         self.counts.decisions += len(decisions)
-        if self._twin is not None and core is self._core:  # else the session has ended within the bytes
-            started = time.process_time()
-            wrong = self._twin.takes(data, core, decisions)
-            self._judge_time(started, "compiled turn", data)
-            self.counts.compiled_bytes += len(data)
-            self.counts.compiled_messages += self._twin.took
-            if wrong:
-                raise LimitBroken(wrong)
+        if self._twin is None or core is not self._core:  # the session has ended within the bytes
+            return False
+        started = time.process_time()
+        wrong = self._twin.takes(data, core, decisions)
+        self._judge_time(started, "compiled turn", data)
+        self.counts.compiled_messages += self._twin.took
+        if wrong:
+            raise LimitBroken(wrong)
+        return True
 
     def _host_digests(self, data: bytes, decisions: list[Decision]) -> None:
         self._host_ns += 1_000_000
@@ -304,11 +314,11 @@ class Fuzzer:
         if kind in (MessageType.CLICKS, MessageType.FRAMES, MessageType.COUNTS) and dice.random() < 0.9:
             return self._block(MessageType(kind), session)
         if kind == MessageType.MARK and dice.random() < 0.7:
-            here = self._core.tracker.position
-            tick = here[1] * plan.slot_period_ticks
-            return wire.encode_mark(
-                Mark(here[0], dice.randrange(9), dice.randrange(-1, 3), here[1], tick, 1.0, 9), session
-            )
+            seq, exposure, _ = self._here
+            self._here = (seq + 1, exposure, 0)
+            tick = exposure * plan.slot_period_ticks
+            mark = Mark(seq, dice.randrange(9), dice.randrange(-1, 3), exposure, tick, 1.0, 9)
+            return wire.encode_mark(mark, session)
         layouts = {
             MessageType.PONG: "<IQQQ", MessageType.ACK: "<IIIHH", MessageType.STATUS: "<BBHIIQQ", MessageType.MARK: "<IIhHQQf",
             MessageType.WELCOME: "<IHH", MessageType.CLICKS: "<IIQQIHHI", MessageType.FRAMES: "<IIQQIHHI",
@@ -326,11 +336,12 @@ class Fuzzer:
 
     def _block(self, kind: MessageType, session: int) -> bytes:
         """Exposures of all kinds; most are what the plan has next, so that some get as far as the windows."""
-        dice, plan, tracker = self._dice, self._host_plan, self._core.tracker
+        dice, plan = self._dice, self._host_plan
+        next_seq, next_exposure, _ = self._here
         count = dice.randrange(1, 6)
         good = dice.random() < 0.8
-        seq = tracker.next_seq if good else self._strange.number(32)
-        first = tracker.next_exposure + dice.choice((0,) * 9 + (1, 50)) if good else self._strange.number(64)
+        seq = next_seq if good else self._strange.number(32)
+        first = next_exposure + dice.choice((0,) * 9 + (1, 50)) if good else self._strange.number(64)
         cycle, slot = divmod(first, plan.slots_per_cycle)
         stamps = np.array([dice.choice((0, 1, 2, 3, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
         if good and dice.random() < 0.9:
@@ -341,6 +352,7 @@ class Fuzzer:
             stamps = wanted if plan.automaton is None else np.arange(slot, slot + count, dtype=np.uint16) % 6
             if dice.random() < 0.2:
                 stamps = np.array([dice.choice((0, 1, 2, 3, 5, 6, 0xFFFF)) for _ in range(count)], np.uint16)
+            self._here = (seq + 1, first + count, 0)
         else:
             number = self._strange.number
             head = (seq, number(32), number(63), first, number(32), number(32))

@@ -137,6 +137,23 @@ def test_fixed_patterns_are_counted_as_the_physics_says() -> None:
     assert max(int(block.bits.max()) for block in again) == 1
 
 
+def test_an_object_that_stays_for_ever_is_counted_as_one_that_goes() -> None:
+    """The host says for how many cycles: so many exposures are not drawn at once, and what is drawn is the same."""
+    drawn = []
+    for cycles_per_object in (3000, (1 << 32) - 1):
+        bench = Bench(instrument(), SCENE, seed=3)
+        bench.hello()
+        bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(0, 0, 6, np.ones(6, np.uint16))))
+        bench.done(Opcode.LOAD_PLAN, pack_plan(fixed_plan(1, [0], cycles_per_object=cycles_per_object)))
+        bench.done(Opcode.READ_COUNTS, pack_read_counts(4))
+        bench.grant(1 << 20)
+        start = bench.device.tick + 2000
+        bench.done(Opcode.ARM, pack_arm(Arm(start, 3000, 3_600_000)))
+        drawn.append(blocks_of(bench.run_to(start + 3000 * 100))[1].tolist())
+    assert len(drawn[0]) == 3000
+    assert drawn[0] == drawn[1]
+
+
 def test_the_device_follows_the_numbers_and_the_host_gets_the_same_by_naming() -> None:
     automaton = random_automaton(5, slots=5, width=6, patterns=6, outcomes=4)
     bench, made = set_up(automaton, "device")

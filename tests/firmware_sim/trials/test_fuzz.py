@@ -17,6 +17,7 @@ from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.trials.fuzz import fuzz
 from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.turn.system import offered
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, Gate, PatternChunk, PlanChunk, pack_arm, pack_gate, pack_pattern, pack_plan
 from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode
@@ -35,7 +36,13 @@ def test_a_short_run_finds_nothing_and_comes_far() -> None:
     assert counts.commands_refused > 100
     assert counts.blocks_accepted > 100
     assert counts.counts_accepted > 10
+    assert counts.walks_accepted > 10
+    assert counts.flow_accepted > 10
+    assert counts.decisions > 100
     assert counts.frames_decoded > 100
+    if not offered():
+        assert counts.compiled_frames > 2000
+        assert counts.compiled_bytes > 100_000
 
 
 def test_the_command_reports_as_json(capsys: pytest.CaptureFixture[str]) -> None:
