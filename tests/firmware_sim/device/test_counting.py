@@ -144,12 +144,13 @@ def test_an_object_that_stays_for_ever_is_counted_as_one_that_goes() -> None:
         bench = Bench(instrument(), SCENE, seed=3)
         bench.hello()
         bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(0, 0, 6, np.ones(6, np.uint16))))
-        bench.done(Opcode.LOAD_PLAN, pack_plan(fixed_plan(1, [0], cycles_per_object=cycles_per_object)))
+        times = {"exposure_ticks": 10_000, "slot_period_ticks": 20_000, "cycle_ticks": 20_000}
+        bench.done(Opcode.LOAD_PLAN, pack_plan(fixed_plan(1, [0], cycles_per_object=cycles_per_object, **times)))
         bench.done(Opcode.READ_COUNTS, pack_read_counts(4))
         bench.grant(1 << 20)
         start = bench.device.tick + 2000
         bench.done(Opcode.ARM, pack_arm(Arm(start, 3000, 3_600_000)))
-        drawn.append(blocks_of(bench.run_to(start + 3000 * 100))[1].tolist())
+        drawn.append(blocks_of(bench.run_to(start + 3000 * 20_000))[1].tolist())
     assert len(drawn[0]) == 3000
     assert drawn[0] == drawn[1]
 
