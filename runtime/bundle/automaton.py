@@ -4,8 +4,8 @@ Owns the facts, the checks that need nothing else (ranges, order, depth, reach) 
 decides. All checks are linear in the size, whatever the arrays hold; they raise ValueError with what, found and allowed.
 
 A *node* is a state or a leaf: state s is node s, leaf l is node `n_states` + l. A *walk* begins in state 0; one exposure per state, until a
-leaf is reached. With c channels an exposure has 2**c outcomes: bit k of the outcome is the click of channel k. Of a detector that
-counts, outcome j is j photons, the last one that many or more.
+leaf is reached. With c channels a state shows c patterns at once, one for each, and an exposure has 2**c outcomes: bit k of the outcome is
+the click of channel k. Of a detector that counts, outcome j is j photons, the last one that many or more.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pans.runtime.ranges import Range, demand
 STATES_MAX = 65_533  # a state number is stamped into a u16 beside 0xFFFE (adaptive slot) and 0xFFFF (dark)
 LEAVES_MAX = 1 << 20
 SLOTS_MAX = 1024
-CHANNELS_MAX = 8
+CHANNELS_MAX = 4  # the outcomes of more are no number of COUNTS
 COUNT_OUTCOMES = (3, 16)  # of a detector that counts; two are clicks
 POSTERIOR_SUM_TOLERANCE = 1e-5
 DWELL_STEPS_RANGE = Range(1, 65_535, whole=True)
@@ -48,7 +48,10 @@ class Automaton:
     (2, 2, 2, [0, 1])
     """
 
-    pattern: NDArray[np.uint16]  # (states,) row of Bundle.pattern_levels that the state shows; states may share one
+    pattern: NDArray[
+        np.uint16
+    ]  # (states,) row of Bundle.pattern_levels that the state shows, of several channels the first of as
+    # many rows in turn; states may share them
     dwell: NDArray[np.uint16]  # (states,) the light is on for dwell / dwell_steps of the exposure, 1..dwell_steps
     dwell_steps: int  # 1: one time for all
     successors: NDArray[
@@ -100,6 +103,11 @@ class Automaton:
     def channels(self) -> int:
         """Number of channels that are read at once, c; one where photons are counted."""
         return 1 if self.counts else self.n_outcomes.bit_length() - 1
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows of Bundle.pattern_levels that each state shows, (states, channels): row k is for channel k."""
+        return self.pattern.astype(np.int64)[:, None] + np.arange(self.channels)
 
     @property
     def n_bits(self) -> int:

@@ -1,4 +1,4 @@
-"""The parts of a bundle that holds an automaton, format versions 3 and 4 (of photon numbers): docs/reference/formats.md in code.
+"""The parts of a bundle that holds an automaton, format versions 3, 4 (photon numbers) and 6 (several channels): formats.md in code.
 
 Owns how patterns are packed and how states, posteriors and golden walks lie in the file; the container around them is format.py's. A part
 that unpacks to more than memory should hold is refused before it is unpacked.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.ranges import demand
 
-from .automaton import Automaton
+from .automaton import CHANNELS_MAX, Automaton
 from .facts import GOLDEN_MAX, GOLDEN_MEANS_MAX, PATTERN_CELLS_MAX, PATTERNS_MAX, Bundle, frozen
 from .walks import log_scores
 
@@ -28,6 +28,7 @@ GOLDEN_PARTS = {"golden_words": "|u1", "golden_walks": "<u4", "golden_posteriors
 PARTS = PATTERN_PARTS | STATE_PARTS | GOLDEN_PARTS
 HEADER_KEYS = {"automaton"}
 OPTIONAL_KEYS = {"expected"}
+_SAYS = {4: "outcomes", 6: "channels"}  # the key of each format version beyond 3
 _ROWS_AT_ONCE = 1024
 
 
@@ -63,8 +64,10 @@ def parts_of(bundle: Bundle, automaton: Automaton) -> list[tuple[str, NDArray[An
 
 def facts_of(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
     """Return the header's keys that only such a bundle has."""
-    outcomes = {"outcomes": automaton.n_outcomes} if automaton.counts else {}
-    facts: dict[str, Any] = {"automaton": {"dwell_steps": automaton.dwell_steps, **outcomes}}
+    more: dict[str, int] = {"outcomes": automaton.n_outcomes} if automaton.counts else {}
+    if automaton.channels > 1:
+        more = {"channels": automaton.channels}
+    facts: dict[str, Any] = {"automaton": {"dwell_steps": automaton.dwell_steps, **more}}
     return facts if bundle.expected is None else facts | {"expected": dict(bundle.expected)}
 
 
@@ -77,23 +80,26 @@ def demand_parts(parts: Mapping[str, NDArray[Any]], levels: int) -> None:
         demand(array.ndim == axes, f"the part {name} has {array.ndim} axes, allowed: {axes}")
 
 
-def counts_photons(facts: Mapping[str, Any]) -> bool:
-    """Return whether the automaton in a header or in `facts_of` tells photon numbers apart, which takes format version 4."""
-    return isinstance(facts["automaton"], dict) and "outcomes" in facts["automaton"]
+def version_of(facts: Mapping[str, Any]) -> int:
+    """Return the lowest format version that can say what a header or `facts_of` says of the automaton."""
+    said = facts["automaton"]
+    return next((version for version, key in _SAYS.items() if isinstance(said, dict) and key in said), 3)
 
 
 def automaton_of(header: Mapping[str, Any], parts: Mapping[str, NDArray[Any]]) -> Automaton:
     """Return the automaton of a file; ValueError for what is impossible."""
-    facts, counts = header["automaton"], counts_photons(header)
-    keys = {"dwell_steps", "outcomes"} if counts else {"dwell_steps"}
-    known = isinstance(facts, dict) and set(facts) == keys
-    demand(
-        known, f"automaton is {ascii(facts)[:80]}, allowed: an object with the keys dwell_steps and perhaps outcomes"
-    )
-    if counts:
-        said, columns = facts["outcomes"], parts["successors"].shape[1]
-        same = isinstance(said, int) and said == columns
-        demand(same, f"automaton.outcomes is {ascii(said)[:80]}, successors has {columns} columns")
+    facts, version, columns = header["automaton"], version_of(header), parts["successors"].shape[1]
+    counts, key = version == 4, _SAYS.get(version)
+    known = isinstance(facts, dict) and set(facts) == {"dwell_steps", *([key] if key else [])}
+    said = f"automaton is {ascii(facts)[:80]}"
+    demand(known, f"{said}, allowed: an object with the keys dwell_steps and perhaps outcomes or channels")
+    if key is None:
+        demand(columns == 2, f"successors has {columns} columns, allowed without automaton.channels or outcomes: 2")
+    else:
+        value = facts[key]
+        whole = isinstance(value, int) and not isinstance(value, bool) and (counts or 2 <= value <= CHANNELS_MAX)
+        same = whole and (value if counts else 1 << value) == columns
+        demand(same, f"automaton.{key} is {ascii(value)[:80]}, successors has {columns} columns")
     states = (parts["state_pattern"], parts["state_dwell"], facts["dwell_steps"])
     return Automaton(*states, parts["successors"], parts["posteriors"], counts)
 

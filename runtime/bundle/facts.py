@@ -106,6 +106,11 @@ class Bundle:
         return self.outcomes - 1 if self.automaton is None else self.automaton.largest
 
     @property
+    def n_channels(self) -> int:
+        """Number of detectors that each exposure of a walk reads at once; 1 of fixed patterns."""
+        return 1 if self.automaton is None else self.automaton.channels
+
+    @property
     def n_outputs(self) -> int:
         """Numbers that the head gives for one object: scores of classes, or pixels of the picture."""
         return self.n_classes if self.picture_shape is None else math.prod(self.picture_shape)
@@ -153,7 +158,7 @@ class Bundle:
     def light_of(self, automaton: Automaton) -> NDArray[np.float64]:
         """Return what each state of an `automaton` over these patterns shows, as `state_light`."""
         whole = self.pattern_levels.sum(axis=1, dtype=np.uint64).astype(np.float64) * self.photons_per_level
-        return whole[automaton.pattern] * (automaton.dwell / automaton.dwell_steps)
+        return np.asarray(whole[automaton.rows].sum(axis=1) * (automaton.dwell / automaton.dwell_steps))
 
 
 def golden_violation(found: NDArray[np.float32], golden: NDArray[np.float32], *, decides: bool = True) -> str:
@@ -315,7 +320,7 @@ def _check_automaton(bundle: Bundle, automaton: Automaton) -> None:
     demand(patterns <= PATTERNS_MAX, f"{patterns} patterns of an automaton, allowed: 1 to {PATTERNS_MAX}")
     cells = patterns * pixels
     demand(cells <= PATTERN_CELLS_MAX, f"{patterns} patterns of {pixels} pixels, allowed: {PATTERN_CELLS_MAX} in all")
-    top = int(automaton.pattern.max())
+    top = int(automaton.pattern.max()) + automaton.channels - 1
     demand(top < patterns, f"a state shows pattern {top}, allowed: 0 to {patterns - 1}")
     classes = automaton.n_classes
     demand(classes == bundle.n_classes, f"posteriors of {classes} classes, the bundle has {bundle.n_classes}")

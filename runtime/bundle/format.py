@@ -28,7 +28,7 @@ from .layers import Int8Head
 from .optics import Analyser
 
 MAGIC = b"PANSBNDL"
-VERSIONS = (1, 2, 3, 4, 5)  # a bundle is written in the lowest that can say it
+VERSIONS = (1, 2, 3, 4, 5, 6)  # a bundle is written in the lowest that can say it
 HEADER_MAX_BYTES = MIB
 _PROLOGUE = struct.Struct("<8sII")
 _DIGEST_BYTES = 32
@@ -41,8 +41,9 @@ _KEYS_OF_VERSION: dict[int, set[str]] = {
     3: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
     4: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
     5: {"outcomes"},
+    6: automaton_file.HEADER_KEYS | automaton_file.OPTIONAL_KEYS,
 }
-_OF_AUTOMATA = (3, 4)
+_OF_AUTOMATA = (3, 4, 6)
 _OUTCOMES = Range(*COUNT_OUTCOMES, whole=True)
 _PART_KEYS = {"name", "dtype", "shape", "offset", "length", "sha256"}
 _PARTS = {"pattern_levels": "<u2", "head_onnx": "|u1", "table": "<f4", "golden_means": "<f4", "golden_scores": "<f4"}
@@ -135,7 +136,7 @@ def _new_facts(bundle: Bundle) -> dict[str, Any]:
 def _version_of(facts: Mapping[str, Any]) -> int:
     """The lowest version that can say `facts`, those that version 1 has not."""
     if "automaton" in facts:
-        return 4 if automaton_file.counts_photons(facts) else 3
+        return automaton_file.version_of(facts)
     return 5 if "outcomes" in facts else 2 if facts else 1
 
 

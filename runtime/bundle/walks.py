@@ -6,6 +6,7 @@ expected to achieve. Numpy over many words at once; nothing here is in a hot pat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,6 +30,7 @@ EXPECTED_RANGES = {
     "exposures": Range(1.0, 1024),
 }
 EXPECTED_KEYS = (*_TEXTS, *EXPECTED_RANGES)
+EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
 
 
 def walk_nodes(automaton: Automaton, words: NDArray[Any]) -> NDArray[np.uint32]:
@@ -137,3 +139,15 @@ def check_expected(expected: Mapping[str, Any], automaton: Automaton) -> None:
     )
     most = exposures * (automaton.n_outcomes - 1 if automaton.counts else automaton.channels)
     demand(clicks <= most * slack, f"expected.clicks is {clicks:g} of {exposures:g} exposures")
+
+
+def expected_differences(kept: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """Return which figures of a bundle's `expected` are others now; those of other conditions cannot be compared, and give none."""
+    names = EXPECTED_KEYS
+    if any(kept[name] != found[name] for name in names[:4]):
+        return []
+    return [
+        f"expected {name} is {kept[name]:.9g} in the bundle, {found[name]:.9g} here"
+        for name in names[4:]
+        if not math.isclose(kept[name], found[name], rel_tol=EXPECTED_TOLERANCE, abs_tol=EXPECTED_TOLERANCE)
+    ]

@@ -1,9 +1,10 @@
 """What an automaton does on given objects, exactly: no trials, no sampling error.
 
 Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
-edges into s', in float64, whether the outcomes are clicks or photon numbers: every state is at one depth, so that alpha is whole when its
-slot comes. Where the detector has afterpulses, a click depends on the click before: alpha is then carried for both outcomes of the last
-exposure; where they have a time constant, with the mean memory of each (remembering.py). Never draws anything.
+edges into s', in float64, whether the outcomes are clicks, photon numbers or the clicks of several channels, which are independent given
+the object: every state is at one depth, so that alpha is whole when its slot comes. Where the detector has afterpulses, a click depends on
+the click before: alpha is then carried for both outcomes of the last exposure; where they have a time constant, with the mean memory of
+each (remembering.py). Never draws anything.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ def expected_walk(
     Of `afterpulses` without a time constant a click makes the next exposure click as well; the exposure before a walk is taken to have
     none (that of the last object's end is forgotten, at most one click in so many walks). With one, `begins` is the memory with which a
     walk begins, and remembering.py says what is exact.
-    ValueError for shapes that do not fit, more than one channel, a law of other outcomes than the automaton's, and afterpulses of a
-    detector that counts.
+    Of several channels `law` is that of each. ValueError for shapes that do not fit, a law of other outcomes than the automaton's, and
+    afterpulses of a detector that counts or of several channels.
     """
     _check_arguments(automaton, patterns, transmission)
     _check_law(automaton, law, afterpulses)
@@ -77,7 +78,9 @@ def expected_walk(
         here = slice(start, min(start + step, n))
         light = pattern_light(patterns, transmission[here], photons_per_level)
         walked: _Walked
-        if isinstance(law, CountLaw):
+        if automaton.channels > 1 and isinstance(law, ClickLaw):
+            walked = _ByWords(automaton, law, len(light))
+        elif isinstance(law, CountLaw):
             walked = _ByNumbers(automaton, law, len(light))
         elif afterpulses.time:
             walked = _ByMemory(Remembered(automaton, afterpulses, len(light), begins), law, automaton.n_states)
@@ -88,12 +91,11 @@ def expected_walk(
 
 
 def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission: NDArray[Any]) -> None:
-    if automaton.channels != 1:
-        raise ValueError(f"an automaton of {automaton.channels} channels, allowed: 1")
     if patterns.ndim != 2 or transmission.ndim != 2 or patterns.shape[1] != transmission.shape[1]:
         raise ValueError(f"patterns {patterns.shape} and objects {transmission.shape}, allowed: the same pixels")
-    if int(automaton.pattern.max()) >= len(patterns):
-        raise ValueError(f"a state shows pattern {automaton.pattern.max()} of {len(patterns)}")
+    last = int(automaton.pattern.max()) + automaton.channels - 1
+    if last >= len(patterns):
+        raise ValueError(f"a state shows pattern {last} of {len(patterns)}")
     if len(transmission) * automaton.n_leaves > LEAF_NUMBERS_MAX:
         most = LEAF_NUMBERS_MAX // automaton.n_leaves
         raise ValueError(
@@ -103,11 +105,12 @@ def _check_arguments(automaton: Automaton, patterns: NDArray[Any], transmission:
 
 def _check_law(automaton: Automaton, law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> None:
     outcomes = outcomes_of(law)
-    if outcomes != automaton.n_outcomes or (automaton.counts and afterpulses):
+    wanted = automaton.n_outcomes if automaton.counts else 2
+    if outcomes != wanted or (automaton.n_outcomes > 2 and afterpulses):
         found = f"{outcomes}, afterpulse {afterpulses.probability:g}"
         raise ValueError(
             f"an automaton of {automaton.n_outcomes} outcomes under a law of {found}, allowed: the same outcomes, and no afterpulses "
-            "where photons are counted"
+            "where photons are counted or several channels are read at once"
         )
 
 
@@ -132,7 +135,7 @@ class _Walked(Protocol):
     """The walks of some objects, carried on slot by slot."""
 
     def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
-        """Leave `states` (m,) of one slot, shown with `photoelectrons` (objects, m).
+        """Leave `states` (m,) of one slot, shown with `photoelectrons` (objects, m), of several channels (objects, m, channels).
 
         Returns the chances with which the objects reached them (objects, m), and the expected clicks (objects,).
         """
@@ -188,6 +191,36 @@ class _ByNumbers:
         return None
 
 
+class _ByWords:
+    """Walks by the clicks of several channels at once."""
+
+    def __init__(self, automaton: Automaton, law: ClickLaw, n: int) -> None:
+        self._automaton, self._law = automaton, law
+        self._alpha = np.zeros((n, len(automaton.posteriors)))
+        self._alpha[:, 0] = 1.0
+
+    def go_on(self, states: NDArray[np.int64], photoelectrons: F64) -> tuple[F64, F64]:
+        reached = self._alpha[:, states]
+        click, miss = both_chances(self._law, photoelectrons)
+        chances = word_chances(click, miss)
+        pass_counts_on(self._alpha, states, self._automaton.successors, chances)
+        return reached, (reached * click.sum(axis=2)).sum(axis=1)
+
+    def leaves(self) -> F64:
+        return self._alpha[:, self._automaton.n_states :]
+
+    def ends(self) -> None:
+        return None
+
+
+def word_chances(click: F64, miss: F64) -> F64:
+    """Return the chance of each outcome, (2**channels, n, m), from those of a click and of none in each channel, (n, m, channels)."""
+    chances = np.ones((1, *click.shape[:2]))
+    for channel in range(click.shape[2]):
+        chances = np.concatenate([chances * miss[:, :, channel], chances * click[:, :, channel]])
+    return chances
+
+
 class _ByMemory:
     """Walks by clicks on a detector that remembers several exposures."""
 
@@ -216,13 +249,14 @@ def _walk_block(
     """Carry `walked` through all slots; `light` (objects, patterns) and `shown` (patterns,) of the patterns, lit all the time."""
     sums = np.zeros((4, len(light)))
     for states in slots:
-        pattern = automaton.pattern[states]
+        rows = automaton.rows[states]
         share = automaton.dwell[states] / automaton.dwell_steps
-        photoelectrons = light[:, pattern] * share
+        each = light[:, rows] * share[:, None]
+        photoelectrons = each[:, :, 0] if automaton.channels == 1 else each
         reached, clicks = walked.go_on(states, photoelectrons)
         sums[0] += clicks
-        sums[1] += (reached * photoelectrons).sum(axis=1)
-        sums[2] += reached @ (shown[pattern] * share)
+        sums[1] += (reached * each.sum(axis=2)).sum(axis=1)
+        sums[2] += reached @ (shown[rows].sum(axis=1) * share)
         sums[3] += reached.sum(axis=1)
     for total, row in zip((found.clicks, found.photons, found.illumination, found.exposures), sums):
         total[here] = row

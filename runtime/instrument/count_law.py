@@ -103,6 +103,22 @@ def cannot_count(profile: Profile, outcomes: int) -> str:
     return ""
 
 
+def cannot_read_at_once(profile: Profile, channels: int) -> str:
+    """Return why no exact law tells what `channels` detectors of `profile` read in one exposure, pattern after pattern, or "" if one does.
+
+    Each clicks by the click law, and given the light they are independent.
+    """
+    detector = profile.detector
+    if profile.mode != "sequential":
+        return f"{channels} channels per exposure of a walk, {profile.name} measures in {profile.mode} mode"
+    if channels > detector.channels:
+        return f"{channels} channels per exposure, {profile.name} has {detector.channels} (detector.channels)"
+    for key in ("crosstalk_probability", "afterpulse_probability"):
+        if getattr(detector, key) > 0:
+            return f"{channels} channels per exposure, but {profile.name} has detector.{key}: their clicks are not independent"
+    return ""
+
+
 def outcome_weights(law: CountLaw) -> F64:
     """The w_j(k), float64 (outcomes, n): P(outcome j | k photoelectrons), up to the last k at which any but the last outcome counts."""
     columns: list[list[float]] = []

@@ -22,6 +22,7 @@ GATED, FREE_RUNNING = "gated", "free-running"
 MAX_FLUCTUATION = 0.3  # of the light from exposure to exposure: beyond it a Gaussian factor would often be below 0
 MOST_AFTERPULSES = 0.6  # of those that come at any time: beyond 1 - 1/e every one would cause another
 FARTHEST_CROSSTALK = 8  # channels
+MOST_SEQUENTIAL = 4  # channels: the clicks of one exposure are a number of COUNTS
 MIN_EXPOSURE_TICKS = 10  # rounding an exposure to whole ticks then changes the photons by 5 % at most
 
 
@@ -231,11 +232,12 @@ _Fault = Callable[..., ConfigError]
 
 def _check_channels(values: _Values, fault: _Fault) -> None:
     channels, path = values["detector"]["channels"], ("detector", "channels")
-    if values["profile"]["mode"] == "sequential" and channels != 1:
+    if values["profile"]["mode"] == "sequential" and channels > MOST_SEQUENTIAL:
         raise fault(
             path,
-            f"detector.channels must be 1 in sequential mode (one detector, pattern after pattern), found {channels}",
-            'set channels = 1, or mode = "parallel" if all channels click at once',
+            f"detector.channels must be from 1 to {MOST_SEQUENTIAL} in sequential mode (detectors that are read at once, each with a "
+            f"pattern of its own, one such set after another), found {channels}",
+            'set channels = 1, or mode = "parallel" if all patterns are shown at once',
         )
     if values["profile"]["mode"] == "parallel" and channels < 2:
         raise fault(

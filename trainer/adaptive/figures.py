@@ -14,6 +14,7 @@ import torch
 from .grow import sum_of
 from .machine import Machine, Sight, forward
 from .objects import Block
+from .outcomes import by_state, channels_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ def figures(machine: Machine, sight: Sight, blocks: list[Block]) -> Figures:
         whole = []
         for level in machine.levels:
             mask, scale = level.light.shown()
-            whole.append(mask.sum(dim=1) if scale is None else mask.sum(dim=1) * scale.squeeze(1))
+            shown = mask.sum(dim=1, keepdim=True) if scale is None else mask.sum(dim=1, keepdim=True) * scale
+            whole.append(by_state(shown, channels_of(sight.law)).squeeze(1))
         for block in blocks:
             passed = forward(machine, sight, block.grey)
             loss = right = 0.0

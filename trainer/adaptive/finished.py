@@ -127,27 +127,30 @@ def scale_light(machine: Machine, factor: float) -> None:
 
 def finished(machine: Machine, posteriors: Posteriors, profile: Profile, grid: Grid | None) -> Finished:
     """Return the arrays of `machine`, whose patterns are whole levels (no `grid`) or bits on the grid."""
-    rows, dwells, top = [], [], 0.0
+    rows, dwells, top, channels = [], [], 0.0, 1
     levels = profile.projector.levels
     for level in machine.levels:
         mask, scale = (None if part is None else part.double().cpu().numpy() for part in level.light.shown())
         assert mask is not None
+        channels = len(mask) // level.n_states
         if grid is None:
             top = float(level.light.top)
             rows.append(np.rint(mask).astype(np.uint16))
-            dwells.append(np.ones(len(mask), np.int64))
+            dwells.append(np.ones(level.n_states, np.int64))
             continue
         assert scale is not None
         units = np.broadcast_to(np.rint(scale / grid.top * grid.steps).astype(np.int64), (len(mask), 1))
         top = grid.top
         rows.append((mask * (units if grid.by_level else levels - 1)).astype(np.uint16))
-        dwells.append(np.ones(len(mask), np.int64) if grid.by_level else units[:, 0])
-    shown, pattern = np.unique(np.concatenate(rows), axis=0, return_inverse=True)
+        dwells.append(np.ones(level.n_states, np.int64) if grid.by_level else units[::channels, 0])
+    n_pixels = rows[0].shape[1]  # what a state shows on all its channels is one
+    of_states = np.concatenate(rows).reshape(-1, channels * n_pixels)
+    shown, pattern = np.unique(of_states, axis=0, return_inverse=True)
     return Finished(
-        shown,
+        shown.reshape(-1, n_pixels),
         top / (levels - 1),
         levels,
-        pattern.reshape(-1),
+        channels * pattern.reshape(-1),
         np.concatenate(dwells),
         1 if grid is None or grid.by_level else grid.steps,
         _numbered(machine),

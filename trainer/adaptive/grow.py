@@ -14,13 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.instrument.count_law import outcomes_of
-
 from .light import Grey
 from .machine import COUNT_FLOOR, Level, Machine, Sight, children
 from .merge import merged
 from .objects import Block
-from .outcomes import mean_reading, readings
+from .outcomes import by_row, by_state, channels_of, clicks_of, mean_reading, readings, slope_of
 
 TRIED_BLOCKS = 6  # objects on which candidates are compared, in blocks
 LIGHT_TRIED = (0.4, 1.6)  # mean photoelectrons of a candidate
@@ -44,6 +42,7 @@ class Growth:
 
     def __init__(self, blocks: list[Block], sight: Sight, options: GrowOptions, random: torch.Generator) -> None:
         self.blocks, self.sight, self.options, self.random = blocks, sight, options, random
+        self.channels, self.clicks = channels_of(sight.law), clicks_of(sight.law)
         self.alphas = [torch.ones(1, len(block)) for block in blocks]
         self.levels: list[Level] = []
         self.spent = 0.0, 0.0  # photons and clicks of an object so far
@@ -79,12 +78,15 @@ class Growth:
         tried = min(TRIED_BLOCKS, len(self.blocks))
         means, masses = self._class_means(tried)
         best = torch.full((len(masses),), torch.inf)
-        chosen = torch.zeros(len(masses), means.shape[2])
+        rows = by_row(means, self.channels), by_row(masses, self.channels)  # each channel has a split of its own
+        chosen = torch.zeros(len(rows[0]), means.shape[2])
         for _ in range(self.options.candidates):
-            patterns = self._candidate(means, masses)
+            patterns = self._candidate(*rows)
             cost = self._cost_of(patterns, tried, price)
             better = cost < best
-            best[better], chosen[better] = cost[better], patterns[better]
+            best[better] = cost[better]
+            of_better = by_row(better, self.channels)
+            chosen[of_better] = patterns[of_better]
         return chosen
 
     def _class_means(self, tried: int) -> tuple[Tensor, Tensor]:
@@ -120,14 +122,14 @@ class Growth:
 
     def _cost_of(self, patterns: Tensor, tried: int, price: float) -> Tensor:
         """What every state's pattern leaves unknown of the class, and the price of its light, (states,)."""
-        spent, whole = torch.zeros(len(patterns)), torch.zeros(len(patterns), self.counts.shape[1])
-        parts = [torch.zeros_like(whole) for _ in range(outcomes_of(self.sight.law) - 1)]
+        spent, whole = torch.zeros(len(self.counts)), torch.zeros_like(self.counts)
+        parts = [torch.zeros_like(whole) for _ in self.clicks[1:]]
         for alpha, block in zip(self.alphas[:tried], self.blocks[:tried]):
             light = self.sight.light(patterns, block.grey)
             for part, chance in zip(parts, readings(light, self.sight.law)[0]):
                 part += (alpha * chance) @ block.one_hot.T
             whole += alpha @ block.one_hot.T
-            spent += (alpha * light).sum(dim=1)
+            spent += (alpha * by_state(light, self.channels)).sum(dim=1)
         unknown = sum_of(mass_entropy(part) for part in [*parts, remainder(whole, parts).clamp(min=0)])
         return unknown + price * spent
 
@@ -136,9 +138,8 @@ class Growth:
         options = self.options
         optimiser = torch.optim.Adam([light.root], lr=options.rate, fused=True)
         n = sum(len(block) for block in self.blocks)
-        outcomes = outcomes_of(self.sight.law)
         whole = (
-            self.counts.double() + outcomes * COUNT_FLOOR
+            self.counts.double() + len(self.clicks) * COUNT_FLOOR
         )  # in float32 a child's count could vanish beside another's
         parts = [torch.minimum(p.double() + COUNT_FLOOR, whole - COUNT_FLOOR) for p in self._outcome_counts(light)]
         steps, done = options.epochs * len(self.blocks), 0
@@ -149,8 +150,8 @@ class Growth:
                 mask, _ = light.shown()
                 chances, falls = readings(self.sight.light(mask, block.grey), self.sight.law)
                 arrived = [(alpha * chance) @ block.one_hot.T for chance in chances]
-                slope = _told(falls, parts, whole, block)
-                slope.neg_().add_(price).mul_(alpha).mul_(1.0 / len(block))
+                slope = slope_of(falls, _told(parts, whole, block), self.sight.law)
+                slope.neg_().add_(price).mul_(by_row(alpha, self.channels)).mul_(1.0 / len(block))
                 light.take(self.sight.mask_slope(slope, block.grey, light), None)
                 optimiser.param_groups[0]["lr"] = options.rate * (1 - done / steps) + 1e-4
                 optimiser.step()
@@ -172,7 +173,7 @@ class Growth:
 
     def _branch(self, light: Grey) -> None:
         """Carry the probabilities to the children and merge these."""
-        states = len(light.root)
+        states = len(self.counts)
         parts = self._outcome_counts(light)
         edges = torch.cat([*parts, remainder(self.counts, parts).clamp(min=0)])
         groups = merged(edges.double().cpu().numpy(), min(self.options.states, len(edges)))
@@ -189,8 +190,8 @@ class Growth:
         for index, block in enumerate(self.blocks):
             alpha, brought = self.alphas[index], self.sight.light(mask, block.grey)
             chances, _ = readings(brought, self.sight.law)
-            photons += float((alpha * brought).sum())
-            clicks += float((alpha * mean_reading(chances)).sum())
+            photons += float((alpha * by_state(brought, self.channels)).sum())
+            clicks += float((alpha * mean_reading(chances, self.clicks)).sum())
             self.alphas[index] = children(alpha, chances, successors, n_nodes)
         n = sum(len(block) for block in self.blocks)
         self.spent = self.spent[0] + photons / n, self.spent[1] + clicks / n
@@ -204,16 +205,13 @@ def remainder(whole: Tensor, parts: list[Tensor]) -> Tensor:
     return rest
 
 
-def _told(falls: tuple[Tensor, ...], parts: list[Tensor], whole: Tensor, block: Block) -> Tensor:
-    """How fast light lowers the expected cross-entropy of the outcomes, (states, objects), by their class counts `parts`."""
+def _told(parts: list[Tensor], whole: Tensor, block: Block) -> list[Tensor]:
+    """By how much the cross-entropy of each outcome but the last is above that of the last, (states, objects), by their class counts."""
     rest = remainder(whole, parts)
     if len(parts) > 1:
         rest.clamp_(min=COUNT_FLOOR)  # each part alone leaves it, all together may not
     last = log_posterior(rest)
-    slope = torch.mul(falls[0], (last - log_posterior(parts[0])).float() @ block.one_hot)
-    for fall, part in zip(falls[1:], parts[1:]):
-        slope.addcmul_(fall, (last - log_posterior(part)).float() @ block.one_hot)
-    return slope
+    return [(last - log_posterior(part)).float() @ block.one_hot for part in parts]
 
 
 def sum_of(parts: object) -> Tensor:

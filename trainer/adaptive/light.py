@@ -1,6 +1,7 @@
 """The patterns of one level as parameters: grey, in whole projector levels, or one bit with a brightness per state.
 
-Owns the way from parameters to what is shown, and the way back of the gradient. What is shown is `scale * mask`: `mask` (states,
+Owns the way from parameters to what is shown, and the way back of the gradient. Of several channels a state has as many rows of pixels
+(`parts`), one after the other, and one brightness. What is shown is `scale * mask`: `mask` (states,
 pixels) goes into the matrix products, `scale` (states, 1) does not. Grey patterns are squares, so that no light is negative; levels
 and bits pass the gradient straight through their rounding (levels) or as a smooth step would (bits).
 """
@@ -13,13 +14,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .outcomes import by_row, by_state
+
 BIT_CUT = 0.2  # a pixel is lit that had more than this part of the brightest one
 BRIGHTNESS_MIN, BRIGHTNESS_MAX = 1e-6, 1e6  # photoelectrons of a lit pixel
 
 
 @dataclass(slots=True)
 class Grey:
-    """Patterns root**2, (states, pixels), photoelectrons per exposure and unit transmission, at most `top` per pixel.
+    """Patterns root**2, (rows, pixels), photoelectrons per exposure and unit transmission, at most `top` per pixel.
 
     With `levels`, what is shown is rounded to multiples of top / (levels - 1).
     """
@@ -73,6 +76,7 @@ class Bits:
 
     With one brightness for all, `log_light` is one tensor (1, 1) that all levels share. The brightness stays from `bottom` to `top`.
     With `rows` (states,), `lean` is a pool (patterns, pixels) that all levels share, and a state shows the pattern of its row.
+    With `parts` above 1, `lean` has as many rows of pixels for each state.
     """
 
     lean: Tensor
@@ -80,6 +84,7 @@ class Bits:
     bottom: float = BRIGHTNESS_MIN
     top: float = BRIGHTNESS_MAX
     rows: Tensor | None = None
+    parts: int = 1
 
     def parameters(self) -> list[Tensor]:
         """Return what an optimiser changes."""
@@ -94,9 +99,13 @@ class Bits:
         lean = self.own()
         return torch.gt(lean, 0, out=torch.empty_like(lean)), self.scale()
 
+    def brightness(self) -> Tensor:
+        """Return the photoelectrons of a lit pixel of every state, (states, 1)."""
+        return self.log_light.exp().expand(len(self.lean) // self.parts if self.rows is None else len(self.rows), 1)
+
     def scale(self) -> Tensor:
-        """Return the brightness of every state, (states, 1)."""
-        return self.log_light.exp().expand(len(self.lean) if self.rows is None else len(self.rows), 1)
+        """Return the brightness of every row of pixels, (rows, 1)."""
+        return by_row(self.brightness(), self.parts)
 
     def full(self, mask: Tensor) -> Tensor:
         """Return what a full pixel has in `mask`, (states, 1): 1."""
@@ -118,7 +127,8 @@ class Bits:
             gradient = before.index_add_(0, self.rows, gradient)
         self.lean.grad = gradient
         assert light_slope is not None
-        if len(self.log_light) != len(slope) or self.log_light.grad is not None:  # one for all: a sum
+        light_slope = by_state(light_slope, self.parts)
+        if len(self.log_light) != len(light_slope) or self.log_light.grad is not None:  # one for all: a sum
             light_slope = light_slope.sum(dim=0, keepdim=True)
             light_slope = light_slope if self.log_light.grad is None else self.log_light.grad + light_slope
         self.log_light.grad = light_slope
@@ -131,11 +141,15 @@ class Bits:
 Light = Grey | Bits
 
 
-def as_bits(grey: Tensor, mean_object: Tensor, top: float = BRIGHTNESS_MAX) -> Bits:
-    """Return one-bit patterns made from grey ones, which give the same light on the state's mean object; all (states, pixels).
+def as_bits(grey: Tensor, mean_object: Tensor, top: float = BRIGHTNESS_MAX, parts: int = 1) -> Bits:
+    """Return one-bit patterns made from grey ones, which give the same light on the state's mean object; all (rows, pixels).
 
-    Lit are pixels above a part of the brightest one; more are, where the brightness would else exceed `top`.
+    Lit are pixels above a part of the brightest one; more are, where the brightness would else exceed `top`. The `parts` of a state
+    have one brightness, the mean of what each alone would have, by its light; so many of their brightest pixels are lit that each
+    brings its light.
     """
+    if parts > 1:
+        return _parts_as_bits(grey, mean_object, as_bits(grey, mean_object, top).log_light, top, parts)
     brightest = grey.amax(dim=1, keepdim=True).clamp(min=1e-30)
     wanted = (grey * mean_object).sum(dim=1, keepdim=True)
     values, order = grey.sort(dim=1, descending=True)
@@ -144,3 +158,14 @@ def as_bits(grey: Tensor, mean_object: Tensor, top: float = BRIGHTNESS_MAX) -> B
     lean = (grey - torch.minimum(BIT_CUT * brightest, 0.999 * last)) / brightest
     brought = ((lean > 0) * mean_object).sum(dim=1, keepdim=True).clamp(min=1e-9)
     return Bits(lean, (wanted / brought).clamp(min=BRIGHTNESS_MIN).log(), top=top)
+
+
+def _parts_as_bits(grey: Tensor, mean_object: Tensor, log_light: Tensor, top: float, parts: int) -> Bits:
+    """As `as_bits`, with the brightness of each part alone, the exponential of `log_light` (rows, 1)."""
+    wanted = (grey * mean_object).sum(dim=1, keepdim=True)
+    common = by_state(wanted * log_light, parts) / by_state(wanted, parts).clamp(min=1e-30)
+    values, order = grey.sort(dim=1, descending=True)
+    lit = (mean_object.gather(1, order).cumsum(dim=1) * by_row(common.exp(), parts) < wanted).sum(dim=1, keepdim=True)
+    last = values.gather(1, lit.clamp(max=grey.shape[1] - 1))  # the darkest pixel that is lit
+    lean = (grey - 0.999 * last) / values[:, :1].clamp(min=1e-30)
+    return Bits(lean, common, top=top, parts=parts)

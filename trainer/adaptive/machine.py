@@ -1,8 +1,9 @@
 """The automaton while it is trained: levels of states, their successors, and the class counts of its leaves.
 
 Owns the exact forward pass (the probability of every node, given an object), the exact gradient of the expected loss, and the matrix
-products in reduced precision that make both quick. A level has states; an outcome (no click, click; or 0, 1, 2+ photons) of a
-state leads to a node of the next level; nodes are that level's states first, then its leaves. Nodes of the last level are all leaves.
+products in reduced precision that make both quick. A level has states; an outcome (no click, click; 0, 1, 2+ photons; or the clicks of
+several channels) of a state leads to a node of the next level; nodes are that level's states first, then its leaves. Nodes of the last
+level are all leaves.
 
 Tensors stand as (states, objects): rows are moved whole along the edges. For a state s of a level, with alpha its probability, q that
 of no click and beta the expected loss from there on:
@@ -28,7 +29,7 @@ from pans.trainer.model.afterpulses import MeanMemory
 from pans.trainer.model.concentration import concentration_slope
 
 from .light import Light
-from .outcomes import Law, mean_reading, readings
+from .outcomes import Law, by_row, by_state, channels_of, clicks_of, mean_reading, readings, slope_of
 
 WRONG = 2.2  # nats, of a wrong decision: about the odds of ten classes, so that both parts of the loss are of one size
 COUNT_FLOOR = 1e-3  # objects of every class in every leaf, before any was seen
@@ -120,12 +121,17 @@ class Sight:
 
 @dataclass(slots=True)
 class Step:
-    """One level of a pass: probability of the states, light, chances of all outcomes but the last, and how fast each falls with light."""
+    """One level of a pass: probability of the states, light by rows, chances of all outcomes but the last, and how fast these fall.
+
+    `whole` is the light of a state, all its channels together; `numbers` are the clicks of each outcome.
+    """
 
     alpha: Tensor
     light: Tensor
+    whole: Tensor
     chances: tuple[Tensor, ...]
     falls: tuple[Tensor, ...]
+    numbers: tuple[int, ...]
 
     @property
     def dark(self) -> Tensor:
@@ -134,7 +140,7 @@ class Step:
 
     def clicks(self) -> Tensor:
         """Return the expected clicks of every object: photons counted, where they are."""
-        return (self.alpha * mean_reading(self.chances)).sum(dim=0)
+        return (self.alpha * mean_reading(self.chances, self.numbers)).sum(dim=0)
 
 
 @dataclass(slots=True)
@@ -146,7 +152,7 @@ class Pass:
 
     def photons(self) -> Tensor:
         """Return the expected photoelectrons of every object."""
-        return torch.stack([(step.alpha * step.light).sum(dim=0) for step in self.steps]).sum(dim=0)
+        return torch.stack([(step.alpha * step.whole).sum(dim=0) for step in self.steps]).sum(dim=0)
 
     def clicks(self) -> Tensor:
         """Return the expected clicks of every object: photons counted, where they are."""
@@ -154,7 +160,7 @@ class Pass:
 
 
 def brought(light: Light, sight: Sight, grey: Tensor) -> Tensor:
-    """Return the light (states, objects) that the patterns of `light` bring from objects of `grey`."""
+    """Return the light (rows, objects) that the patterns of `light` bring from objects of `grey`."""
     mask, scale = light.shown()
     result = sight.light(mask, grey, light.full(mask) if sight.dark_pixels else None)
     return result if scale is None else result.mul_(scale)
@@ -178,7 +184,7 @@ def children(alpha: Tensor, chances: tuple[Tensor, ...], successors: Tensor, n_n
 
 def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
     """Return the pass of the objects `grey` (objects, pixels) through `machine`."""
-    result = Pass()
+    result, numbers, channels = Pass(), clicks_of(sight.law), channels_of(sight.law)
     nodes = torch.ones(1, len(grey), dtype=sight.sums)
     memory = None if sight.afterpulses is None else MeanMemory(sight.afterpulses, nodes)
     for number, level in enumerate(machine.levels):
@@ -189,7 +195,7 @@ def forward(machine: Machine, sight: Sight, grey: Tensor) -> Pass:
         chances, falls = readings(light, sight.law)
         if memory is not None:
             chances, falls = memory.go_on(alpha, chances, falls, level.successors, machine.n_nodes(number))
-        result.steps.append(Step(alpha, light, chances, falls))
+        result.steps.append(Step(alpha, light, by_state(light, channels), chances, falls, numbers))
         nodes = children(alpha, chances, level.successors, machine.n_nodes(number))
     result.leaves.append(nodes)
     return result
@@ -228,28 +234,26 @@ def backward(machine: Machine, sight: Sight, grey: Tensor, one_hot: Tensor, pass
     """Set the gradients of what `aim` makes small over the objects of `passed`; they replace those that were there."""
     for tensor in machine.parameters():
         tensor.grad = None
-    share = 1.0 / len(grey)
+    share, channels = 1.0 / len(grey), channels_of(sight.law)
     beta = aim.at_leaves(machine.counts[-1], one_hot)
     for number in range(len(machine.levels) - 1, -1, -1):
         level, step = machine.levels[number], passed.steps[number]
         after_last = beta[level.successors[-1]]
         gains = [beta[after].sub_(after_last) for after in level.successors[:-1]]  # what they cost more than the last
-        slope = torch.mul(step.falls[0], gains[0])
-        for fall, gain in zip(step.falls[1:], gains[1:]):
-            slope.addcmul_(fall, gain)
-        slope.neg_().add_(aim.price).mul_(step.alpha).mul_(share)
+        slope = slope_of(step.falls, gains, sight.law)
+        slope.neg_().add_(aim.price).mul_(by_row(step.alpha, channels)).mul_(share)
         mask_slope = sight.mask_slope(slope, grey, level.light)
         scale = level.light.scale()
         light_slope = None if scale is None else slope.mul_(step.light).sum(dim=1, keepdim=True)
         mask_slope = mask_slope if scale is None else mask_slope.mul_(scale)
         if aim.spread:
             mass = step.alpha.sum(dim=1, keepdim=True).mul_(aim.spread * share / len(machine.levels))
-            mask_slope.addcmul_(mass, concentration_slope(level.light.shown()[0]))
+            mask_slope.addcmul_(by_row(mass, channels), concentration_slope(level.light.shown()[0]))
         level.light.take(mask_slope, light_slope)
         beta = gains[0].mul_(step.chances[0])
         for chance, gain in zip(step.chances[1:], gains[1:]):
             beta.addcmul_(chance, gain)
-        beta.add_(after_last).add_(step.light, alpha=aim.price)
+        beta.add_(after_last).add_(step.whole, alpha=aim.price)
         if aim.exposure_price:
             beta += aim.exposure_price
         if number and len(machine.counts[number - 1]):

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pans.runtime.bundle.automaton import SLOTS_MAX, STATES_MAX
+from pans.runtime.bundle.automaton import CHANNELS_MAX, SLOTS_MAX, STATES_MAX
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count
+from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count, cannot_read_at_once
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import check_optics
 from pans.trainer.tasks.registry import Task
@@ -70,7 +70,13 @@ class AutomatonOptions:
     optics: str | None = None  # tolerance of the optics to train through, as `--optics` spells it
     spread: float = 0.0  # weight in the loss of how concentrated the light of a pattern is (model/concentration.py)
     outcomes: int = 2  # of one exposure: no click and a click, or 0, 1, ... photons and the last "this many or more"
+    channels: int = 1  # detectors that are read at once, each with a pattern of its own
     start: str | None = None  # sha256 of the bundle whose automaton is trained on, instead of one that grows
+
+    @property
+    def successors(self) -> int:
+        """Number of outcomes of one exposure."""
+        return 1 << self.channels if self.channels > 1 else self.outcomes
 
 
 LIMITS = {
@@ -92,6 +98,7 @@ LIMITS = {
     "spread": (0, 10),
     "teacher_epochs": (1, 1000),
     "outcomes": (2, OUTCOMES_MAX),
+    "channels": (1, CHANNELS_MAX),
     "patterns": (0, 65_535),
     "offset_px": (0, 65536),
     "copies": (0, 1000),
@@ -127,13 +134,17 @@ def default_size(photons: float) -> tuple[int, int]:
 
 
 def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int]:
-    """Return exposures and states per level: those asked for, else those of the budget, as far as the profile holds them."""
+    """Return exposures and states per level: those asked for, else those of the budget, as far as the profile holds them.
+
+    Several channels need fewer exposures, in proportion.
+    """
     wanted, states = default_size(photons_wanted(options))
+    wanted = -(-wanted // options.channels)
     exposures = options.exposures or wanted
     if options.states:
         return exposures, options.states
-    most = min(profile.projector.pattern_memory, profile.projector.automaton_states or STATES_MAX)
-    while states > 1 and states_at_most(exposures, states, options.outcomes) > most:
+    most = min(profile.projector.pattern_memory // options.channels, profile.projector.automaton_states or STATES_MAX)
+    while states > 1 and states_at_most(exposures, states, options.successors) > most:
         states -= 1
     return exposures, states
 
@@ -176,7 +187,8 @@ def started_from(
     if options.grey:
         raise UsageError("--start: not with --grey, what is trained on are patterns of one bit and a brightness")
     exposures, states = automaton.n_slots, int(np.bincount(automaton.depth).max())
-    found = {"exposures": exposures, "states": states, "outcomes": automaton.n_outcomes}
+    outcomes = automaton.n_outcomes if automaton.counts else 2
+    found = {"exposures": exposures, "states": states, "outcomes": outcomes, "channels": automaton.channels}
     for name, value in found.items():
         if getattr(options, name) not in (0, value):
             raise UsageError(
@@ -190,12 +202,17 @@ def started_from(
             remedy="start from an automaton of the same task",
         )
     most = patterns_at_most(options, profile)
-    if most < automaton.n_states:
+    if most < automaton.n_states * automaton.channels:
         raise PlanError(
-            f"--start: {automaton.n_states} states with a pattern each, {most} are allowed; only a training that grows shares them",
+            f"--start: {automaton.n_states} states with {_patterns_each(automaton.channels)}, {most} are allowed; "
+            "only a training that grows shares them",
             remedy="leave out --start or --patterns, or choose a profile with a larger pattern memory",
         )
     return replace(options, exposures=exposures, states=states, start=sha256)
+
+
+def _patterns_each(channels: int) -> str:
+    return "a pattern each" if channels == 1 else f"{channels} patterns each"
 
 
 def check_automaton_options(options: AutomatonOptions, task: Task, profile: Profile) -> None:
@@ -244,18 +261,37 @@ def _check_fits(options: AutomatonOptions, profile: Profile) -> None:
     why = cannot_count(profile, options.outcomes)
     if why:
         raise PlanError(why, remedy="--outcomes 2, or a profile whose detector.photon_number_max is at least one less")
-    most = states_at_most(exposures, states, options.outcomes)
+    if options.channels > 1:
+        _check_channels(options, profile)
+    most = states_at_most(exposures, states, options.successors)
     if most > STATES_MAX:
         raise PlanError(
             f"{exposures} exposures of {states} states are up to {most} states, allowed at most {STATES_MAX}",
             remedy=f"--states {STATES_MAX // exposures}, or fewer",
         )
     few = patterns_at_most(options, profile)
+    if options.channels > 1 and few < most * options.channels:
+        raise PlanError(
+            f"up to {most} states show {options.channels} patterns each, {few} patterns are allowed, and channels share none",
+            remedy="fewer --exposures or --states, or leave out --patterns",
+        )
     if few < most and (options.grey or (profile.projector.dwell_steps == 1 and profile.projector.levels > 2)):
         raise PlanError(
             f"{few} patterns for up to {most} states: on {profile.name} a state's brightness is part of its pattern, so "
             "that states cannot share one",
             remedy="fewer --exposures or --states, or a profile with projector.dwell_steps",
         )
-    if options.clicks is not None and options.clicks >= exposures:
-        raise UsageError(f"--clicks is {options.clicks}, allowed: below {exposures}, one click per exposure at most")
+    clicks = exposures * options.channels
+    if options.clicks is not None and options.clicks >= clicks:
+        raise UsageError(f"--clicks is {options.clicks}, allowed: below {clicks}, one click per exposure at most")
+
+
+def _check_channels(options: AutomatonOptions, profile: Profile) -> None:
+    if options.outcomes > 2:
+        raise UsageError(
+            f"--channels {options.channels} with --outcomes {options.outcomes}: detectors that are read at once click, they do not count",
+            remedy="leave out one of them",
+        )
+    why = cannot_read_at_once(profile, options.channels)
+    if why:
+        raise PlanError(why, remedy="fewer --channels, or a sequential profile with as many detectors: dmd-four-snspd")

@@ -17,7 +17,7 @@ from torch import Tensor
 from .light import Grey, Light
 from .machine import COUNT_FLOOR, Machine, Sight, forward, leaf_losses
 from .objects import Block
-from .outcomes import readings
+from .outcomes import by_state, channels_of, readings
 
 SURE = 0.5  # standard errors by which a node must be better; the difference of an object's losses varies by about LOSS_SPREAD
 LOSS_SPREAD = 0.5  # nats
@@ -85,7 +85,7 @@ class Sweep:
             before = after = beta[level.successors[-1]]
             for chance, outcome in zip(readings(light, self.sight.law)[0], level.successors):
                 before = before + chance * (beta[outcome] - after)
-            before = before + price * light
+            before = before + price * by_state(light, channels_of(self.sight.law))
             before += exposure_price
             if number and len(self.machine.counts[number - 1]):
                 before = torch.cat([before, leaf_losses(self.machine.counts[number - 1], block.one_hot)])
@@ -202,12 +202,13 @@ def _copy_node(machine: Machine, number: int, source: int, target: int, counts: 
         return
     level = machine.levels[number + 1]
     for tensor in _by_state(level.light):
-        tensor[target] = tensor[source]
+        blocks = tensor.view(level.n_states, -1)
+        blocks[target] = blocks[source]
     level.successors[:, target] = level.successors[:, source]
 
 
 def _by_state(light: Light) -> list[Tensor]:
-    """The tensors of which a state has a row of its own."""
+    """The tensors of which a state has rows of its own."""
     if isinstance(light, Grey):
         return [light.root]
     own = [light.lean if light.rows is None else light.rows]

@@ -41,7 +41,7 @@ def _light_state(light: Light) -> dict[str, Any]:
     if isinstance(light, Grey):
         return {"root": light.root, "top": light.top, "whole_levels": light.levels}
     limits = {"bottom": light.bottom, "top": light.top}
-    return {"lean": light.lean, "log_light": light.log_light, "rows": light.rows, **limits}
+    return {"lean": light.lean, "log_light": light.log_light, "rows": light.rows, "parts": light.parts, **limits}
 
 
 def _light_from(level: dict[str, Any], shared: dict[int, Tensor]) -> Light:
@@ -51,7 +51,8 @@ def _light_from(level: dict[str, Any], shared: dict[int, Tensor]) -> Light:
     if "root" in level:
         return Grey(here(level["root"]), level["top"], level["whole_levels"])
     rows = None if level["rows"] is None else here(level["rows"])
-    return Bits(once(level["lean"]), once(level["log_light"]), level["bottom"], level["top"], rows)
+    lean, log_light = once(level["lean"]), once(level["log_light"])
+    return Bits(lean, log_light, level["bottom"], level["top"], rows, level.get("parts", 1))
 
 
 def machine_of(bundle: Bundle) -> Machine:
@@ -76,7 +77,8 @@ def machine_of(bundle: Bundle) -> Machine:
 
 def _bits_of(bundle: Bundle, states: NDArray[np.int64]) -> Bits:
     assert bundle.automaton is not None
-    shown = bundle.pattern_levels[bundle.automaton.pattern[states]].astype(np.int64)
+    parts, n_pixels = bundle.automaton.channels, bundle.n_pixels
+    shown = bundle.pattern_levels[bundle.automaton.rows[states]].astype(np.int64).reshape(len(states), -1)
     lit, most = shown > 0, shown.max(axis=1, keepdims=True)
     if (lit & (shown != most)).any():
         raise UsageError(
@@ -85,5 +87,5 @@ def _bits_of(bundle: Bundle, states: NDArray[np.int64]) -> Bits:
         )
     part = bundle.automaton.dwell[states, None] / bundle.automaton.dwell_steps
     brightness = np.maximum(BRIGHTNESS_MIN, most * bundle.photons_per_level * part)
-    lean = torch.from_numpy(np.where(lit, LEAN, -LEAN).astype(np.float32))
-    return Bits(here(lean), here(torch.from_numpy(np.log(brightness).astype(np.float32))))
+    lean = torch.from_numpy(np.where(lit, LEAN, -LEAN).astype(np.float32).reshape(-1, n_pixels))
+    return Bits(here(lean), here(torch.from_numpy(np.log(brightness).astype(np.float32))), parts=parts)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import tolerance_of
-from pans.runtime.instrument.count_law import count_law
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
 from pans.trainer.model.afterpulses import trained_through
@@ -48,6 +47,7 @@ from .options import (
     tune_epochs_of,
     with_defaults,
 )
+from .outcomes import by_row, law_of
 from .posteriors import Posteriors, calibrated, node_counts
 from .reroute import reroute
 from .share import choose_patterns, share_patterns
@@ -168,9 +168,8 @@ class _Run:
         low, high = top_limits(self.profile)
         top = self.machine.levels[0].light.top if self.stage == "shown" else low
         exposure_us = exposure_us_of(self.profile, min(high, max(low, top)))
-        law = count_law(self.profile, exposure_us, self.options.outcomes)
-        if self.options.dark is not None:
-            law = replace(law, dark_per_exposure=self.options.dark)
+        asked = self.options
+        law = law_of(self.profile, exposure_us, asked.outcomes, asked.channels, asked.dark)
         links = trained_through(self.profile, exposure_us)
         return Sight(law, self.objects.gain, self.objects.floor, products, self.options.optics is not None, links)
 
@@ -276,8 +275,11 @@ class _Run:
 
     def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
         shared, top = self._one_brightness(), self._highest_top()
-        means = list(mean_objects(self.machine, self.sight(self.products), self._some_blocks()))
-        made = [as_bits(light, own, top) for light, own in zip(lights, means)]
+        means, parts = (
+            list(mean_objects(self.machine, self.sight(self.products), self._some_blocks())),
+            self.options.channels,
+        )
+        made = [as_bits(light, by_row(own, parts), top, parts) for light, own in zip(lights, means)]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
         for level, bits in zip(self.machine.levels, made):
             if shared:
@@ -326,7 +328,7 @@ class _Run:
 
         One bright state that is hardly ever reached would else bring its dark counts to every exposure.
         """
-        lights = torch.cat([level.light.shown()[1].flatten() for level in self.machine.levels])  # type: ignore[union-attr]
+        lights = torch.cat([level.light.brightness().flatten() for level in self.machine.levels])  # type: ignore[union-attr]
         masses, order = torch.cat(self._masses()), lights.argsort()
         below = masses[order].cumsum(0) / masses.sum()
         low, high = top_limits(self.profile)[0], self._highest_top()

@@ -59,7 +59,7 @@ NUMBERS = (
 )
 OF_AUTOMATA = (
     *("exposures", "states", "patterns", "grey", "strength", "decide", "exposure_price", "soft", "teacher"),
-    *("start", "rate", "reroutes"),
+    *("start", "rate", "reroutes", "channels"),
 )
 AS_GIVEN = (
     *("features", "photons", "budget", "complex_field", "optics", "bleach", "outcomes"),
@@ -129,6 +129,12 @@ def _add_of_automata(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="K",
         help="outcomes of an exposure; 3: no photon, one, two or more, on a detector that counts (default 2)",
+    )
+    parser.add_argument(
+        "--channels",
+        type=int,
+        metavar="C",
+        help="of an automaton: detectors that are read at once, each with a pattern of its own (default 1, at most 4)",
     )
     parser.add_argument(
         "--grey", action="store_true", help="of an automaton: patterns in all levels, not one bit and a brightness"

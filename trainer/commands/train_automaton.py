@@ -44,6 +44,7 @@ TAKEN = (
     "strength",
     "decide",
     "outcomes",
+    "channels",
     "exposure_price",
     "soft",
     "rate",

@@ -22,7 +22,7 @@ from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, cannot_count, count_chances, counting
+from pans.runtime.instrument.count_law import CountLaw, cannot_count, cannot_read_at_once, count_chances, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 
@@ -193,6 +193,9 @@ def outcome_law_of(
     """
     law, outcomes = law_of(bundle, profile, eta, dark), bundle.largest + 1
     if outcomes == 2:
+        why = cannot_read_at_once(profile, bundle.n_channels) if bundle.n_channels > 1 else ""
+        if why:
+            raise ValueError(f"{bundle.name} needs {why}")
         return law
     why = cannot_count(profile, outcomes)
     if why:

@@ -7,7 +7,6 @@ exposures are always reported together. SIMULATED figures: the click law of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton, stopped
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.bundle.walks import EXPECTED_KEYS
+from pans.runtime.bundle.walks import expected_differences as expected_differences
 from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import ExpectedWalk, expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
@@ -31,7 +30,6 @@ from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
-EXPECTED_TOLERANCE = 1e-6  # of an exact figure, times max(1, |figure|): the sums are float64
 BEGIN_OBJECTS, BEGIN_ROUNDS = 500, 4  # by which the memory is found with which an object comes
 _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
@@ -159,6 +157,8 @@ def _fitting(
         demand_sequence(profile)
         if trials is None:
             raise ValueError("bleaching depends on the walk, there is no exact expectation (sample trials instead)")
+        if bundle.n_channels > 1:
+            raise ValueError(f"bleaching under {bundle.n_channels} patterns at once, allowed: under one")
     return bundle.automaton
 
 
@@ -232,14 +232,18 @@ class _Lit(Protocol):
         """Begin new walks, each with an object that no light has met."""
 
     def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
-        """Show one state to each of the objects `rows`, and return the photoelectrons expected, all int64 or float64 (n,)."""
+        """Show one state to each of the objects `rows` int64 (n,), and return the photoelectrons expected, float64 (n,).
+
+        Of several channels (n, channels).
+        """
 
 
 class _Steady:
     """Objects that stay as they are."""
 
     def __init__(self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float) -> None:
-        self.n, self._pattern, self._share = len(seen), automaton.pattern, automaton.dwell / automaton.dwell_steps
+        self.n, self._share = len(seen), automaton.dwell / automaton.dwell_steps
+        self._shown = automaton.rows if automaton.channels > 1 else automaton.pattern
         self._light = pattern_light(patterns, seen, scale)
 
     def fresh(self) -> None:
@@ -247,7 +251,10 @@ class _Steady:
 
     def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
         """See `_Lit`."""
-        return np.asarray(self._light[rows, self._pattern[states]] * self._share[states])
+        shown, share = self._shown[states], self._share[states]
+        if shown.ndim > 1:
+            rows, share = rows[:, None], share[:, None]
+        return np.asarray(self._light[rows, shown] * share)
 
 
 def _sampled(
@@ -278,14 +285,17 @@ def _sampled(
                 memory *= afterpulses.decay
                 continue
             state = node[going]
-            shown = whole[automaton.pattern[state]] * (automaton.dwell[state] / automaton.dwell_steps)
+            shown = whole[automaton.rows[state]].sum(axis=1) * (automaton.dwell[state] / automaton.dwell_steps)
             photoelectrons = lit.photoelectrons(going, state)
-            outcome = _drawn(law, photoelectrons, memory[going], rng)
+            clicks = outcome = _drawn(law, photoelectrons, memory[going], rng)
+            if automaton.channels > 1:
+                clicks, outcome = outcome.sum(axis=1), outcome @ (1 << np.arange(automaton.channels))
+                photoelectrons = photoelectrons.sum(axis=1)
             if afterpulses and isinstance(law, ClickLaw):
                 known = afterpulses.after(-log_no_click(law, photoelectrons), memory[going], outcome)
                 memory *= afterpulses.decay
                 memory[going] = known
-            each: tuple[Any, ...] = (outcome, photoelectrons, shown, 1.0)
+            each: tuple[Any, ...] = (clicks, photoelectrons, shown, 1.0)
             for total, values in zip(sums, each):
                 total[going] += values
             node[going] = automaton.successors[state, outcome]
@@ -296,13 +306,14 @@ def _sampled(
 
 
 def _drawn(law: ClickLaw | CountLaw, light: F64, memory: F64, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Draw the outcome of each exposure (n,); `memory` is the mean number of afterpulses in it."""
+    """Draw the outcome of each exposure (n,), of several channels their clicks (n, channels); `memory` (n,): mean afterpulses in it."""
     if isinstance(law, CountLaw):
         passed = rng.random(light.size) >= np.cumsum(count_chances(law, light)[:-1], axis=0)
         return np.asarray(passed.sum(axis=0), np.int64)
     probability = click_probability(law, light)
-    probability -= (1 - probability) * np.expm1(-memory)
-    return np.asarray(rng.random(light.size) < probability, np.int64)
+    if light.ndim == 1:
+        probability -= (1 - probability) * np.expm1(-memory)
+    return np.asarray(rng.random(light.shape) < probability, np.int64)
 
 
 def measured_walks(walks: Walks) -> MeasuredWalks:
@@ -374,18 +385,6 @@ def expected_figures(found: MeasuredWalks, profile: str, task: str, split: str) 
         "illumination": found.illumination,
         "exposures": found.exposures_mean,
     }
-
-
-def expected_differences(kept: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
-    """Return which figures of a bundle's `expected` are others now; those of other conditions cannot be compared, and give none."""
-    names = EXPECTED_KEYS
-    if any(kept[name] != found[name] for name in names[:4]):
-        return []
-    return [
-        f"expected {name} is {kept[name]:.9g} in the bundle, {found[name]:.9g} here"
-        for name in names[4:]
-        if not math.isclose(kept[name], found[name], rel_tol=EXPECTED_TOLERANCE, abs_tol=EXPECTED_TOLERANCE)
-    ]
 
 
 def walk_payload(walks: Walks) -> dict[str, Any]:

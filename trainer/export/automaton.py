@@ -99,8 +99,10 @@ def bundle_of(
         arrays.posteriors,
         trained.options.outcomes > 2,
     )
-    shown, pattern = np.unique(automaton.pattern, return_inverse=True)
-    automaton = replace(automaton, pattern=pattern.astype(np.uint16))
+    first, pattern = np.unique(automaton.pattern, return_inverse=True)
+    channels = automaton.channels
+    automaton = replace(automaton, pattern=(channels * pattern).astype(np.uint16))
+    shown = (first.astype(np.int64)[:, None] + np.arange(channels)).reshape(-1)
     facts = {
         **origin(task, profile),
         "held_back": {key: round(value, 6) for key, value in asdict(trained.held_back).items()},
