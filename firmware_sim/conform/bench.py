@@ -13,7 +13,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import Link
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.counts import announced_counts, decode_counts
+from pans.runtime.wire.counts import announced_channels, announced_counts, decode_counts
 from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, MessageType, Opcode
 from pans.runtime.wire.session import STREAM_TYPES
 
@@ -101,8 +101,10 @@ class Bench:
             message = DECODE[frame.type](frame.payload)
         except MalformedMessage as error:
             raise Broken(f"{MessageType(frame.type).name} cannot be meant: {error.message}") from None
-        if frame.type == MessageType.COUNTS and announced_counts(self.facts) < 2:
-            raise Broken("COUNTS came from a device that announces no photon numbers")
+        if frame.type == MessageType.COUNTS and max(announced_counts(self.facts), announced_channels(self.facts)) < 2:
+            raise Broken(
+                "COUNTS came from a device that announces neither photon numbers nor several detectors at once"
+            )
         if frame.type == MessageType.CLICKS:
             self._raw = [*self._raw[-KEPT_PIECES:], frame.payload]
         self.inbox.append(Heard(frame.type, message, self.link.now_ns()))

@@ -1,6 +1,6 @@
-"""Rules of section 13: exposures that are photon numbers, and automata that follow them.
+"""Rules of sections 13 and 14: exposures that are photon numbers, or the clicks of several detectors, and automata that follow them.
 
-Owns these checks; on a device that announces no photon numbers only its refusals are tried.
+Owns these checks; on a device that announces neither only its refusals are tried.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pans.runtime.wire.automata import announced, pack_states
 from pans.runtime.wire.commands import Arm, pack_arm, pack_plan
 from pans.runtime.wire.counts import (
     CountStateChunk,
+    announced_channels,
     announced_counts,
     pack_count_states,
     pack_read_counts,
@@ -22,6 +23,7 @@ from pans.runtime.wire.messages import DARK_PATTERN, AckStatus, ClickBlock, Opco
 from pans.runtime.wire.schema import COUNT_SCHEMA
 
 from .bench import Bench
+from .plans import Layout
 from .rules import NotTried, need, rule
 from .walks import CYCLES, SLOTS, following, four_states
 
@@ -54,8 +56,8 @@ def clicks_of(bench: Bench) -> list[ClickBlock]:
 
 @rule("13.1", "A device without photon numbers refuses their opcodes with 1 and sends no COUNTS.")
 def clicks_only(bench: Bench) -> None:
-    if announced_counts(bench.facts) > 1:
-        raise NotTried("the device announces photon numbers")
+    if announced_counts(bench.facts) > 1 or announced_channels(bench.facts) > 1:
+        raise NotTried("the device announces photon numbers, or several detectors at once")
     for opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES):
         bench.refused(AckStatus.UNKNOWN_OPCODE, opcode, bytes(4), opcode.name)
     _, stream, _ = bench.run(bench.layout(), CYCLES)
@@ -69,7 +71,7 @@ def clicks_only(bench: Bench) -> None:
 )
 def says_what_it_knows(bench: Bench) -> None:
     schema, largest = (bench.facts.get(key) for key in ("count_schema", "photon_number_max"))
-    if schema is None and largest in (None, 1):
+    if largest in (None, 1) and (schema is None or announced_channels(bench.facts) > 1):
         raise NotTried("the device announces no photon numbers")
     need(schema == COUNT_SCHEMA, f"count_schema is {schema}, expected {COUNT_SCHEMA:#010x}")
     need(isinstance(largest, int) and largest >= 2, f"photon_number_max is {largest}, expected 2 to 15")
@@ -171,7 +173,12 @@ def follows_numbers(bench: Bench) -> None:
     bench.grant()
     bench.arm(CYCLES)
     bench.closing(layout, CYCLES)
-    node, seen = 0, 0
+    follow(bench, layout, automaton)
+
+
+def follow(bench: Bench, layout: Layout, automaton: CountStateChunk) -> None:
+    """Hold the stamps of a run of `CYCLES` against its numbers and the states."""
+    node, seen, largest = 0, 0, automaton.outcomes - 1
     for block in clicks_of(bench):
         need(block.largest == largest, f"a block has the largest number {block.largest}, asked for was {largest}")
         for place, (stamp, number) in enumerate(zip(block.patterns.tolist(), block.bits.tolist())):
@@ -185,3 +192,77 @@ def follows_numbers(bench: Bench) -> None:
                 node = int(automaton.states["next"][node, number])
             seen += 1
     need(seen == CYCLES * layout.n_slots, f"{seen} exposures, the run has {CYCLES * layout.n_slots}")
+
+
+# ---- several detectors at once ----
+
+
+def at_once(bench: Bench) -> int:
+    """How many detectors the device reads at once; NotTried of one."""
+    channels = announced_channels(bench.facts)
+    if channels < 2:
+        raise NotTried("the device announces one detector at a time")
+    return channels
+
+
+@rule(
+    "14.1",
+    "A device that reads one detector at a time refuses READ_COUNTS for several with 3, or with 1 without numbers.",
+)
+def one_at_a_time(bench: Bench) -> None:
+    if announced_channels(bench.facts) > 1:
+        raise NotTried("the device announces several detectors at once")
+    bench.upload(bench.layout())
+    status = RANGE if announced_counts(bench.facts) > 1 else AckStatus.UNKNOWN_OPCODE
+    bench.refused(status, Opcode.READ_COUNTS, pack_read_counts(3, 2), "READ_COUNTS of two detectors")
+
+
+@rule(
+    "14.2",
+    "A device that announces several detectors at once does so with the number of section 13, up to 4 of its channels, and automata.",
+)
+def says_how_many(bench: Bench) -> None:
+    told = bench.facts.get("channels_at_once")
+    if told in (None, 1):
+        raise NotTried("the device announces one detector at a time")
+    schema, most = bench.facts.get("count_schema"), min(4, bench.facts["channels"])
+    need(schema == COUNT_SCHEMA, f"count_schema is {schema}, expected {COUNT_SCHEMA:#010x}")
+    need(isinstance(told, int) and 2 <= told <= most, f"channels_at_once is {told}, expected 2 to {most}")
+    need(bench.facts["mode"] == "sequential", f"mode is {bench.facts['mode']}, expected sequential")
+    need(announced(bench.facts) is not None, "no automata are announced")
+
+
+@rule(
+    "14.3",
+    "READ_COUNTS for several detectors needs a plan with adaptive slots (4); more of them than announced, or another largest number "
+    "than 2^c - 1, is refused with 3.",
+)
+def reading_several(bench: Bench) -> None:
+    channels = at_once(bench)
+    bench.upload(bench.layout())
+    bench.refused(STATE, Opcode.READ_COUNTS, pack_read_counts(3, 2), "two detectors and fixed patterns")
+    bench.upload(bench.layout(adaptive=SLOTS))
+    for largest, several in ((2, 2), (7, 2), (1, 1), (3, channels + 1), ((2 << channels) - 1, channels + 1)):
+        what = f"READ_COUNTS of {several} detectors up to {largest}"
+        bench.refused(RANGE, Opcode.READ_COUNTS, pack_read_counts(largest, several), what)
+    bench.done(Opcode.READ_COUNTS, pack_read_counts(3, 2))
+
+
+@rule(
+    "14.4",
+    "A state of several detectors names the first of as many patterns, all in the plan (3); each word of clicks leads to the stamped "
+    "successor.",
+)
+def follows_words(bench: Bench) -> None:
+    at_once(bench)
+    found, layout = following(bench), bench.layout(adaptive=SLOTS)
+    automaton = four_counted(found.dwell_steps, 3)
+    bench.upload(layout)
+    bench.done(Opcode.READ_COUNTS, pack_read_counts(3, 2))
+    bench.refused(RANGE, Opcode.LOAD_COUNT_STATES, pack_count_states(automaton), "a second pattern that is not there")
+    automaton.states["pattern"] = 0
+    bench.done(Opcode.LOAD_COUNT_STATES, pack_count_states(automaton))
+    bench.grant()
+    bench.arm(CYCLES)
+    bench.closing(layout, CYCLES)
+    follow(bench, layout, automaton)

@@ -1,5 +1,7 @@
 """What a detector that counts photons reads: under fixed patterns, states that the host names, and a walk that the device follows.
 
+Also the clicks of several detectors that are read at once as a number: bit k is that of detector k, which sees pattern k of a state.
+
 Owns the way from light to a number: Poisson photoelectrons by inversion, Gaussian read noise, edges. It draws what happens and never asks
 the host's law of counts (runtime/instrument/count_law.py) for a probability, so that each is a test of the other; that law is used for what
 MARK expects alone. The number drawn depends on seed and exposure only: both ways of driving give the same numbers for the same patterns.
@@ -15,12 +17,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
-from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, mix
-from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, stream_key
+from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, click_thresholds, mix
+from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, first_click_probability, stream_key
 from pans.runtime.instrument.count_law import count_chances, counting
 from pans.runtime.wire.inner import inner
 from pans.runtime.wire.messages import DARK_PATTERN
 
+from . import walk_kernels
 from .states import ShowList
 from .walking import Followed, Walked
 
@@ -147,8 +150,12 @@ def expected_light(chances, light, successors):  # type: ignore[no-untyped-def]
     return total
 
 
-def warm_up() -> None:
-    """Compile or load the loops: ARM must not wait for a compiler."""
+def warm_up(channels: int = 0) -> None:
+    """Compile or load the loops, those of several `channels` where they are: ARM must not wait for a compiler."""
+    if channels:
+        walk_kernels.warm_up_words(channels)
+        expected_light(np.zeros((3, 1)), np.zeros(1), np.ones((1, 3), np.int64))
+        return
     reader = Reader(np.zeros(2), np.array([0.5, 1.5]), np.zeros(5, np.uint64))
     numbers, successors = np.zeros((1, 1), np.uint8)[:, 0], np.ones((1, 3), np.int64)
     read_each(0, np.zeros(1), np.zeros((1, N_CONDITIONS)), reader, numbers)
@@ -275,12 +282,99 @@ class CountedWalk(Followed):
             counted.reader, stamps, readings[:, 0],
         )  # fmt: skip
 
-    def _expose(self, exposure: int, light: float, before: U8) -> U8:
+    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
         number = np.zeros((1, 1), np.uint8)
-        self._counted.read(exposure, np.array([light]), number)
+        self._counted.read(exposure, np.array([self._light_now(exposure, lit)]), number)
         return number[0]
 
     def _walk_light(self, light: F64) -> float:
         return float(
             expected_light(_chances(self._walked.model, self.largest + 1, light), light, self._states.successors)
         )
+
+
+class _AtOnce:
+    """What exposures of several detectors share: the light of their patterns, and their clicks as a number."""
+
+    def __init__(self, walked: Walked, channels: int) -> None:
+        self._walked, self.places = walked, np.arange(channels)
+
+    def light(self, exposure: int, pattern: int, share: float) -> F64:
+        """Photoelectrons, float64 (channels,), of an exposure that shows `pattern` and those after it."""
+        return np.asarray(self._walked.light.of(self._walked.object_of(exposure))[pattern + self.places] * share)
+
+    def click(self, exposure: int, light: F64, before: U8) -> U8:
+        """Draw one exposure, uint8 (1,), as `before` of the exposure before."""
+        clicks = self._walked.click(exposure, light, (before[0] >> self.places & 1).astype(np.uint8))
+        return np.array([int(clicks.astype(np.int64) @ (1 << self.places))], np.uint8)
+
+
+class ShowsAtOnce:
+    """The exposures of several detectors that the host names one by one; one without a name is dark."""
+
+    ahead = 0
+
+    def __init__(self, walked: Walked, shows: ShowList, channels: int) -> None:
+        self._at_once, self._shows, self.largest = _AtOnce(walked, channels), shows, (1 << channels) - 1
+
+    def prepare(self, exposure: int) -> bool:
+        """Nothing: what is shown is not known."""
+        return False
+
+    def expected_photoelectrons(self, number: int) -> float:
+        """Not known: only the host knows the automaton."""
+        return math.nan
+
+    def exposures(self, first: int, count: int, before: U8) -> tuple[U16, U8]:
+        """See `SlotSource`."""
+        stamps, numbers = np.full(count, DARK_PATTERN, np.uint16), np.zeros((count, 1), np.uint8)
+        for place, exposure in enumerate(range(first, first + count)):
+            shown, light = self._shows.take(exposure), np.zeros(len(self._at_once.places))
+            if shown is not None:
+                stamps[place] = shown.state
+                light = self._at_once.light(exposure, shown.pattern, shown.light)
+            numbers[place] = before = self._at_once.click(exposure, light, before)
+        return stamps, numbers
+
+
+class WalkAtOnce(Followed):
+    """The clicks of several detectors under an automaton that the device follows."""
+
+    def __init__(self, walked: Walked, states: States, channels: int) -> None:
+        super().__init__(walked, states, at_once=not (walked.changing or walked.model.afterpulse_probability))
+        self._channels, self._draws, self.largest = channels, _AtOnce(walked, channels), (1 << channels) - 1
+        self._kept: tuple[int, NDArray[np.uint64]] | None = None  # thresholds of the object before the detectors
+
+    def prepare(self, exposure: int) -> bool:
+        """Nothing: a walk needs no more than the light of its states."""
+        return False
+
+    def _light(self, number: int) -> F64:
+        """Photoelectrons of an exposure in each state, float64 (states, channels)."""
+        rows = self._states.pattern[:, None] + self._draws.places
+        return np.asarray(self._walked.light.of(number)[rows] * self._states.light[:, None])
+
+    def _at_once(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
+        walked = self._walked
+        number = walked.object_of(first)
+        if self._kept is None or self._kept[0] != number:
+            light = np.concatenate([self._light(number), np.zeros((1, self._channels))])
+            self._kept = number, click_thresholds(first_click_probability(walked.model, light))
+        self._state = walk_kernels.follow_words(
+            self._kept[1], self._states.successors, self._adaptive[slot : slot + len(stamps)],
+            walk_kernels.key_of(walked.seed), walked.first_draw + first, self._state, stamps, readings[:, 0],
+        )  # fmt: skip
+
+    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
+        light = np.zeros(self._channels)
+        if lit:
+            state = self._state
+            light = self._draws.light(exposure, int(self._states.pattern[state]), float(self._states.light[state]))
+        return self._draws.click(exposure, light, before)
+
+    def _walk_light(self, light: F64) -> float:
+        click = first_click_probability(self._walked.model, light)
+        chances = np.ones((1, len(click)))
+        for of_channel in click.T:
+            chances = np.concatenate([chances * (1.0 - of_channel), chances * of_channel])
+        return float(expected_light(chances, light.sum(axis=1), self._states.successors))

@@ -43,7 +43,8 @@ def facts_of(view: View, extension: Extension | None, number_max: int, now: Now)
     projector = profile.projector
     passive = {} if optics is None else {"optics_sha256": optics.fingerprint}
     automata = {} if extension is None else announcement(extension)
-    counts = count_announcement(number_max) if number_max > 1 else {}
+    at_once = profile.detector.channels if extension is not None else 1
+    counts = count_announcement(number_max, at_once)
     return (
         passive
         | _table_facts(scene)

@@ -21,7 +21,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire import messages as wire
 from pans.runtime.wire.automata import Extension, unpack_masks, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, unpack_arm, unpack_gate, unpack_pattern, unpack_plan
-from pans.runtime.wire.counts import unpack_count_states, unpack_read_counts
+from pans.runtime.wire.counts import ReadCounts, unpack_count_states, unpack_read_counts
 from pans.runtime.wire.messages import AckStatus, DeviceState, Frame, MessageType, Opcode, StateReason
 
 from .clock import BUFFER_MESSAGES
@@ -86,6 +86,7 @@ class Instrument:
         )  # what the clicks choose must be shown one after another
         self.extension = Extension(projector.automaton_states, projector.dwell_steps) if automata else None
         self.number_max = largest_number(profile) if automata else 1  # of a detector that counts photons
+        self.channels_max = profile.detector.channels if automata else 1  # detectors that are read at once
         self.stream = StreamBuffer(buffer_messages)
         self._out: list[bytes | memoryview] = []
         self._forget_session()
@@ -96,7 +97,7 @@ class Instrument:
         self._patterns = PatternMemory(projector.pattern_memory, pixels, projector.levels)
         self._plan = PlanMemory(self.profile, adaptive=self.extension is not None)
         turn_ticks = math.ceil(self.profile.timing.device_turn_us * self._tick_hz / 1e6)
-        self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks, self.number_max)
+        self._states = StateMemory(self.extension or Extension(0, 1), turn_ticks, self.number_max, self.channels_max)
         self._shows: ShowList | None = None  # of a run that the host drives
         self._light: tuple[tuple[int, int, int, bool, bytes], Table | PatternLight] | None = None
         self._ack = wire.Ack(0, 0, AckStatus.DONE, "")
@@ -287,7 +288,7 @@ class Instrument:
             self._patterns.load(unpack_pattern(body))
         elif opcode in (Opcode.LOAD_MASKS, Opcode.LOAD_STATES, Opcode.SHOW) and self.extension is not None:
             self._automaton(Opcode(opcode), body)
-        elif opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES) and self.number_max > 1:
+        elif opcode in (Opcode.READ_COUNTS, Opcode.LOAD_COUNT_STATES) and max(self.number_max, self.channels_max) > 1:
             self._counts(Opcode(opcode), body)
         elif opcode == Opcode.LOAD_PLAN:
             self._require_idle("LOAD_PLAN")
@@ -339,8 +340,9 @@ class Instrument:
         if opcode == Opcode.LOAD_COUNT_STATES:
             self._states.load(piece_of(unpack_count_states(body)), program)
             return
-        self._states.read_counts(unpack_read_counts(body), program)
-        counting.warm_up()
+        asked = unpack_read_counts(body)
+        self._states.read_counts(asked, program)
+        counting.warm_up(asked.channels)
         if program is not None:
             with suppress(Refused):  # ARM says what is wrong
                 self._light_table(program)
@@ -357,10 +359,11 @@ class Instrument:
         check_arm(program, arm, self._tick, self._tick_hz)
         if self._states.begun:
             raise Refused(AckStatus.WRONG_STATE, "some states of the automaton have not come")
-        shows = ShowList(self._states.extension) if program.adaptive and self._states.states is None else None
-        drive = self._states.states if shows is None else shows
-        largest = self._states.largest
-        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive, largest)
+        states = self._states
+        shows = ShowList(states.extension, states.channels) if program.adaptive and states.states is None else None
+        drive = states.states if shows is None else shows
+        reading = ReadCounts(states.largest, states.channels)
+        self._run = self.view.run(program, arm, self._light_table(program), self._draws, drive, reading)
         self._shows = shows
         self.stream.restart()
         self._exposures_ended = 0

@@ -1,6 +1,6 @@
 """The automaton that the host has uploaded, and the states that the host names one by one.
 
-Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), of READ_COUNTS and LOAD_COUNT_STATES (section 13), with
+Owns the checks of LOAD_STATES and SHOW (docs/reference/protocol.md, section 11), of READ_COUNTS and LOAD_COUNT_STATES (13 and 14), with
 every limit checked before anything is stored; never draws a click. A command that makes no sense raises `Refused` and leaves what is
 stored as it was.
 """
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pans.firmware_sim.program import Program, States
 from pans.runtime.wire.automata import Extension, Show, StateChunk
-from pans.runtime.wire.counts import EXPOSURE_BYTES, CountStateChunk
+from pans.runtime.wire.counts import EXPOSURE_BYTES, CountStateChunk, ReadCounts
 from pans.runtime.wire.fields import MAX_LEAVES, MAX_STATES
 from pans.runtime.wire.messages import ADAPTIVE_PATTERN, BLOCK_HEADER_BYTES, MAX_PAYLOAD_BYTES, AckStatus
 
@@ -59,15 +59,17 @@ class StateMemory:
     extension: Extension
     turn_ticks: int = 0  # from the end of an exposure until the projector shows what its click chose
     number_max: int = 1  # the largest photon number that the detector tells
+    channels_max: int = 1  # detectors that are read at once
     states: States | None = None
     largest: int = 1  # number that the runs of this plan read; 1: clicks
+    channels: int = 1  # whose clicks that number is
     _head: StatePiece | None = None
     _pieces: list[StatePiece] = field(default_factory=list)
     _filled: int = 0
 
     def forget(self) -> None:
         """Begin without states and with clicks: another plan comes."""
-        self.largest = 1
+        self.largest = self.channels = 1
         self._forget_states()
 
     def _forget_states(self) -> None:
@@ -78,16 +80,29 @@ class StateMemory:
         """Whether some states have come, but not all."""
         return self._head is not None and self.states is None
 
-    def read_counts(self, largest: int, program: Program | None) -> None:
-        """Read photon numbers up to `largest` in the runs of the loaded plan, or raise `Refused`; states have to come again."""
+    def read_counts(self, asked: ReadCounts, program: Program | None) -> None:
+        """Read the numbers that are asked for in the runs of the loaded plan, or raise `Refused`; states have to come again."""
         if program is None:
             raise Refused(AckStatus.WRONG_STATE, "READ_COUNTS needs a complete plan")
-        _require(2 <= largest <= self.number_max, lambda: f"numbers up to {largest}: allowed 2..{self.number_max}")
+        largest, channels = asked
+        if channels:
+            self._check_channels(asked, program)
+        else:
+            _require(2 <= largest <= self.number_max, lambda: f"numbers up to {largest}: allowed 2..{self.number_max}")
         exposures = max(count for _, count in program.blocks)
         longest = (MAX_PAYLOAD_BYTES - BLOCK_HEADER_BYTES) // EXPOSURE_BYTES
         _require(exposures <= longest, lambda: f"blocks of {exposures} exposures: COUNTS holds {longest}")
         self._forget_states()
-        self.largest = largest
+        self.largest, self.channels = largest, channels or 1
+
+    def _check_channels(self, asked: ReadCounts, program: Program) -> None:
+        largest, channels = asked
+        fits = 2 <= channels <= self.channels_max
+        _require(fits, lambda: f"{channels} detectors at once: the device reads {self.channels_max}")
+        wanted = (1 << channels) - 1
+        _require(largest == wanted, lambda: f"numbers up to {largest} of {channels} detectors: allowed {wanted}")
+        if not program.adaptive:
+            raise Refused(AckStatus.WRONG_STATE, "several detectors at once need a plan with adaptive slots")
 
     def load(self, piece: StatePiece, program: Program | None) -> None:
         """Store one piece, or raise `Refused`; the last one checks the whole."""
@@ -102,7 +117,7 @@ class StateMemory:
             raise Refused(AckStatus.OUT_OF_RANGE, f"state {first} continues no states of this header")
         if first not in (0, self._filled):
             raise Refused(AckStatus.OUT_OF_RANGE, f"state {first} does not continue the states at {self._filled}")
-        _check_states(piece, program.n_patterns)
+        _check_states(piece, program.n_patterns - (self.channels - 1))
         if first == 0:
             self._forget_states()
             self._head = piece
@@ -186,16 +201,15 @@ class Shown(NamedTuple):
 class ShowList:
     """What the host has named for exposures of a run that have not begun."""
 
-    def __init__(self, extension: Extension) -> None:
-        self._extension = extension
+    def __init__(self, extension: Extension, channels: int = 1) -> None:
+        self._extension, self._channels = extension, channels
         self._shown: dict[int, Shown] = {}
         self.late = 0
 
     def put(self, show: Show, program: Program, begun: int, n_exposures: int | None) -> None:
         """Take a SHOW; `begun` exposures have begun, the run has `n_exposures` (None: no end). `Refused` leaves the list as it was."""
-        _require(
-            show.pattern < program.n_patterns, lambda: f"pattern {show.pattern}: the plan has {program.n_patterns}"
-        )
+        last = show.pattern + self._channels - 1
+        _require(last < program.n_patterns, lambda: f"pattern {last}: the plan has {program.n_patterns}")
         _check_steps(show.dwell_steps, self._extension)
         _require(1 <= show.dwell <= show.dwell_steps, lambda: f"dwell {show.dwell}: allowed 1..{show.dwell_steps}")
         _require(show.state < MAX_STATES, lambda: f"state {show.state}: allowed 0..{MAX_STATES - 1}")

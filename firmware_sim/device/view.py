@@ -26,6 +26,7 @@ from pans.runtime.bundle.optics import Analyser
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.commands import PARALLEL, Arm
+from pans.runtime.wire.counts import ReadCounts
 from pans.runtime.wire.messages import AckStatus
 
 from .bleached import bleached_photoelectrons
@@ -35,8 +36,11 @@ from .upload import Refused
 from .walking import PatternLight, PlanSource, ShownSource, Walked, WalkSource
 
 if TYPE_CHECKING:
-    from .counting import CountedPlan, CountedShows, CountedWalk
+    from .counting import CountedPlan, CountedShows, CountedWalk, ShowsAtOnce, WalkAtOnce
     from .parallel import FrameRun
+
+
+CLICKS = ReadCounts(1, 1)  # of one detector
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,14 +138,14 @@ class View:
         table: Table | PatternLight,
         first_draw: int = 0,
         drive: States | ShowList | None = None,
-        largest: int = 1,
+        reading: ReadCounts = CLICKS,
     ) -> Measurement | FrameRun:
         """Return the run that ARM starts: pattern after pattern, or of all channels at once; `drive` chooses patterns by the clicks.
 
-        With `largest` above 1 every exposure is a photon number up to it.
+        `reading` says what number every exposure is.
         """
         if isinstance(table, PatternLight):
-            return self._one_by_one(program, arm, table, first_draw, drive, largest)
+            return self._one_by_one(program, arm, table, first_draw, drive, reading)
         light, source = self.light_and_clicks(program, arm.n_cycles, table, first_draw)
         if isinstance(light, StillObjects) and program.mode != PARALLEL:
             return Measurement(program, arm, light, PlanSource(program, source))
@@ -156,16 +160,19 @@ class View:
         light: PatternLight,
         first_draw: int,
         drive: States | ShowList | None,
-        largest: int,
+        reading: ReadCounts,
     ) -> Measurement:
         scene = self.scene.what
         assert isinstance(scene, Scene)
+        if reading.channels > 1 and self.bleaches:
+            raise Refused(AckStatus.OUT_OF_RANGE, "bleaching under several patterns at once is not simulated")
         exposures = Exposures(program, arm.n_cycles or None, self.profile.clock.tick_hz)
-        changes = Changes(self.scene.changes, program.channels)
+        changes = Changes(self.scene.changes, reading.channels)
         model = detector_model(self.profile, self.exposure_us(program))
         facts = (scene.n_objects, exposures, changes, model, self.seed, first_draw)
-        walked = Walked(program, light, *facts, light.fresh_sample())
-        source = _counting_source(walked, drive, largest) if largest > 1 else _clicking_source(walked, drive)
+        walked = Walked(program, light, *facts, light.fresh_sample(), np.zeros(reading.channels))
+        counts = reading.largest > 1
+        source = _counting_source(walked, drive, reading) if counts else _clicking_source(walked, drive)
         return Measurement(
             program, arm, StillMarks(scene, program, exposures, changes, source.expected_photoelectrons), source
         )
@@ -177,10 +184,16 @@ def _clicking_source(walked: Walked, drive: States | ShowList | None) -> ShownSo
 
 
 def _counting_source(
-    walked: Walked, drive: States | ShowList | None, largest: int
-) -> CountedPlan | CountedShows | CountedWalk:
-    from .counting import CountedPlan, CountedShows, CountedWalk  # numba is loaded only by who counts
+    walked: Walked, drive: States | ShowList | None, reading: ReadCounts
+) -> CountedPlan | CountedShows | CountedWalk | ShowsAtOnce | WalkAtOnce:
+    from .counting import CountedPlan, CountedShows, CountedWalk, ShowsAtOnce, WalkAtOnce  # numba: only for who counts
 
+    largest, channels = reading
+    if channels > 1:
+        assert drive is not None
+        if isinstance(drive, ShowList):
+            return ShowsAtOnce(walked, drive, channels)
+        return WalkAtOnce(walked, drive, channels)
     if drive is None:
         return CountedPlan(walked, largest)
     return CountedShows(walked, drive, largest) if isinstance(drive, ShowList) else CountedWalk(walked, drive)

@@ -39,6 +39,28 @@ def follow(limits, successors, adaptive, key, first, begin, stamps, clicks):  # 
 
 
 @njit(cache=True, nogil=True)
+def follow_words(limits, successors, adaptive, key, first, node, stamps, words):  # type: ignore[no-untyped-def]
+    """As `follow`, of several detectors that are read at once; a word's bit k is the click of detector k.
+
+    limits uint64 (states + 1, channels): what a number must be below to click; successors int64 (states, 2**channels).
+    """
+    n_states = successors.shape[0]
+    for i in range(stamps.shape[0]):
+        lit = adaptive[i] and node < n_states
+        row = node if lit else n_states
+        drawn = mix(_U(first + i) * GOLDEN_WORD + key)
+        word = 0
+        for channel in range(limits.shape[1]):
+            if mix(drawn + _U(channel + 1) * STEP_WORD) >> SHIFT_11 < limits[row, channel]:
+                word |= 1 << channel
+        words[i] = word
+        stamps[i] = node if lit else DARK_PATTERN
+        if lit:
+            node = successors[node, word]
+    return node
+
+
+@njit(cache=True, nogil=True)
 def expected_light(probability, light, successors):  # type: ignore[no-untyped-def]
     """The light of a walk in expectation, the exposure before it without a click.
 
@@ -99,3 +121,10 @@ def warm_up() -> None:
         np.zeros((1, 1), np.uint8)[:, 0],
     )
     expected_light(np.zeros((2, 1)), np.zeros(1), successors)
+
+
+def warm_up_words(channels: int) -> None:
+    """Compile or load the loop of several detectors."""
+    limits, successors = np.zeros((2, channels), np.uint64), np.ones((1, 1 << channels), np.int64)
+    no_slots = np.zeros(0, np.bool_), np.zeros(0, np.uint16), np.zeros((0, 1), np.uint8)[:, 0]
+    follow_words(limits, successors, no_slots[0], _U(0), 0, 0, no_slots[1], no_slots[2])

@@ -141,9 +141,12 @@ class Walked:
         cycle = exposure // self.program.n_slots
         return cycle // self.program.cycles_per_object % NO_OBJECT % self.n_objects
 
-    def click(self, exposure: int, photoelectrons: float, before: U8) -> U8:
-        """Draw one exposure with `photoelectrons` expected: uint8 (1,), as `before` of the exposure before."""
-        light = np.array([[photoelectrons]])
+    def click(self, exposure: int, photoelectrons: float | F64, before: U8) -> U8:
+        """Draw one exposure with `photoelectrons` expected: uint8 (1,), as `before` of the exposure before.
+
+        Of several detectors that are read at once float64 (channels,), and uint8 (channels,).
+        """
+        light = np.atleast_1d(np.asarray(photoelectrons, np.float64))[None, :]
         if self.changes:
             seconds = self.exposures.seconds(self.exposures.begins(exposure, 1))
             probability = self.changes.probability(
@@ -225,13 +228,10 @@ class Followed(ABC):
 
     def _one_by_one(self, first: int, slot: int, stamps: U16, readings: U8, before: U8) -> None:
         """Follow the walk where the detector changes with time, or the object with its dose."""
-        walked, states = self._walked, self._states
+        states = self._states
         for place, adaptive in enumerate(self._adaptive[slot : slot + len(stamps)].tolist()):
-            light, lit = 0.0, adaptive and self._state < len(states.pattern)
-            if lit:
-                pattern, share = int(states.pattern[self._state]), float(states.light[self._state])
-                light = walked.photoelectrons(first + place, pattern, share)
-            readings[place] = before = self._expose(first + place, light, before)
+            lit = adaptive and self._state < len(states.pattern)
+            readings[place] = before = self._expose(first + place, lit, before)
             if lit:
                 stamps[place] = self._state
                 self._state = int(states.successors[self._state, before[0]])
@@ -241,8 +241,15 @@ class Followed(ABC):
         """Follow the walk through exposures of one cycle in a compiled loop; stamps (n,) and readings (n, 1) are set."""
 
     @abstractmethod
-    def _expose(self, exposure: int, light: float, before: U8) -> U8:
-        """Draw one exposure with `light` photoelectrons expected, uint8 (1,), as `before` of the exposure before."""
+    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
+        """Draw one exposure, of the present state or in the dark, uint8 (1,), as `before` of the exposure before."""
+
+    def _light_now(self, exposure: int, lit: bool) -> float:
+        """The photoelectrons expected of an exposure, of the present state or in the dark."""
+        if not lit:
+            return 0.0
+        pattern, share = int(self._states.pattern[self._state]), float(self._states.light[self._state])
+        return self._walked.photoelectrons(exposure, pattern, share)
 
     @abstractmethod
     def _walk_light(self, light: F64) -> float:
@@ -281,8 +288,8 @@ class WalkSource(Followed):
             walk_kernels.key_of(walked.seed), walked.first_draw + first, (self._state, int(before[0])), stamps, readings[:, 0],
         )  # fmt: skip
 
-    def _expose(self, exposure: int, light: float, before: U8) -> U8:
-        return self._walked.click(exposure, light, before)
+    def _expose(self, exposure: int, lit: bool, before: U8) -> U8:
+        return self._walked.click(exposure, self._light_now(exposure, lit), before)
 
     def _walk_light(self, light: F64) -> float:
         from . import walk_kernels

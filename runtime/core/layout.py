@@ -49,7 +49,12 @@ class Plan:
         None  # what chooses the patterns of adaptive slots, ADAPTIVE_PATTERN in `slot_pattern`
     )
     drive: str = ""  # of an automaton: "device" if the device follows it, "host" if the host names each state
-    largest: int = 1  # the largest number that an exposure can have: 1 of clicks
+    largest: int = 1  # the largest number that an exposure can have: 1 of the clicks of one detector
+
+    @property
+    def channels_at_once(self) -> int:
+        """Detectors that each exposure of a walk reads; their clicks are the bits of its number. 1 of fixed patterns."""
+        return 1 if self.automaton is None else self.automaton.channels
 
     @property
     def slots_per_cycle(self) -> int:

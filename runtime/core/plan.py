@@ -264,18 +264,18 @@ def _walks(
     check_slots(len(slots), "fewer dark slots")
     block = 1 if drive == "host" else block_exposures(len(slots), period, ticks, MAX_BLOCK_EXPOSURES)
     plan = lay_out(profile, len(bundle.pattern_levels), _single_shots(slots, period, walks, block), ticks)
-    return replace(plan, automaton=automaton, drive=drive, largest=automaton.largest)
+    return replace(plan, automaton=automaton, drive=drive, largest=automaton.n_outcomes - 1)
 
 
 def _checked_drive(profile: Profile, automaton: Automaton, drive: str) -> str:
     """Return "device" or "host", whichever is asked for and possible; PlanError says what is not, in numbers."""
     if automaton.counts:
         demand_counting(profile, automaton.n_outcomes, "the automaton")
-    if profile.mode != "sequential" or automaton.channels != 1:
+    if profile.mode != "sequential" or automaton.channels > profile.detector.channels:
         raise PlanError(
-            f"the automaton reads {automaton.channels} detectors at once, {profile.name} measures in {profile.mode} mode; "
-            "a run takes one detector, pattern after pattern",
-            remedy="choose a sequential profile and an automaton of one channel",
+            f"the automaton reads {automaton.channels} detectors at once, {profile.name} measures in {profile.mode} mode and has "
+            f"{profile.detector.channels}; a walk shows pattern after pattern",
+            remedy="choose a sequential profile with as many detectors (detector.channels), or train with fewer --channels",
         )
     steps, can = automaton.dwell_steps, profile.projector.dwell_steps
     if can % steps:

@@ -15,6 +15,7 @@ from pans.runtime.wire.automata import STATES_PER_COMMAND, StateChunk, pack_stat
 from pans.runtime.wire.commands import MAX_SLOTS_PER_CHUNK, MODES, PlanChunk, pack_plan
 from pans.runtime.wire.counts import (
     CountStateChunk,
+    ReadCounts,
     count_state_chunks,
     pack_count_states,
     pack_read_counts,
@@ -61,13 +62,18 @@ def plan_commands(plan: Plan) -> list[tuple[Opcode, bytes]]:
     """Return the commands that bring `plan` to a device: its slots, what is read in an exposure, and the states that the device follows."""
     commands = [(Opcode.LOAD_PLAN, pack_plan(chunk)) for chunk in plan_chunks(plan)]
     if plan.largest > 1:
-        commands.append((Opcode.READ_COUNTS, pack_read_counts(plan.largest)))
+        commands.append((Opcode.READ_COUNTS, pack_read_counts(*reading_of(plan))))
     for chunk in state_chunks(plan):
         if isinstance(chunk, CountStateChunk):
             commands.append((Opcode.LOAD_COUNT_STATES, pack_count_states(chunk)))
         else:
             commands.append((Opcode.LOAD_STATES, pack_states(chunk)))
     return commands
+
+
+def reading_of(plan: Plan) -> ReadCounts:
+    """Return what READ_COUNTS asks a device for, of a plan that reads numbers."""
+    return ReadCounts(plan.largest, plan.channels_at_once if plan.channels_at_once > 1 else 0)
 
 
 def state_chunks(plan: Plan) -> Sequence[StateChunk | CountStateChunk]:
@@ -78,7 +84,7 @@ def state_chunks(plan: Plan) -> Sequence[StateChunk | CountStateChunk]:
 def _chunks_of(automaton: Automaton) -> Sequence[StateChunk | CountStateChunk]:
     states = np.zeros(automaton.n_states, _dtype_of(automaton))
     states["pattern"], states["dwell"] = automaton.pattern, automaton.dwell
-    if automaton.counts:
+    if automaton.n_outcomes > 2:
         states["next"] = automaton.successors
         facts = automaton.n_states, automaton.dwell_steps, automaton.n_outcomes, automaton.n_leaves
         return count_state_chunks(facts, states)
@@ -89,7 +95,7 @@ def _chunks_of(automaton: Automaton) -> Sequence[StateChunk | CountStateChunk]:
 
 
 def _dtype_of(automaton: Automaton) -> np.dtype[Any]:
-    return state_dtype(automaton.n_outcomes) if automaton.counts else STATE_DTYPE
+    return state_dtype(automaton.n_outcomes) if automaton.n_outcomes > 2 else STATE_DTYPE
 
 
 def upload_bytes(plan: Plan, bundle: Bundle) -> int:
@@ -173,7 +179,7 @@ def plan_from_chunks(
         exposure_us=head.exposure_ticks * 1e6 / tick_hz,
         automaton=automaton,
         drive="" if automaton is None else "device" if states else "host",
-        largest=largest if automaton is None else automaton.largest,
+        largest=largest if automaton is None else automaton.n_outcomes - 1,
     )
 
 

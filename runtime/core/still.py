@@ -69,7 +69,7 @@ class Core(Follower):
 
     @property
     def counts_photons(self) -> bool:
-        """Whether exposures are photon numbers."""
+        """Whether exposures are numbers: of photons, or of the clicks of several detectors."""
         return self._plan.largest > 1
 
     @property

@@ -36,8 +36,8 @@ class Window(NamedTuple):
     """One object's K shots: `counts` int64 (d_f,) clicks per pattern, a view that is valid until the next `push`.
 
     `first_shot` counts within the visit. `missing` exposures never came, `wrong` ones showed another pattern than planned: with
-    either above 0 no decision may be made from it. Of a walk: `counts` are the clicks per slot, `exposures` how many it took (0 where
-    the patterns are fixed), and of the exposures that may be `missing` nobody knows how many the walk would have had.
+    either above 0 no decision may be made from it. Of a walk: `counts` are the clicks per slot and channel, `exposures` how many it
+    took (0 where the patterns are fixed), and of the exposures that may be `missing` nobody knows how many the walk would have had.
     """
 
     object_index: int
@@ -67,8 +67,12 @@ class DecisionWindows:
         if self.visit_exposures > MAX_VISIT_EXPOSURES:
             raise PlanError(f"an object takes {self.visit_exposures} exposures, allowed {MAX_VISIT_EXPOSURES}")
         self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
+        self._channels = (
+            plan.channels_at_once
+        )  # of several the clicks of a slot are one number until its window is settled
+        n_features //= self._channels
         self._counts: I64 = np.zeros((self.n_windows, n_features), np.int64)
-        self._out: I64 = np.zeros_like(self._counts)
+        self._out: I64 = np.zeros((self.n_windows, n_features * self._channels), np.int64)
         self._seen: I64 = np.zeros((self.n_windows, 2), np.int64)
         self._feature_at, self._window_at = _visit_maps(plan, shots)
         self._last = _last_exposures(self._window_at, self.n_windows, self.visit_exposures)
@@ -149,12 +153,18 @@ class DecisionWindows:
         return state if known else -1
 
     def latest(self) -> tuple[list[int], int] | None:
-        """Return the clicks of the window of this visit that was settled last, and its exposures with light; None before the first.
+        """Return the clicks of the window of this visit that was settled last (of several channels the numbers), and its exposures with
+        light; None before the first.
 
         For a view beside the loop: it may be read in another thread, and is then of one moment or the next.
         """
         at = self._next_window - 1
         return None if at < 0 else (self._counts[at].tolist(), int(self._seen[at, 0]))
+
+    def _clicks(self, window: int) -> I64:
+        """The counts of a window as they are decided on: of several channels bit t * channels + k is the click of channel k in slot t."""
+        counts = self._counts[window]
+        return counts if self._channels == 1 else (counts[:, None] >> np.arange(self._channels) & 1).reshape(-1)
 
     @property
     def half_seen(self) -> bool:
@@ -208,7 +218,7 @@ class DecisionWindows:
             need = int(self._need[index])
             if right < need and self._last[index] >= relative_end:
                 break
-            self._out[index] = self._counts[index]
+            self._out[index] = self._clicks(index)
             last = self._visit * self.visit_exposures + int(self._last[index])
             exposures = right if self._adaptive else 0
             settled.append(
@@ -233,13 +243,13 @@ def _make_walks(plan: Plan, n_features: int, shots: int, last: I64) -> Walks:
         none = read_only(np.zeros((0, 2), np.uint32)), np.zeros(0, np.int64)
         return Walks(*none, np.full(len(last), shots * n_features, np.int64), last, np.zeros(0, np.int64))
     slots = int(np.count_nonzero(plan.slot_pattern == ADAPTIVE_PATTERN))
-    if shots != 1 or automaton.channels != 1:
+    if shots != 1:
         raise PlanError(
-            f"{shots} walks that read {automaton.channels} detectors at once make one decision; allowed: 1 of 1",
+            f"{shots} walks make one decision; allowed: 1",
             remedy="one walk is one decision: --shots 1, and --trials N for more of them",
         )
     if not automaton.n_slots <= slots <= n_features:
-        raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for clicks of {n_features}")
+        raise PlanError(f"walks of {automaton.n_slots} exposures in cycles of {slots} for numbers of {n_features}")
     nodes, shown = np.zeros(len(last), np.int64), np.zeros(automaton.n_states, np.int64)
     return Walks(read_only(automaton.successors), nodes, np.full(len(last), slots, np.int64), last, shown)
 

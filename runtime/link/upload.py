@@ -15,7 +15,7 @@ from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import DeviceError
 from pans.runtime.wire.automata import announced, mask_chunks, pack_masks
 from pans.runtime.wire.commands import MAX_PIXELS_PER_CHUNK, PatternChunk, pack_pattern
-from pans.runtime.wire.counts import announced_counts
+from pans.runtime.wire.counts import announced_channels, announced_counts
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.schema import AUTOMATON_SCHEMA, COUNT_SCHEMA
 
@@ -61,6 +61,9 @@ def check_automaton(facts: Mapping[str, Any], plan: Plan) -> None:
 def _check_counts(facts: Mapping[str, Any], plan: Plan) -> None:
     """Raise DeviceError when the device cannot tell the photon numbers that the plan's automaton asks for."""
     told = announced_counts(facts)
+    if plan.channels_at_once > 1:
+        _check_channels(facts, plan.channels_at_once)
+        return
     if plan.largest <= told:
         return
     found = facts.get("count_schema")
@@ -75,3 +78,14 @@ def _check_counts(facts: Mapping[str, Any], plan: Plan) -> None:
         f"the device announces {what}",
         remedy="use a device that counts (docs/reference/protocol.md, section 13), or train with --outcomes 2",
     )
+
+
+def _check_channels(facts: Mapping[str, Any], wanted: int) -> None:
+    """Raise DeviceError when the device does not read `wanted` detectors at once."""
+    told = announced_channels(facts)
+    if told < wanted:
+        raise DeviceError(
+            f"the device reads {told} detector(s) at once, needed {wanted}: it has fewer, or its firmware is older or newer than this "
+            "runtime",
+            remedy="use a device that announces them (docs/reference/protocol.md, section 14), or train with fewer --channels",
+        )

@@ -96,6 +96,9 @@ class DarkRun:
             expected = np.where(
                 few, np.clip(said, low, high), expected
             )  # hardly measured: the profile's, as far as possible
+        expected, low, high = (
+            1 - (1 - rate) ** plan.channels_at_once for rate in (expected, low, high)
+        )  # any of them clicks
         per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,

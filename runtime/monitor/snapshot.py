@@ -128,13 +128,17 @@ class Snapshots:
             shown = list(range(min(len(clicks), PIXELS_MAX)))
             clicks = clicks[: len(shown)]
         else:
-            shown, node, clicks = [], 0, [int(click > 0) for click in clicks[:exposures]]
-            for click in clicks:
+            shown, node, words = [], 0, clicks[:exposures]
+            for word in words:
                 if not 0 <= node < automaton.n_states:
                     break
-                shown.append(int(automaton.pattern[node]))
-                node = int(automaton.successors[node, click])
-            clicks = clicks[: len(shown)]
+                shown += automaton.rows[node].tolist()
+                node = int(automaton.successors[node, word])
+            several = automaton.channels > 1
+            bits = (
+                [word >> channel & 1 for word in words for channel in range(automaton.channels)] if several else words
+            )
+            clicks = [int(bit > 0) for bit in bits[: len(shown)]]
         new = [number for number in dict.fromkeys(shown) if number not in self._told]
         new = new[: max(0, PATTERNS_MAX - len(self._told))]
         self._told.update(new)

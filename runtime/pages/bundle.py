@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
@@ -19,6 +20,7 @@ from .patterns import add_patterns, grey_png
 from .rates import Rates
 
 STATES_SHOWN = 24
+_BESIDE = "the patterns of its channels side by side,"
 
 
 def bundle_page(bundle: Bundle, sha256: str, path: Path) -> bytes:
@@ -49,12 +51,13 @@ def _add_automaton(page: Page, bundle: Bundle, automaton: Automaton) -> None:
     """Add the patterns of the first states with what a click means there, how many states each slot has, and how sure they are."""
     pictures = []
     for state in range(min(STATES_SHOWN, automaton.n_states)):
-        values = bundle.pattern_levels[automaton.pattern[state]].astype(np.float64).reshape(bundle.image_shape)
+        values = state_picture(bundle, automaton, state)
         lines = [f"step {int(automaton.depth[state]) + 1}", *outcomes(automaton, state, bundle.classes)]
         pictures.append(Picture(grey_png(values, 0.0, float(values.max()) or 1.0), f"state {state}", lines))
     page.pictures(
         pictures,
-        f"What the first {len(pictures)} of {automaton.n_states} states show, each pattern by its own brightest pixel, and the most "
+        f"What the first {len(pictures)} of {automaton.n_states} states show, {_BESIDE if automaton.channels > 1 else 'each pattern'} by "
+        "its own brightest pixel, and the most "
         f"probable class after a click and without one. Every walk begins in state 0. "
         f"{bundle.n_patterns} patterns in {bundle.levels} whole levels.",
     )
@@ -88,12 +91,32 @@ def _add_automaton(page: Page, bundle: Bundle, automaton: Automaton) -> None:
     )
 
 
+def clicked_words(word: int, channels: int) -> str:
+    """Return which channels clicked in an outcome, in words.
+
+    >>> clicked_words(0, 2), clicked_words(2, 2), clicked_words(3, 2)
+    ('no click', 'click on 1', 'clicks on 0, 1')
+    """
+    clicked = [str(channel) for channel in range(channels) if word >> channel & 1]
+    return f"click{'s' * (len(clicked) > 1)} on {', '.join(clicked)}" if clicked else "no click"
+
+
+def state_picture(bundle: Bundle, automaton: Automaton, state: int) -> NDArray[np.float64]:
+    """Return what a state shows, in levels, float64 (height, width); of several channels their patterns side by side, a line between."""
+    parts = bundle.pattern_levels[automaton.rows[state]].astype(np.float64).reshape(-1, *bundle.image_shape)
+    line = np.full((bundle.image_shape[0], 1), parts.max())
+    pieces = [piece for part in parts for piece in (line, part)]
+    return np.concatenate(pieces[1:], axis=1)
+
+
 def outcomes(automaton: Automaton, state: int, classes: tuple[str, ...]) -> list[str]:
     """Return the most probable class after each outcome of an exposure in `state`."""
     named: tuple[str, ...] = ("no click", "click") if automaton.n_outcomes == 2 else ()
     if automaton.counts:
         last = automaton.n_outcomes - 1
         named = (*(f"{number} photons" for number in range(last)), f"{last} or more")
+    elif automaton.channels > 1:
+        named = tuple(clicked_words(word, automaton.channels) for word in range(automaton.n_outcomes))
     lines = []
     for outcome, words in reversed(list(enumerate(named))):
         after = automaton.posteriors[int(automaton.successors[state, outcome])]

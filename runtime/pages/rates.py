@@ -87,6 +87,8 @@ def _sums(item: Exposures, plan: Plan, n: int, of_states: F64) -> tuple[F64, F64
     """
     dark = is_dark(item.pattern)
     lit = item.clicks[~dark]
+    if plan.channels_at_once > 1:  # exposures in which any of the channels clicked
+        lit = np.asarray(lit.any(axis=1))[:, None]
     if plan.mode == "parallel":
         clicks, exposures = lit.sum(axis=0).astype(np.float64), np.full(n, float(len(lit)))
         return clicks, exposures, int(item.clicks[dark].sum()), int(dark.sum()) * n
@@ -98,7 +100,12 @@ def _sums(item: Exposures, plan: Plan, n: int, of_states: F64) -> tuple[F64, F64
         shown = plan.automaton.depth[states]
     shown = np.minimum(shown, n - 1)
     clicks = np.bincount(shown, weights=lit[:, 0], minlength=n).astype(np.float64)
-    return clicks, np.bincount(shown, minlength=n).astype(np.float64), int(item.clicks[dark].sum()), int(dark.sum())
+    return (
+        clicks,
+        np.bincount(shown, minlength=n).astype(np.float64),
+        int(item.clicks[dark].any(axis=1).sum()),
+        int(dark.sum()),
+    )
 
 
 def add_rates(page: Page, plan: Plan, rates: Rates) -> None:

@@ -13,7 +13,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.record import Recording
 
-from .bundle import outcomes
+from .bundle import clicked_words, outcomes, state_picture
 from .charts import Axis, Bars, Chart, Curve, percent
 from .page import Page
 from .rates import Rates
@@ -47,6 +47,12 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
             f"An exposure is a photon number from 0 to {last} (or more). Clicks of a walk are the photons counted.",
             "note",
         )
+    if automaton.channels > 1:
+        page.text(
+            f"A state shows {automaton.channels} patterns at once, side by side here, each to a detector of its own; how often it clicked "
+            "counts exposures in which any of them did.",
+            "note",
+        )
     page.table(
         _meanings(automaton, nodes, bundle, rates),
         ("state", "walks", "clicked", *_after(automaton)),
@@ -62,6 +68,9 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
 
 def _after(automaton: Automaton) -> tuple[str, ...]:
     """The heads of the classes after each outcome, in the order of `outcomes`."""
+    if automaton.channels > 1:
+        words = reversed(range(1, automaton.n_outcomes))
+        return (*(f"after {clicked_words(word, automaton.channels)}" for word in words), "without a click")
     if not automaton.counts:
         return "most probable after a click", "without a click"
     last = automaton.n_outcomes - 1
@@ -144,7 +153,7 @@ def _first_states(automaton: Automaton) -> NDArray[np.int64]:
 
 def tree_drawing(bundle: Bundle, automaton: Automaton, nodes: NDArray[np.int64], rates: Rates) -> Tree:
     """Return the tree of the first states with their patterns."""
-    pictures = bundle.pattern_levels[automaton.pattern[nodes]].astype(np.float64).reshape(-1, *bundle.image_shape)
+    pictures = np.stack([state_picture(bundle, automaton, node) for node in nodes.tolist()])
     return Tree(_tree_of(automaton, nodes, rates), pictures)
 
 

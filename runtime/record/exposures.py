@@ -29,7 +29,10 @@ class Exposures(NamedTuple):
     object: int
     first: int  # number of the first exposure in its stream
     start_tick: NDArray[np.int64]  # (n,): begin of each exposure
-    pattern: NDArray[np.uint16]  # (n,): the pattern shown, DARK_PATTERN in the dark; 0 where all shine at once
+    pattern: NDArray[
+        np.uint16
+    ]  # (n,): the pattern shown, DARK_PATTERN in the dark; 0 where all shine at once. Of a walk with several
+    # channels that of channel 0, those of the others follow it
     clicks: NDArray[np.bool_]  # (n, channels)
     state: NDArray[
         np.uint16
@@ -56,7 +59,10 @@ def iter_exposures(recording: Recording, plan: Plan) -> Iterator[Exposures | Mar
 
 def _exposures(block: ClickBlock | FrameBlock, arrival_ns: int, stream: int, plan: Plan) -> Exposures:
     if isinstance(block, ClickBlock):
-        state, photons = block.patterns, block.bits[:, None]
+        photons = block.bits[:, None]
+        if plan.channels_at_once > 1:
+            photons = np.asarray(photons >> np.arange(plan.channels_at_once) & 1, np.uint8)
+        state = block.patterns
         pattern = state if plan.automaton is None else _patterns_of(state, plan.automaton)
     else:
         bits = np.unpackbits(block.words, axis=1, bitorder="little")
@@ -99,7 +105,8 @@ def click_list(recording: Recording, plan: Plan) -> ClickList:
             continue
         row, channels = np.nonzero(item.clicks)
         same = np.full(len(row), item.object), np.full(len(row), item.stream)
-        shown = item.pattern[row], item.state[row]
+        of_channel = np.where(item.pattern[row] == DARK_PATTERN, 0, channels if plan.channels_at_once > 1 else 0)
+        shown = item.pattern[row] + of_channel, item.state[row]
         for column, values in zip(
             columns,
             (item.start_tick[row], item.first + row, same[0], channels, *shown, same[1], item.photons[row, channels]),

@@ -20,7 +20,7 @@ MAGIC = b"PANSRECD"
 FORMAT_VERSION = 3
 WALKS_VERSION = 4  # of runs with an automaton: verdicts have exposures
 RUNS_VERSION = 5  # of parallel frames, many decisions a block: TIMING_RUNS
-COUNTS_VERSION = 6  # of runs that count photons: MESSAGES hold COUNTS
+COUNTS_VERSION = 6  # of runs whose exposures are numbers: MESSAGES hold COUNTS
 READABLE_VERSIONS = (2, 3, 4, 5, 6)  # 2 has no ANSWERS
 MESSAGE_MAX_BYTES = MIB
 LONG_VERDICT = 0xFFFF  # the code of a verdict that has no number, since so many others have one
@@ -54,7 +54,7 @@ def version_for(header: Mapping[str, Any]) -> int:
     config = header.get("config")
     if not isinstance(config, Mapping):
         return FORMAT_VERSION
-    if config.get("photon_number_max"):
+    if config.get("photon_number_max") or config.get("channels_at_once"):
         return COUNTS_VERSION
     if config.get("mode") == "parallel":
         return RUNS_VERSION

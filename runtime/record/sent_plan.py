@@ -12,12 +12,12 @@ from typing import Any
 from pans.runtime.bundle.automaton import Automaton, DoseCap
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
-from pans.runtime.core.plan_codec import plan_from_chunks
+from pans.runtime.core.plan_codec import plan_from_chunks, reading_of
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.ranges import Range
 from pans.runtime.wire.automata import StateChunk, unpack_show, unpack_states
 from pans.runtime.wire.commands import Arm, PlanChunk, unpack_arm, unpack_plan
-from pans.runtime.wire.counts import CountStateChunk, unpack_count_states, unpack_read_counts
+from pans.runtime.wire.counts import CountStateChunk, ReadCounts, unpack_count_states, unpack_read_counts
 from pans.runtime.wire.fields import MAX_PHOTON_NUMBER
 from pans.runtime.wire.messages import (
     CommandMessage,
@@ -58,7 +58,7 @@ class Sent:
     states: dict[int, StateChunk | CountStateChunk] = field(default_factory=dict)  # by first state
     shown: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # state: pattern, dwell, dwell steps
     arms: dict[int, Arm] = field(default_factory=dict)
-    read: list[int] = field(default_factory=list)  # the largest photon number of each READ_COUNTS
+    read: list[ReadCounts] = field(default_factory=list)  # each READ_COUNTS
 
     def plan(self, tick_hz: int, automaton: Automaton | None, largest: int) -> Plan:
         """Return the plan, which ran `automaton`, or fixed patterns read as numbers up to `largest`; MalformedMessage when it is not
@@ -66,10 +66,10 @@ class Sent:
         chunks = [self.chunks[first] for first in sorted(self.chunks)]
         states = [self.states[first] for first in sorted(self.states)]
         plan = plan_from_chunks(chunks, tick_hz, automaton, states, largest)
-        if set(self.read) != ({plan.largest} if plan.largest > 1 else set()):
-            raise MalformedMessage(
-                f"photon numbers up to {sorted(set(self.read))} were asked for, needed: {plan.largest}"
-            )
+        wanted = {reading_of(plan)} if plan.largest > 1 else set()
+        if set(self.read) != wanted:
+            found = [tuple(one) for one in sorted(set(self.read))]
+            raise MalformedMessage(f"numbers up to {found} (largest, detectors) were asked for, needed: {plan.largest}")
         for state, shown in self.shown.items():
             if automaton is None or state >= automaton.n_states:
                 raise MalformedMessage(f"state {state} was shown, which the automaton does not have")

@@ -89,7 +89,7 @@ def _decision_row(row: Any, first_tick: int, us: float, classes: tuple[str, ...]
 def _click_table(clicks: ClickList, us: float, plan: Plan) -> tuple[Sequence[str], Iterable[Sequence[Any]]]:
     """Heads and rows of clicks.csv; those of a detector that counts have their photons too."""
     rows = _click_rows(clicks, us, walks=plan.automaton is not None)
-    if plan.largest == 1:
+    if plan.largest == 1 or plan.channels_at_once > 1:
         return CLICKS, rows
     return (*CLICKS, "photons"), ((*row, number) for row, number in zip(rows, clicks.photons.tolist()))
 

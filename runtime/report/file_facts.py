@@ -87,6 +87,7 @@ def _automaton_facts(bundle: Bundle, automaton: Automaton) -> dict[str, Any]:
         "states": automaton.n_states,
         "leaves": automaton.n_leaves,
         "outcomes": automaton.n_outcomes,
+        "channels": automaton.channels,
         "exposures_longest": automaton.n_slots,
         "exposures_shortest": shortest_walk(automaton),
         "states_per_slot_most": int(np.bincount(automaton.depth).max()),

@@ -75,7 +75,7 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
 
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
     unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
-    channels = plan.n_patterns if plan.mode == "parallel" else 1
+    channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
     simulated = recording.simulated
     profile = recording.header.get("profile", {})
     device = recording.summary.get("device", {})
@@ -122,7 +122,7 @@ def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> di
                 "exposure": clicks.exposure,
                 "object": clicks.object,
                 "pattern": clicks.pattern,
-                **({"photons": clicks.photons} if plan.largest > 1 else {}),
+                **({"photons": clicks.photons} if plan.largest > 1 and plan.channels_at_once == 1 else {}),
                 "decisions": recording.decisions(),
                 "classes": np.array([name.encode() for name in classes], dtype=np.bytes_),
                 "decisions_sha256": recording.decisions_sha256,

@@ -200,7 +200,7 @@ def _bundle_alerts(bundle: Bundle) -> Iterator[str]:
 
 
 def _automaton_alerts(bundle: Bundle, automaton: Automaton) -> Iterator[str]:
-    unused = np.setdiff1d(np.arange(bundle.n_patterns), automaton.pattern)
+    unused = np.setdiff1d(np.arange(bundle.n_patterns), automaton.rows)
     if len(unused):
         yield f"{len(unused)} of {bundle.n_patterns} patterns are shown by no state (the first: {int(unused[0])})"
     longest = int(automaton.dwell.max())

@@ -35,5 +35,5 @@ def excluded(core: Any, link: Link, *, drives: bool) -> str:
 
 def _excluded_still(core: Core) -> str:
     if core.counts_photons:
-        return "the detector counts photons: COUNTS are taken in Python"
+        return "exposures are numbers (photons, or several detectors at once): COUNTS are taken in Python"
     return "" if core.compiles else "--on-dark changes decisions while they are made"

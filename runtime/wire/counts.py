@@ -1,5 +1,6 @@
 """The extension for photon numbers: blocks of COUNTS, the command that asks for them, automata with a successor for each number.
 
+A number may also be the clicks of several detectors that are read at once: bit k is that of detector k (section 14).
 Owns the layouts of COUNTS, READ_COUNTS and LOAD_COUNT_STATES (docs/reference/protocol.md, section 13), and what a device announces of
 itself. A block of COUNTS is a `ClickBlock` whose `largest` is above 1. `pack_*` and `encode_*` return bytes, `unpack_*` and `decode_*`
 raise `MalformedMessage`; sizes are checked before anything is allocated.
@@ -19,6 +20,13 @@ from .schema import COUNT_SCHEMA, MessageType
 
 STATE_BYTES_PER_COMMAND = 8160  # as automata.STATES_PER_COMMAND: a slow line acknowledges it before it is repeated
 EXPOSURE_BYTES = 3  # of COUNTS: the pattern shown, and the number
+
+
+class ReadCounts(NamedTuple):
+    """What READ_COUNTS asks for: numbers up to `largest`, of one detector that counts (`channels` 0) or the clicks of so many detectors."""
+
+    largest: int
+    channels: int = 0
 
 
 class CountStateChunk(NamedTuple):
@@ -46,9 +54,16 @@ def announced_counts(facts: Mapping[str, Any]) -> int:
     return int(facts.get("photon_number_max", 1)) if facts.get("count_schema") == COUNT_SCHEMA else 1
 
 
-def count_announcement(largest: int) -> dict[str, int]:
-    """Return the keys of WELCOME's map that `announced_counts` reads."""
-    return {"count_schema": COUNT_SCHEMA, "photon_number_max": largest}
+def announced_channels(facts: Mapping[str, Any]) -> int:
+    """Return how many detectors a device reads at once by WELCOME's map; 1 of one that does not, or that speaks another version."""
+    return int(facts.get("channels_at_once", 1)) if facts.get("count_schema") == COUNT_SCHEMA else 1
+
+
+def count_announcement(largest: int, channels: int = 1) -> dict[str, int]:
+    """Return the keys of WELCOME's map that `announced_counts` and `announced_channels` read; none of a device with neither."""
+    told = {"photon_number_max": largest, "channels_at_once": channels}
+    found = {key: value for key, value in told.items() if value > 1}
+    return {"count_schema": COUNT_SCHEMA, **found} if found else {}
 
 
 def encode_counts(block: ClickBlock, session: int) -> bytes:
@@ -72,15 +87,14 @@ def decode_counts(payload: bytes) -> ClickBlock:
     return ClickBlock(seq, drops, tick, first, period, object_index, patterns, numbers, largest)
 
 
-def pack_read_counts(largest: int) -> bytes:
-    """Return the body of READ_COUNTS: runs of the loaded plan send COUNTS of numbers up to `largest`."""
-    return STRUCTS["READ_COUNTS"].pack(largest, 0)
+def pack_read_counts(largest: int, channels: int = 0) -> bytes:
+    """Return the body of READ_COUNTS: runs of the loaded plan send COUNTS of numbers up to `largest`; see `ReadCounts`."""
+    return STRUCTS["READ_COUNTS"].pack(largest, channels)
 
 
-def unpack_read_counts(body: bytes) -> int:
+def unpack_read_counts(body: bytes) -> ReadCounts:
     """Invert `pack_read_counts`; the range is the device's to judge."""
-    largest, _ = fields("READ_COUNTS", body)
-    return int(largest)
+    return ReadCounts(*fields("READ_COUNTS", body))
 
 
 def pack_count_states(chunk: CountStateChunk) -> bytes:

@@ -26,6 +26,7 @@ U16_MAX, U32_MAX = (1 << 16) - 1, (1 << 32) - 1
 MAX_STATES = 0xFFFD  # of an automaton: the two numbers above mean "chosen by the clicks" and "dark"
 MAX_LEAVES = 1 << 20
 MAX_PHOTON_NUMBER = 15  # of one reading: beyond it the bins of a real detector overlap (instrument/count_law.py)
+MAX_CHANNELS_AT_ONCE = 4  # their clicks are a number of COUNTS, up to 15
 
 
 class Field(NamedTuple):
@@ -197,7 +198,7 @@ COUNT_MESSAGES: Mapping[str, tuple[Field, ...]] = {
     "COUNTS": (*_BLOCK, Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER), _OBJECT),
     "READ_COUNTS": (
         Field("largest", "H", "largest number", "photons", low=2, high=MAX_PHOTON_NUMBER),
-        _reserved("H"),
+        Field("channels", "H", "detectors read at once", "detectors", high=MAX_CHANNELS_AT_ONCE),
     ),
     "LOAD_COUNT_STATES": (
         Field("n_states", "H", "states in all", "states", low=1, high=MAX_STATES),
@@ -266,6 +267,7 @@ FACTS: Mapping[str, Fact] = {
     "dwell_steps": Fact(int, False, 1, U16_MAX),
     "count_schema": Fact(int, False, 0, U32_MAX),
     "photon_number_max": Fact(int, False, 1, MAX_PHOTON_NUMBER),
+    "channels_at_once": Fact(int, False, 1, MAX_CHANNELS_AT_ONCE),
 }
 
 

@@ -1,4 +1,4 @@
-"""Automata in bundles of versions 3 and 4, read as a lab would from docs/reference/formats.md ("Automata, versions 3 and 4") alone.
+"""Automata in bundles of versions 3, 4 and 6, read as a lab would from docs/reference/formats.md ("Automata, versions 3, 4 and 6") alone.
 
 Owns the meaning of the parts: patterns out of bits, walks, the golden ones recomputed, stopping by a confidence. It owns the decisions of
 runs that followed one, too ("Walks" and "Photon numbers" there); all else of a run is lab_decisions.py's. Plain Python where the package
@@ -54,27 +54,29 @@ class Automaton:
 
 
 def read_automaton(bundle: Bundle) -> Automaton:
-    """Return the automaton of a bundle of version 3 or 4, every rule of the document checked."""
+    """Return the automaton of a bundle of version 3, 4 or 6, every rule of the document checked."""
     header, parts = bundle.header, bundle.parts
     pixels = header["image_shape"][0] * header["image_shape"][1]
     steps = header["automaton"]["dwell_steps"]
     counts = "outcomes" in header["automaton"]
-    keys = {"dwell_steps", "outcomes"} if counts else {"dwell_steps"}
+    more = set(header["automaton"]) & {"outcomes", "channels"}
+    keys = {"dwell_steps"} | more
+    demand(len(more) < 2, "outcomes beside channels")
     demand(header["encoder"] == "automaton" and set(header["automaton"]) == keys, "the keys of an automaton")
     demand(type(steps) is int and 1 <= steps <= 65_535, "dwell_steps")
     patterns = _patterns(header["levels"], parts, pixels)
     successors, posteriors = parts["successors"], parts["posteriors"]
     states, nodes = len(successors), len(posteriors)
     outcomes = successors.shape[1]
-    channels = 1 if counts else outcomes.bit_length() - 1
+    channels = header["automaton"].get("channels", 1)
     if counts:
         said = header["automaton"]["outcomes"]
         demand(type(said) is int and 3 <= said <= 16 and said == outcomes, "outcomes")
     else:
-        demand(1 <= channels <= 8 and outcomes == 2**channels, "outcomes")
+        demand(type(channels) is int and 1 + len(more) <= channels <= 4 and outcomes == 2**channels, "outcomes")
     demand(1 <= states <= 65_533 and 1 <= nodes - states <= 1 << 20, "states and leaves")
     demand(parts["state_pattern"].shape == parts["state_dwell"].shape == (states,), "one pattern and dwell per state")
-    demand(int(parts["state_pattern"].max()) < len(patterns), "a pattern that is not there")
+    demand(int(parts["state_pattern"].max()) + channels <= len(patterns), "a pattern that is not there")
     demand(int(parts["state_dwell"].min()) >= 1 and int(parts["state_dwell"].max()) <= steps, "dwell")
     demand(posteriors.shape[1] == len(header["classes"]), "classes")
     for row in posteriors.tolist():
@@ -171,6 +173,7 @@ class WalkDecisions(Decisions):
 
     def __init__(self, plan: Plan, automaton: Automaton) -> None:
         self.automaton = automaton
+        demand(max(1, plan.channels) == automaton.channels, "as many detectors as the automaton has channels")
         super().__init__(plan, lambda counts, shots: np.zeros(0), 1)
 
     def _open_visit(self) -> None:
@@ -181,7 +184,7 @@ class WalkDecisions(Decisions):
         self.window_of = {}
         for cycle in range(plan.cycles_per_object):
             members = [cycle * len(plan.slots) + slot for slot in steps]
-            self.windows.append(Walk(members, np.zeros(len(steps), np.int64)))
+            self.windows.append(Walk(members, np.zeros(len(steps) * self.automaton.channels, np.int64)))
             self.window_of |= dict.fromkeys(members, self.windows[-1])
         self.next_window, self.object = 0, 0xFFFFFFFF
 
@@ -199,7 +202,9 @@ class WalkDecisions(Decisions):
         elif shown != walk.node:
             walk.broken, walk.wrong = True, 1
         else:
-            walk.counts[step] = bit
+            channels = self.automaton.channels
+            clicks = [bit >> channel & 1 for channel in range(channels)] if channels > 1 else [bit]
+            walk.counts[step * channels : (step + 1) * channels] = clicks
             walk.right += 1
             walk.node = self.automaton.successors[walk.node][bit]
             if walk.node >= len(self.automaton.successors):

@@ -47,8 +47,9 @@ NEW_KEYS: dict[int, set[str]] = {
     3: {"automaton", "expected"},
     4: {"automaton", "expected"},
     5: {"outcomes"},
+    6: {"automaton", "expected"},
 }
-OF_AUTOMATA = (3, 4)
+OF_AUTOMATA = (3, 4, 6)
 KEYS = {"name", "task", "encoder", "classes", "image_shape", "levels", "photons_per_level", "provenance", "parts"}
 
 
@@ -132,6 +133,7 @@ def read_bundle(data: bytes) -> Bundle:
     if version in OF_AUTOMATA:
         demand(isinstance(header["automaton"], dict), "an automaton that is no object")
         demand(("outcomes" in header["automaton"]) == (version == 4), "an automaton of photon numbers is version 4")
+        demand(("channels" in header["automaton"]) == (version == 6), "an automaton of several channels is version 6")
     dtypes = AUTOMATON_DTYPES if version in OF_AUTOMATA else DTYPES
     parts: dict[str, NDArray[Any]] = {}
     begin, offset = 16 + length, 0

@@ -32,7 +32,8 @@ class Plan:
     exposure_ticks: int
     cycles_per_object: int
     slots: list[tuple[int, int, int]]  # start, pattern, shot
-    largest: int = 1  # the largest photon number that READ_COUNTS asked for; 1: clicks
+    largest: int = 1  # the largest number that READ_COUNTS asked for; 1: clicks
+    channels: int = 0  # detectors of whose clicks the number is made; 0: a photon number
 
     @property
     def visit(self) -> int:
@@ -54,7 +55,7 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
     pieces: dict[int, bytes] = {}
     arms: dict[int, Arm] = {}
     head: tuple[int, ...] = ()
-    largest = 1
+    largest, channels = 1, 0
     for _, data in recording.commands:
         cutter = FrameCutter()
         for kind, session, payload in cutter.feed(data):
@@ -66,7 +67,7 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
                 head = struct.unpack_from("<BBHIIIIQHHI", body)
                 pieces[head[4]] = body[36:]
             elif opcode == 0x0A:
-                largest, _ = struct.unpack("<HH", body)
+                largest, channels = struct.unpack("<HH", body)
             elif opcode == 0x03:
                 start, cycles, _, _ = struct.unpack("<QQII", body)
                 arms[session] = Arm(session, start, cycles)
@@ -74,7 +75,7 @@ def sent_plan(recording: Recording) -> tuple[Plan, list[Arm]]:
     mode, _, patterns, n_slots, _, exposure_ticks, _, _, _, _, cycles_per_object = head
     slots = list(struct.iter_unpack("<QHH", b"".join(pieces[first] for first in sorted(pieces))))
     demand(len(slots) == n_slots, "slots of the plan are missing")
-    return Plan(bool(mode), patterns, exposure_ticks, cycles_per_object, slots, largest), list(arms.values())
+    return Plan(bool(mode), patterns, exposure_ticks, cycles_per_object, slots, largest, channels), list(arms.values())
 
 
 # ---- the rules ----
@@ -301,7 +302,9 @@ def run_again(recording: Recording, make: Callable[[Plan], Decisions]) -> NDArra
     demand("flow" not in config, "objects flow past")
     demand(config["dark"].get("guard", {}).get("policy", "warn") == "warn", "the dark counts decide too")
     plan, arms = sent_plan(recording)
-    demand(plan.largest == config.get("photon_number_max", 1), "the numbers that were asked for")
+    channels = config.get("channels_at_once", 0)
+    largest = 2**channels - 1 if channels else config.get("photon_number_max", 1)
+    demand((plan.largest, plan.channels) == (largest, channels), "the numbers that were asked for")
     run = make(plan)
     run.begin(arms.pop(0))
     for _, body in recording.messages:

@@ -32,7 +32,8 @@ def test_an_automaton_means_the_same(automaton: Automaton, levels: int) -> None:
     made = automaton_bundle(automaton, levels=levels)
     found = read_automaton(read_bundle(bundle_bytes(made)))
     assert np.array_equal(found.patterns, made.pattern_levels)
-    light = [found.patterns[p].sum() * made.photons_per_level * d for p, d in zip(found.shows, found.dwell_share)]
+    parts = [range(first, first + found.channels) for first in found.shows]
+    light = [found.patterns[p].sum() * made.photons_per_level * d for p, d in zip(parts, found.dwell_share)]
     assert light == pytest.approx(made.state_light())
     assert found.counts == automaton.counts
     words = np.random.default_rng(levels).integers(0, automaton.largest + 1, (100, made.n_features))
@@ -65,7 +66,10 @@ def accepted(read: object) -> bool:
     return True
 
 
-@pytest.mark.parametrize("automaton", [diamond(), random_automaton(5, slots=3, width=3, outcomes=3)])
+@pytest.mark.parametrize(
+    "automaton",
+    [diamond(), random_automaton(5, slots=3, width=3, outcomes=3), random_automaton(5, slots=3, width=3, channels=2)],
+)
 def test_both_readers_accept_and_refuse_the_same(automaton: Automaton) -> None:
     """Arrays changed, checksums made to fit: whatever the one takes, the other takes."""
     facts = {"profile": "p", "task": "t", "split": "s", "objects": 3}
@@ -100,16 +104,22 @@ FAULTS = "loss:0.02,duplicate:0.02,flip:0.01"
 
 
 @pytest.mark.parametrize(
-    ("drive", "outcomes", "faults"), [("device", 0, ""), ("host", 3, ""), ("device", 3, FAULTS), ("host", 0, FAULTS)]
+    ("drive", "outcomes", "faults"),
+    [
+        *(("device", 0, ""), ("host", 3, ""), ("device", 3, FAULTS), ("host", 0, FAULTS)),
+        *(("device", -2, ""), ("host", -2, FAULTS)),
+    ],
 )
 def test_walks_come_out_the_same(tmp_path: Path, drive: str, outcomes: int, faults: str) -> None:
-    """A run with an automaton, of clicks (version 4) and of photon numbers (version 6): every row, bit for bit."""
-    made = automaton_bundle(random_automaton(7, slots=6, outcomes=outcomes), levels=2, photons_per_level=0.25)
+    """A run with an automaton, of clicks (version 4), of photon numbers and (below 0) of several channels (6): every row, bit for bit."""
+    more_of_it = {"channels": -outcomes} if outcomes < 0 else {"outcomes": outcomes}
+    made = automaton_bundle(random_automaton(7, slots=6, **more_of_it), levels=2, photons_per_level=0.25)
     write_bundle(made, tmp_path / "walk.pans")
     images = np.random.default_rng(2).integers(0, 256, (20, *made.image_shape)).astype(np.uint8)
     np.savez(tmp_path / "tiny.npz", images=images, labels=np.arange(20) % 3, classes=np.array(made.classes))
     more = f"&faults={faults}" if faults else ""
-    device = f"sim:dmd-qcmos?scene={tmp_path / 'tiny.npz'}&seed=5&pace=fast{more}"
+    profile = "dmd-four-snspd" if outcomes < 0 else "dmd-qcmos"
+    device = f"sim:{profile}?scene={tmp_path / 'tiny.npz'}&seed=5&pace=fast{more}"
     words = ["--drive", drive, "--decisions", "60", "--trials", "3", "--out", str(tmp_path / "out"), "-q"]
     main(["run", str(tmp_path / "walk.pans"), "--device", device, *words])
     data = (tmp_path / "out" / "run.pansrec").read_bytes()

@@ -28,6 +28,17 @@ def walk(automaton: Automaton, word: Sequence[int], counts: bool = False) -> Wal
     return Walk(states, node - automaton.n_states)
 
 
+def word_chances(click: Sequence[Any], one: Any) -> list[Any]:
+    """The chance of each outcome of an exposure of several channels, of which `click` are the chances to click: bit k is channel k."""
+    found = []
+    for word in range(2 ** len(click)):
+        chance = one
+        for channel, each in enumerate(click):
+            chance *= each if word >> channel & 1 else one - each
+        found.append(chance)
+    return found
+
+
 def expectation(automaton: Automaton, click: Sequence[Any], one: Any, afterpulse: Any = 0) -> dict[str, Any]:
     """Sums over all 2**T words of one object: `click[s]` is the chance of a click in state s, `one` the number 1 of their type.
 

@@ -65,7 +65,7 @@ def random_automaton(
 def automaton_bundle(automaton: Automaton | None = None, **facts: Any) -> Bundle:
     """A bundle of `automaton` (the diamond by default) with random patterns of 2 x 2 pixels and 4 levels."""
     automaton = diamond() if automaton is None else automaton
-    n_patterns = int(automaton.pattern.max()) + 1
+    n_patterns = int(automaton.pattern.max()) + automaton.channels
     levels = facts.get("levels", 4)
     pattern_levels = np.random.default_rng(7).integers(0, levels, (n_patterns, 4))
     pattern_levels[:, 0] = levels - 1

@@ -55,7 +55,7 @@ def six_states() -> Automaton:
 
 def automaton_bundle(automaton: Automaton, photons: float = 1.0, **facts: Any) -> Bundle:
     """A bundle around `automaton` with patterns of 2 x 3 pixels and two levels; a lit pixel gives `photons` per exposure."""
-    n_patterns = int(automaton.pattern.max()) + 1
+    n_patterns = int(automaton.pattern.max()) + automaton.channels
     masks = np.random.default_rng(5).integers(0, 2, (n_patterns, 6))
     masks[np.arange(n_patterns), np.arange(n_patterns) % 6] = 1  # none is dark
     toy: dict[str, Any] = {

@@ -145,8 +145,8 @@ def as_bits(grey: Tensor, mean_object: Tensor, top: float = BRIGHTNESS_MAX, part
     """Return one-bit patterns made from grey ones, which give the same light on the state's mean object; all (rows, pixels).
 
     Lit are pixels above a part of the brightest one; more are, where the brightness would else exceed `top`. The `parts` of a state
-    have one brightness, the mean of what each alone would have, by its light; so many of their brightest pixels are lit that each
-    brings its light.
+    have one brightness, the mean of what each alone would have, by its light, or more; so many of their brightest pixels are lit that
+    each brings its light.
     """
     if parts > 1:
         return _parts_as_bits(grey, mean_object, as_bits(grey, mean_object, top).log_light, top, parts)
@@ -164,6 +164,10 @@ def _parts_as_bits(grey: Tensor, mean_object: Tensor, log_light: Tensor, top: fl
     """As `as_bits`, with the brightness of each part alone, the exponential of `log_light` (rows, 1)."""
     wanted = (grey * mean_object).sum(dim=1, keepdim=True)
     common = by_state(wanted * log_light, parts) / by_state(wanted, parts).clamp(min=1e-30)
+    least = (wanted / ((grey > 0) * mean_object).sum(dim=1, keepdim=True).clamp(min=1e-9)).clamp(min=BRIGHTNESS_MIN)
+    common = torch.maximum(
+        common, 1e-3 + least.log().unflatten(0, (-1, parts)).amax(dim=1)
+    )  # else no part could be as bright
     values, order = grey.sort(dim=1, descending=True)
     lit = (mean_object.gather(1, order).cumsum(dim=1) * by_row(common.exp(), parts) < wanted).sum(dim=1, keepdim=True)
     last = values.gather(1, lit.clamp(max=grey.shape[1] - 1))  # the darkest pixel that is lit

@@ -132,6 +132,47 @@ def test_photon_numbers_come_back_in_version_4() -> None:
     assert bundle_bytes(read) == data
 
 
+def test_several_channels_come_back_in_version_6() -> None:
+    automaton = random_automaton(4, slots=4, channels=3)
+    made = automaton_bundle(automaton)
+    data = bundle_bytes(made)
+    assert struct.unpack_from("<I", data, 8)[0] == 6
+    header, arrays = taken_apart(data)
+    assert header["automaton"] == {"dwell_steps": 8, "channels": 3}
+    assert len(arrays["pattern_bytes"]) == int(automaton.pattern.max()) + 3  # a state shows three rows in turn
+    read = parse_bundle(data, "here")
+    assert read.automaton is not None
+    assert (read.automaton.channels, read.automaton.n_outcomes, read.automaton.counts) == (3, 8, False)
+    assert read.automaton.rows.tolist() == [[first, first + 1, first + 2] for first in automaton.pattern.tolist()]
+    same(made, read)
+    assert bundle_bytes(read) == data
+
+
+CHANNEL_LIES: list[tuple[Callable[[dict[str, Any], dict[str, np.ndarray]], Any], str]] = [
+    (lambda h, a: h["automaton"].update(channels=3), "channels is 3, successors has 4 columns"),
+    (lambda h, a: h["automaton"].update(channels=True), "channels is True, successors"),
+    (lambda h, a: h["automaton"].update(outcomes=4), "version 6 that says no more than 4"),
+    (lambda h, a: h["automaton"].pop("channels"), "version 6 that says no more than 3"),
+    (lambda h, a: a["state_pattern"].__setitem__(0, len(a["pattern_bytes"]) - 1), "a state shows pattern"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), CHANNEL_LIES, ids=[words[:30] for _, words in CHANNEL_LIES])
+def test_a_lie_about_channels_is_named(change: Callable[..., Any], words: str) -> None:
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle(random_automaton(4, channels=2))))
+    change(header, arrays)
+    with pytest.raises(DamagedFileError, match=words):
+        parse_bundle(put_together(header, arrays, 6), "here")
+
+
+def test_four_successors_without_a_word_on_channels_are_refused() -> None:
+    """Format version 3 never said which patterns several channels see."""
+    header, arrays = taken_apart(bundle_bytes(automaton_bundle(random_automaton(4, channels=2))))
+    del header["automaton"]["channels"]
+    with pytest.raises(DamagedFileError, match=r"4 columns, allowed without automaton\.channels"):
+        parse_bundle(put_together(header, arrays, 3), "here")
+
+
 COUNT_LIES: list[tuple[Change, str]] = [
     (lambda h, a: h["automaton"].update(outcomes=3), "outcomes is 3, successors has 4 columns"),
     (lambda h, a: h["automaton"].update(outcomes=4.0), r"outcomes is 4\.0, successors"),

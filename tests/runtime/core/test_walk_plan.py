@@ -109,8 +109,9 @@ def test_a_parallel_instrument_and_several_detectors_at_once_are_refused() -> No
         parallel = replace(load_profile("wdm-snspd"), projector=instrument().projector)
         build_plan(parallel, bundle_for(six_states(), 4.0))
     pair = Automaton([0], [1], 1, [[1, 2, 3, 1]], np.full((4, 2), 0.5))
-    with pytest.raises(PlanError, match="2 detectors at once"):
-        build_plan(instrument(), bundle_for(pair))
+    with pytest.raises(PlanError, match=r"2 detectors at once, .* has 1;"):
+        build_plan(instrument(), two := bundle_for(pair))
+    assert two.n_patterns == 2
 
 
 def test_a_stopped_automaton_takes_fewer_slots() -> None:

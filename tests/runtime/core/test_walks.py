@@ -148,7 +148,7 @@ def test_another_core_goes_on_from_a_place_between_two_walks(
 
 def test_what_cannot_be_followed_is_refused() -> None:
     automaton = random_automaton(1, 4, 2)
-    with pytest.raises(PlanError, match="2 walks that read 1 detectors"):
+    with pytest.raises(PlanError, match="2 walks make one decision"):
         DecisionWindows(walk_plan(automaton, 2), 4, 2)
     with pytest.raises(PlanError, match="walks of 4 exposures"):
         DecisionWindows(walk_plan(automaton, 1), 3, 1)

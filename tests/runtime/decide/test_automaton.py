@@ -114,7 +114,7 @@ def test_below_the_confidence_nothing_is_decided(seed: int) -> None:
 
 def of_objects(automaton: Automaton, seed: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.random((int(automaton.pattern.max()) + 1, 6)) * 0.6, rng.random((n, 6))
+    return rng.random((int(automaton.pattern.max()) + automaton.channels, 6)) * 0.6, rng.random((n, 6))
 
 
 LAWS = [ClickLaw(), ClickLaw(0.02), ClickLaw(0.01, 0.3, 0.6), ClickLaw(0.0, 0.2, 1.5)]
@@ -189,5 +189,35 @@ def test_expectations_refuse_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="the same outcomes, and no afterpulses"):
         counting = random_automaton(5, outcomes=3)
         expected_walk(counting, *of_objects(counting), CountLaw(0.0, 0.2, (0.5, 1.5)), afterpulses=Afterpulses(0.1))
-    with pytest.raises(ValueError, match="2 channels"):
-        expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw())
+    with pytest.raises(ValueError, match="no afterpulses"):
+        expected_walk(AUTOMATA[3], *of_objects(AUTOMATA[3]), ClickLaw(), afterpulses=Afterpulses(0.1))
+    with pytest.raises(ValueError, match="a state shows pattern"):
+        patterns, objects = of_objects(AUTOMATA[3])
+        expected_walk(AUTOMATA[3], patterns[:-1], objects, ClickLaw())
+
+
+@pytest.mark.parametrize("channels", [2, 3])
+def test_expectations_of_several_channels_are_sums_over_all_words(channels: int) -> None:
+    """Outcome by outcome in exact numbers: the chance of a word is the product over its channels."""
+    automaton, law = random_automaton(5, slots=3, width=3, channels=channels), ClickLaw(0.01, 0.3, 0.6)
+    patterns, objects = of_objects(automaton)
+    found = expected_walk(automaton, patterns, objects, law, photons_per_level=1.5)
+    for i, seen in enumerate(objects):
+        sums, leaves = np.zeros(4), np.zeros(automaton.n_leaves)  # clicks, photons, illumination, exposures
+        going = [(0, Fraction(1), np.zeros(4))]
+        while going:
+            node, chance, met = going.pop()
+            if node >= automaton.n_states:
+                leaves[node - automaton.n_states] += float(chance)
+                sums += float(chance) * met
+                continue
+            first, share = int(automaton.pattern[node]), automaton.dwell[node] / automaton.dwell_steps
+            lit = [1.5 * patterns[first + channel] * share for channel in range(channels)]
+            light = [float(part @ seen) for part in lit]
+            click = [Fraction(float(click_probability(law, mu))) for mu in light]
+            for word, part in enumerate(naive.word_chances(click, Fraction(1))):
+                here = np.array([bin(word).count("1"), sum(light), sum(part.sum() for part in lit), 1.0])
+                going.append((int(automaton.successors[node, word]), chance * part, met + here))
+        totals = [found.clicks[i], found.photons[i], found.illumination[i], found.exposures[i]]
+        np.testing.assert_allclose(totals, sums, rtol=1e-11)
+        np.testing.assert_allclose(found.leaves[i], leaves, rtol=1e-10, atol=1e-300)

@@ -144,7 +144,7 @@ def test_only_contrast_may_be_infinite():
         ("detector.dark_rate_hz", "dark_rate_hz = [1.0]", ["found a list"]),
         ("detector.channels", "channels = true", ["a whole number", "found the boolean true"]),
         ("detector.efficiency", "efficiency = true", ["a number", "found the boolean true"]),
-        ("detector.channels", "channels = 4", ["must be 1 in sequential mode", "found 4"]),
+        ("detector.channels", "channels = 5", ["must be from 1 to 4 in sequential mode", "found 5"]),
         ("exposure.min_us", "min_us = 2000.0", ["at most exposure.max_us = 1000", "found 2000"]),
         ("exposure.min_us", "min_us = 9.0", ["at least 10 ticks = 10 us", "found 9"]),
         ("exposure.readout_us", "readout_us = -1", ["from 0 to"]),
@@ -308,7 +308,8 @@ def test_loads_a_path_and_ignores_the_line_ends_of_the_system(tmp_path):
 
 def test_an_unknown_name_lists_the_shipped_profiles():
     with pytest.raises(
-        ConfigError, match="dmd-8bit-spad, dmd-qcmos, dmd-spad, flow-snspd, ideal, microled-spad, oled-qcmos, wdm-snspd"
+        ConfigError,
+        match="dmd-8bit-spad, dmd-four-snspd, dmd-qcmos, dmd-spad, flow-snspd, ideal, microled-spad, oled-qcmos, wdm-snspd",
     ) as caught:
         load_profile("oled-qcmso")
     assert "did you mean oled-qcmos?" in caught.value.remedy

@@ -15,6 +15,8 @@ from tree import ROOT
 from pans.runtime.wire import FrameDecoder, MalformedMessage, MessageType, StreamTracker
 from pans.runtime.wire.counts import (
     CountStateChunk,
+    ReadCounts,
+    announced_channels,
     announced_counts,
     count_announcement,
     count_state_chunks,
@@ -128,7 +130,9 @@ def test_the_stream_accounts_for_numbers_as_for_clicks() -> None:
 
 def test_commands_by_hand() -> None:
     assert pack_read_counts(5) == b"\5\0\0\0"
-    assert unpack_read_counts(b"\5\0\0\0") == 5
+    assert unpack_read_counts(b"\5\0\0\0") == ReadCounts(5, 0)
+    assert pack_read_counts(15, 4) == b"\17\0\4\0"
+    assert unpack_read_counts(b"\3\0\2\0") == ReadCounts(3, 2)
     with pytest.raises(MalformedMessage):
         unpack_read_counts(b"\5\0\0")
     rows = np.zeros(2, state_dtype(3))
@@ -155,5 +159,10 @@ def test_states_are_cut_and_joined() -> None:
 
 def test_what_a_device_announces() -> None:
     assert announced_counts(count_announcement(15)) == 15
+    assert announced_channels(count_announcement(15)) == 1
+    assert announced_channels(count_announcement(1, 4)) == 4
+    assert announced_counts(count_announcement(1, 4)) == 1
+    assert announced_channels({"channels_at_once": 4}) == 1  # of an extension of another number nothing is known
+    assert count_announcement(1) == {}
     assert announced_counts({}) == announced_counts({"photon_number_max": 15}) == 1
     assert announced_counts({"photon_number_max": 15, "count_schema": 0xEEF01CE0}) == 1
