@@ -92,7 +92,7 @@ class Checker:
             self.counts.blocks_lost_open_end += 1
             return
         stream.entries.append(entry)
-        where = np.arange(entry.first, stream.emitted_to) % RING
+        where = _places(entry.first, stream.emitted_to)
         stream.state[where] = EMITTED
         if self._automaton is not None and isinstance(message, ClickBlock):
             stream.stamps[where] = message.patterns
@@ -236,7 +236,7 @@ class Checker:
                 f"and {None if wanted is None else wanted[:2]}: repeated, changed, or skipped in silence"
             )
         stream.accounted_to = got.first + got.exposures
-        stream.state[np.arange(got.first, stream.accounted_to) % RING] = DELIVERED
+        stream.state[_places(got.first, stream.accounted_to)] = DELIVERED
         self.counts.blocks_delivered += 1
 
     def _on_gap(self, gap: Gap) -> None:
@@ -253,7 +253,7 @@ class Checker:
         if stream.accounted_to != end:
             self.fail(f"the gap {gap[:2]} ends at {end}, but only exposures up to {stream.accounted_to} were emitted")
             stream.accounted_to = end
-        stream.state[np.arange(gap.first_exposure, end) % RING] = LOST
+        stream.state[_places(gap.first_exposure, end)] = LOST
 
     def _on_output(self, output: Output) -> Output:
         stream = self._stream(self._host_session)
@@ -357,6 +357,12 @@ class WatchedInstrument(Instrument):
     def _gate(self, body: bytes) -> None:
         super()._gate(body)
         self.checker.on_gate(unpack_gate(body), self.tick)
+
+
+def _places(first: int, stop: int) -> slice | NDArray[np.int64]:
+    """Return where exposures `first` to `stop` - 1 stand in a ring; as a slice, which is quicker, where they do not go around."""
+    begin, end = first % RING, (stop - 1) % RING + 1
+    return slice(begin, end) if end - begin == stop - first else np.arange(first, stop) % RING
 
 
 def _forget_oldest(log: dict[Any, Any], most: int) -> None:

@@ -81,7 +81,7 @@ class SocketTwin:
         rows = [batch.rows.copy() for batch in _sent(self._streamed, data)]
         again = self._streamed.core
         self.took = again.tracker.counters.messages - before
-        wrong = _unlike(again, core) + _unlike_rows(rows, np.array(decisions, DECISION_DTYPE))
+        wrong = unlike(again, core) + unlike_rows(rows, np.array(decisions, DECISION_DTYPE))
         return f"the compiled turn disagrees over {data[:100].hex()}: {'; '.join(wrong)}" if wrong else ""
 
 
@@ -90,10 +90,11 @@ def differences(
 ) -> list[str]:
     """Let `streamed` read `tape`; return where decisions, counters and tallies are not those of `core`, which read it first."""
     rows = [batch.rows.copy() for batch in _read_again(streamed, tape)]
-    return [f"compiled turn: {words}" for words in _unlike(streamed.core, core) + _unlike_rows(rows, decisions)]
+    return [f"compiled turn: {words}" for words in unlike(streamed.core, core) + unlike_rows(rows, decisions)]
 
 
-def _unlike(again: Core | FlowCore, core: Core | FlowCore) -> list[str]:
+def unlike(again: Core | FlowCore, core: Core | FlowCore) -> list[str]:
+    """Return in what `again`, behind the compiled turn, is not where `core` is."""
     names = ["n_decisions", "n_abstained", "completed", "last_tick", "jitter_ticks", "contradictions"]
     if isinstance(core, FlowCore):
         names += ["n_passages", "empty_frames", "dark_frames", "watched_frames"]
@@ -108,10 +109,13 @@ def _unlike(again: Core | FlowCore, core: Core | FlowCore) -> list[str]:
     return [f"{what} {one}, Python's {other}" for what, one, other in compared if one != other]
 
 
-def _unlike_rows(rows: list[NDArray[np.void]], decisions: NDArray[np.void]) -> list[str]:
+def unlike_rows(rows: list[NDArray[np.void]], decisions: NDArray[np.void]) -> list[str]:
+    """Return the first row in which the compiled turn's decisions, in batches, are not `decisions`."""
     found = np.concatenate(rows) if rows else np.zeros(0, DECISION_DTYPE)
     if len(found) != len(decisions):
         return [f"decisions {len(found)}, Python's {len(decisions)}"]
+    if found.tobytes() == decisions.tobytes():
+        return []
     differ = np.flatnonzero(found != decisions)
     return [f"decision {differ[0]} is {found[differ[0]]}, Python's {decisions[differ[0]]}"] if differ.size else []
 

@@ -9,14 +9,17 @@ from __future__ import annotations
 import tempfile
 import time
 import traceback
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
+from pans.firmware_sim.checks.streams import StreamCounts, compare_streams
 from pans.firmware_sim.options import option
 from pans.firmware_sim.resealed import fuzz_files
 from pans.runtime.cli import say
+from pans.runtime.errors import UsageError
 from pans.runtime.ranges import Range
+from pans.runtime.turn.system import offered
 
 from . import Report, Trial, figures_text
 from .fields import MAX_GROWTH_MIB, MAX_MIB, resident_mib, sessions, sessions_beside
@@ -62,6 +65,11 @@ class Settings:
         type=Range(0, 10**9, whole=True).option,
         help="instead of those: whole sessions in which a field says something else",
     )
+    streams: int = option(
+        0,
+        type=Range(0, 10**10, whole=True).option,
+        help="instead of those: random streams with faults, by the plain core and by the compiled turn",
+    )
     over: str = option(
         "virtual",
         "of --fields: virtual time, tcp in real time, or c: the reference firmware in virtual time",
@@ -84,6 +92,8 @@ def run(settings: Settings) -> Report:
         return _run_files(settings)
     if settings.fields:
         return _run_sessions(settings)
+    if settings.streams:
+        return _run_streams(settings)
     started = time.perf_counter()
     total: dict[str, float] = {}
     parts = settings.parts
@@ -96,6 +106,20 @@ def run(settings: Settings) -> Report:
             say(f"pans fuzz: seed {seed} failed after {counts.bytes} bytes and {counts.frames} frames")
             return Report({**total, "failed_seed": seed}, False, "")
     figures = {**total, "failed_seed": None, "seconds": time.perf_counter() - started}
+    return Report(figures, True, figures_text(figures))
+
+
+def _run_streams(settings: Settings) -> Report:
+    if missing := offered():
+        raise UsageError(f"--streams compares the compiled turn with the plain core: {missing}")
+    started, total = time.perf_counter(), StreamCounts()
+    for seed in range(settings.seed, settings.seed + settings.parts):
+        counts, failure = compare_streams(seed, -(-settings.streams // settings.parts))
+        total = StreamCounts(*map(sum, zip(astuple(total), astuple(counts))))
+        if failure:
+            say(failure)
+            return Report({**asdict(total), "failed_seed": seed}, False, "")
+    figures = {**asdict(total), "failed_seed": None, "seconds": time.perf_counter() - started}
     return Report(figures, True, figures_text(figures))
 
 

@@ -339,7 +339,7 @@ class Fuzzer:
         dice, plan = self._dice, self._host_plan
         next_seq, next_exposure, _ = self._here
         count = dice.randrange(1, 6)
-        good = dice.random() < 0.8
+        good = dice.random() < 0.94  # a long gap takes Python a decision for each window in it
         seq = next_seq if good else self._strange.number(32)
         first = next_exposure + dice.choice((0,) * 9 + (1, 50)) if good else self._strange.number(64)
         cycle, slot = divmod(first, plan.slots_per_cycle)
