@@ -1,8 +1,9 @@
 """Single questions that the paper raises, each a page of `pans reproduce`.
 
 Owns what lies beside the packages `paper` and `frontier`: which options of a training matter (`ablations`), clicks and decisions while
-cells pass (`sequence`, Fig. 4C), single shots mapped beside camera frames of the same photons (`fig-2f`), and heads for few labelled
-objects (`few-labels`). Rows are plain JSON, parts lie in the cache folder; the text is written by hand. SIMULATED.
+cells pass (`sequence`, Fig. 4C), single shots mapped beside camera frames of the same photons (`fig-2f`), heads for few labelled
+objects (`few-labels`), and digits behind a fibre as a field (`mmf-mnist-field`, Fig. 5B). Rows are plain JSON, parts lie in the cache
+folder; the text is written by hand. SIMULATED.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ PAGES = {  # name of a page: its module, imported when it is asked for
     "ablations": "ablations",
     "few-labels": "few_labels",
     "fig-2f": "fig_2f",
+    "mmf-mnist-field": "fibre_field",
     "sequence": "sequence",
 }
 

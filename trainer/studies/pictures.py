@@ -90,3 +90,21 @@ def maps(path: Path, panels: Rows, classes: list[str]) -> None:
     )
     figure.suptitle("t-SNE of one readout of each test image (SIMULATED)", fontsize=10)
     save_figure(figure, path)
+
+
+def fibre_field(path: Path, rows: Rows, direct: Rows) -> None:
+    """Draw accuracy over the number of detectors beside the paper's for its input, and over photons beside direct imaging."""
+    figure, (over, light) = new_figure(width=10.5, panels=2)
+    values, features = [row["value"] for row in rows], [row["features"] for row in rows]
+    over.plot(features, values, "o-", label="ours")
+    over.plot(features, [row["release"] for row in rows], "s--", color="0.6", label="the paper, its own input")
+    light.plot([row["photons"] for row in rows], values, "o-", label="ours, photons detected")
+    light.plot([row["reaching"] for row in rows], values, "x:", color="C0", label="ours, must reach the optics")
+    light.plot([row["photons"] for row in direct], [row["value"] for row in direct], "k-", label="direct imaging")
+    over.set(xlabel="detectors, d_f", ylabel="accuracy, %")
+    light.set(xlabel="photons per digit", ylabel="accuracy, %", xscale="log")
+    for axis in (over, light):
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, loc="lower right")
+    figure.suptitle("digits behind a fibre as a field, W complex and conserving (SIMULATED)", fontsize=10)
+    save_figure(figure, path)

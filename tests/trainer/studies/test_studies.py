@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib", reason="needs the plot extra")
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import check_options
 from pans.trainer.paper import Asked
-from pans.trainer.studies import PAGES, ablations, few_labels, fig_2f, page_of, sequence
+from pans.trainer.studies import PAGES, ablations, few_labels, fibre_field, fig_2f, page_of, sequence
 from pans.trainer.tasks.registry import Objects, Task
 
 OBJECTS = Objects(np.ones((2, 1, 1), np.uint8), np.zeros(2, np.int64))
@@ -141,3 +141,28 @@ def test_arms_are_held_against_the_reference_by_both_errors():
     assert cells[0][:5] == [plain, "3", "71.00", "1.00", "0.30"]
     error = (1.0 / 3 + 0.5 / 2 + 2 * 0.3**2) ** 0.5  # variances of both means, and of the test images
     assert cells[1][:7] == [other, "2", "73.50", "0.71", "0.30", f"+2.50 ± {error:.2f}", "above"]
+
+
+# ---- digits behind a fibre as a field ----
+
+
+def test_a_fibre_row_is_compared_at_what_it_detects_and_at_what_must_reach_it():
+    direct = [
+        {"way": "posterior", "photons": photons, "value": value, "error_objects": 0.3, "clicks": photons / 2}
+        for photons, value in ((10.0, 40.0), (1000.0, 90.0))
+    ]
+    row = {"value": 70.0, "error_objects": 0.4, "photons": 100.0, "reaching": 5000.0}
+    found = fibre_field._beside(row, direct)["direct"]
+    assert found["detected"]["value"] == pytest.approx(65)  # half way in the logarithm
+    assert (found["detected"]["ahead"], found["detected"]["verdict"]) == (pytest.approx(5), "above")
+    assert found["detected"]["error"] == pytest.approx(0.5)
+    assert (found["reaching"]["photons"], found["reaching"]["verdict"]) == (1000.0, "below")
+    assert "detected" not in fibre_field._beside(row | {"photons": 5.0}, direct)["direct"]
+
+
+def test_recipes_behind_the_fibre_conserve_light() -> None:
+    for row in fibre_field.ROWS:
+        options = fibre_field.recipe(row.features)
+        check_options(options, load_profile("ideal"))
+        assert (options.complex_field, options.conserving, options.input_photons) == (True, True, 100.0)
+    assert [row.features for row in fibre_field.ROWS] == [4, 5, 6, 8, 10, 16, 24, 32]  # the paper's figure
