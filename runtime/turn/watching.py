@@ -45,6 +45,7 @@ class FrameWatch:
         self._dark: U8 = np.full((MOST_FRAMES if guard.dark_slot.any() else 0, -(-n // 8)), 0, np.uint8)
         self._seen: I64 = np.zeros((2, -(-n // 8)), np.int64)
         self._place: I64 = np.zeros(N_PLACE, np.int64)
+        self._maps = slots_until_dark(guard.dark_slot), np.append(0, np.cumsum(core.windows.lit, dtype=np.int64))
         none: I64 = np.zeros(0, np.int64)
         dead = [none] * 6 + [np.zeros((0, 0), np.int64)] + [none] * 3
         self._dead = DeadArrays(*dead) if guard.lit is None else guard.lit.arrays
@@ -84,7 +85,7 @@ class FrameWatch:
         place[DARK] = guard.watch.exposures
         if guard.lit is not None:
             place[OBJECT : OBJECTS + 1] = guard.lit.place
-        maps = (guard.dark_slot, self._core.windows.lit)
+        maps = (*self._maps, self._core.windows.lit)
         at, why = watch_frames(
             kept,
             messages,
@@ -106,6 +107,15 @@ class FrameWatch:
         return self._core.watch_frames(_block_of(kept, span)) if span[ring.WHAT] == stream.FRAMES else []
 
 
+def slots_until_dark(dark_slot: npt.NDArray[np.bool_]) -> I64:
+    """Return how many slots of a cycle lie before the next dark one, from each on, int64 (slots,); more than any block has without one."""
+    slots, dark = np.arange(len(dark_slot)), np.flatnonzero(dark_slot)
+    if not len(dark):
+        return np.full(len(slots), MOST_FRAMES, np.int64)
+    following = np.append(dark, dark[0] + len(slots))
+    return following[np.searchsorted(following, slots)] - slots
+
+
 def _block_of(kept: U8, span: npt.NDArray[Any]) -> FrameBlock:
     return decode_frames(kept[int(span[ring.BEGIN]) + HEADER.size : int(span[ring.END])].tobytes())
 
@@ -116,8 +126,9 @@ def watch_frames(kept, messages, first, maps, scratch, watch, dead, place):  # t
 
     SILENT: a channel's silence has passed its limit; the block's dark frames and its object have not been seen. ALARMED: place[ALARMS]
     alarms came of its dark frames; its object has not been seen. PASSED: with its object another one has passed, and channels are due.
-    maps: bool (slots of a cycle,) dark, and bool (visit,) lit; scratch: uint8 (n, bytes) dark frames, the same read-only, and int64
-    (2, bytes); watch: ChannelWatch.arrays, dead: DeadArrays (of length 0 without such a test), place int64 (N_PLACE,).
+    maps: `slots_until_dark` int64 (slots of a cycle,), of a visit how many exposures are lit before each int64 (visit + 1,) and which ones
+    bool (visit,); scratch: uint8 (n, bytes) dark frames, the same read-only, and int64 (2, bytes); watch: ChannelWatch.arrays, dead:
+    DeadArrays (of length 0 without such a test), place int64 (N_PLACE,).
     """
     kept, messages, place, maps, scratch = bare(kept), bare(messages), bare(place), bare(maps), bare(scratch)
     watch, dead = bare(watch), bare(dead)
@@ -148,13 +159,11 @@ def watch_frames(kept, messages, first, maps, scratch, watch, dead, place):  # t
 @inner
 def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-def]
     """Gather a block's dark frames and return how many; which channels clicked in any frame and in lit ones, -1 where none was lit."""
-    dark_slot, lit = maps
+    until_dark, lit_before, lit = maps
     n_bytes, width = seen.shape[1], load4(kept, payload + _U(28)) >> _U(16)
     exposure = np.int64(load8(kept, payload + _U(16)))
-    slot, here, n_dark = exposure % dark_slot.size, exposure % lit.size, 0
-    start, n_lit = payload + _U(stream.BLOCK_HEADER), np.int64(0)
-    for i in range(_U(here), _U(here + count)):  # of places that cannot be negative numba makes one addition for many
-        n_lit += lit[i]
+    here, n_dark, start = exposure % lit.size, 0, payload + _U(stream.BLOCK_HEADER)
+    n_lit = lit_before[here + count] - lit_before[here]
     if n_lit == count:
         _all_seen(kept, start, count * np.int64(width), np.int64(width), seen)
     for byte in range(n_bytes if n_lit < count else 0):
@@ -165,12 +174,11 @@ def _look(kept, payload, count, maps, dark, seen):  # type: ignore[no-untyped-de
             lit_seen |= word if lit[here + i] else np.int64(0)
             at += width
         seen[0, byte], seen[1, byte] = all_seen, lit_seen
-    for i in range(count if dark.shape[0] else 0):
-        if dark_slot[slot]:
-            for byte in range(n_bytes):
-                dark[n_dark, byte] = kept[start + _U(i) * width + _U(byte)]
-            n_dark += 1
-        slot = slot + 1 if slot + 1 < dark_slot.size else 0
+    i = until_dark[exposure % until_dark.size]
+    while i < count and dark.shape[0]:
+        for byte in range(n_bytes):
+            dark[n_dark, byte] = kept[start + _U(i) * width + _U(byte)]
+        i, n_dark = i + 1 + until_dark[(exposure + i + 1) % until_dark.size], n_dark + 1
     if not n_lit:
         seen[1, 0] = -1
     return n_dark

@@ -15,7 +15,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
 from pans.runtime.instrument.dead_channels import DeadChannelTest
 from pans.runtime.turn.rings import BEGIN, END, WHAT
-from pans.runtime.turn.watching import FrameWatch
+from pans.runtime.turn.watching import MOST_FRAMES, FrameWatch, slots_until_dark
 from pans.runtime.wire.framing import FrameDecoder
 from pans.runtime.wire.messages import FrameBlock, Mark, decode_frames, encode_frames, encode_mark, pack_body
 
@@ -78,3 +78,12 @@ def test_many_blocks_at_once_tell_what_each_of_them_tells(lit: bool) -> None:
         assert one.guard.lit.place == many.guard.lit.place
         for a, b in zip(one.guard.lit.arrays, many.guard.lit.arrays):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("dark", [[0], [3], [0, 1, 6], [2, 5, 6], range(7), []])
+def test_how_far_the_next_dark_slot_is(dark: list[int]) -> None:
+    slots = np.zeros(7, np.bool_)
+    slots[list(dark)] = True
+    around = np.concatenate([slots, slots]).tolist()
+    wanted = [around.index(True, slot) - slot if len(dark) else MOST_FRAMES for slot in range(7)]
+    assert slots_until_dark(slots).tolist() == wanted
