@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
 from pans.runtime.errors import LinkError
+from pans.runtime.link.reader import count_delimiters
 
 from .faulty import FaultyDevice
 
@@ -54,7 +55,7 @@ class VirtualLink:
         with suppress(LinkError):
             while frames > 0 and size > 0 and self._now_ns < until_ns and (data := self.read(timeout_s)):
                 reads.append((self._now_ns, data))
-                frames -= data.count(0)
+                frames -= count_delimiters(data)
                 size -= len(data)
         return reads
 

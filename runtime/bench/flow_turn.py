@@ -50,7 +50,7 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
         steps.begin(SESSION)
         rows = [np.zeros(0, DECISION_DTYPE)]
         for data in reads:
-            ended = turn.feed(data, np.array([(len(data), 1)]))
+            ended = turn.feed([(1, data)])
             rows.append(turn.rows.copy())
             while ended != ring.ALL_TAKEN:
                 ended = turn.feed_on()
@@ -61,7 +61,7 @@ def flow_row(bundle: Bundle, quick: bool) -> Row:
         other.begin(0, 0)
         found = []
         for data in reads:
-            spans, place = plain.take(data.tobytes()), 0
+            spans, place = plain.take(data), 0
             while place < len(spans):
                 taken, output = other.step_messages(Messages(plain.buffer, spans), place)
                 found += output.decisions
@@ -102,7 +102,7 @@ def _core(bundle: Bundle, plan: Plan) -> FlowCore:
     return core
 
 
-def _reads(n_features: int, blocks: int) -> Iterator[NDArray[np.uint8]]:
+def _reads(n_features: int, blocks: int) -> Iterator[bytes]:
     """Some blocks at a time, as they come at one read."""
     rng, n_bytes = np.random.default_rng(1), -(-n_features // 8)
     data: list[bytes] = []
@@ -114,5 +114,5 @@ def _reads(n_features: int, blocks: int) -> Iterator[NDArray[np.uint8]]:
         message = FrameBlock(block, 0, first * PERIOD_TICKS, first, PERIOD_TICKS, NO_OBJECT, words)
         data.append(encode_frames(message, SESSION))
         if len(data) == READ_BLOCKS or block == blocks - 1:
-            yield np.frombuffer(b"".join(data), np.uint8).copy()
+            yield b"".join(data)
             data.clear()

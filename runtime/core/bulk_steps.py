@@ -20,14 +20,25 @@ from pans.runtime.wire.frame import Frame, Messages
 from pans.runtime.wire.messages import Mark, MessageType
 
 from . import stream_kernels as kernels
-from .decision import DECISION_DTYPE, NO_LABEL, DecisionFlag, Output
+from .decision import (
+    DECISION_DTYPE,
+    NO_LABEL,
+    RUN_DTYPE,
+    VERDICT_DTYPE,
+    DecisionFlag,
+    NumberedDecisions,
+    Output,
+    RowDecisions,
+)
 from .follower import Follower
 from .plan import Plan
-from .stream_arrays import DecisionTables, MarkArrays, WalkArrays
+from .stream_arrays import DecisionTables, MarkArrays, NumberArrays, WalkArrays
 from .window import DecisionWindows
-from .window_kernels import WindowArrays
+from .window_kernels import ONES, WindowArrays
 
 ROWS_PER_BATCH = 65536  # fewer and longer ways through Python; memory for them is a megabyte per 18 000
+NUMBERS_PER_BATCH = 1 << 17  # of decisions that are numbered: at a frame a microsecond, those between two clock probes
+ASKED_FOR = 1 << 12  # of them, rows that are asked for again and again: as many as a recorder's buffer holds
 WORD_FEATURES = 24  # of tables by word: what stream_kernels.py looks up at once
 CLICKS_MAX = 1 << 16  # exposures of one block: its count is a u16
 _KINDS = {"parallel": place.FRAMES, "sequential": place.CLICKS}
@@ -58,9 +69,12 @@ class BulkSteps:
     ) -> None:
         self.core, self.windows = core, windows
         self._decider, self._shots = decider, shots
-        # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
-        self._rows: Rows = np.full(rows_max, 0, DECISION_DTYPE)
         self.tables = decision_tables(decider, shots, plan)
+        self._verdicts = word_verdicts(self.tables, decider.n_features)
+        # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
+        self._numbered = _numbers(rows_max if len(self._verdicts) else 0, windows)
+        self._rows: Rows = np.zeros(rows_max, DECISION_DTYPE)
+        self._rows[: ASKED_FOR if len(self._verdicts) else rows_max] = np.zeros((), DECISION_DTYPE)
         self._counts = np.full((0 if self.tables.labels.size else rows_max, decider.n_features), 0, np.int64)
         self._marks, self._told = _no_marks(), _no_marks()  # as the kernel knows them, and as the core does
         sequential = plan.mode != "parallel"
@@ -83,7 +97,9 @@ class BulkSteps:
     @property
     def walk(self) -> WalkArrays:
         """What a kernel continues between `load` and `store`."""
-        return WalkArrays(self._state, self._marks, self._windows, self.tables, self._rows, self._counts)
+        return WalkArrays(
+            self._state, self._marks, self._windows, self.tables, self._rows, self._counts, self._numbered
+        )
 
     @property
     def decides(self) -> bool:
@@ -131,7 +147,15 @@ class BulkSteps:
         if self.core.tracker.open:
             buffer, spans = messages
             ended = kernels.walk_messages(
-                buffer, spans, state, self._marks, self._windows, self.tables, self._rows, self._counts
+                buffer,
+                spans,
+                state,
+                self._marks,
+                self._windows,
+                self.tables,
+                self._rows,
+                self._counts,
+                self._numbered,
             )
         self.store()
         return int(state[kernels.MESSAGE]), self.labelled(int(state[kernels.N_ROWS])), ended == kernels.ODD
@@ -154,6 +178,8 @@ class BulkSteps:
 
     def labelled(self, n: int, first: int = 0) -> Rows:
         """Return `n` rows from `first` on; those that the kernel could not label from a table get their verdicts here, all at once."""
+        if self._numbered.numbers.size:
+            return self.decisions(slice(first, first + n)).rows
         rows = self._rows[first : first + n]
         if self.tables.labels.size or not n:
             return rows
@@ -166,6 +192,19 @@ class BulkSteps:
             rows["flags"][whole[silent]] = why[silent] | int(DecisionFlag.ABSTAINED)
             self.core.n_abstained += int(silent.sum())
         return rows
+
+    def decisions(self, place: slice) -> RowDecisions:
+        """Return the decisions at `place`, as `labelled` gives them; their rows are made when somebody asks for them, if that can be."""
+        if not self._numbered.numbers.size:
+            return RowDecisions(self.labelled(place.stop - place.start, place.start))
+        decided = self._verdicts, self._numbered.numbers[place], self._numbered.runs[place]
+
+        def rows_of(first: int, stop: int) -> Rows:
+            rows = self._rows[: stop - first]
+            kernels.write_rows(*decided, first, stop, rows)
+            return rows
+
+        return NumberedDecisions(*decided, rows_of)
 
     def load(self) -> None:
         """Copy what Core, its tracker and its windows know into the kernel's state."""
@@ -224,6 +263,40 @@ def _no_marks() -> MarkArrays:
     return MarkArrays(np.full(n, -1, np.int64), np.full(n, 0, np.int16), np.full(n, 0, np.float32))
 
 
+def _numbers(n: int, windows: DecisionWindows) -> NumberArrays:
+    """Return room for `n` numbered decisions in memory that has been touched; of a plan's stretches only with room."""
+    _, window_at, *_ = windows.arrays()
+    goes_on = np.where(window_at[:-1] < 0, window_at[1:] == window_at[:-1], window_at[1:] == window_at[:-1] + 1)
+    ends = np.append(np.flatnonzero(~goes_on) + 1, len(window_at))
+    ends = ends[np.searchsorted(ends, np.arange(len(window_at) if n else 0), side="right")]
+    return NumberArrays(np.full(n, 0, np.uint32), np.full(n, 0, RUN_DTYPE), ends.astype(np.int32))
+
+
+def word_verdicts(tables: DecisionTables, n_features: int) -> Rows:
+    """Return the verdict on each row of the table, VERDICT_DTYPE (rows,), where words are looked up at once; else none."""
+    n_bytes = len(tables.word_rows)
+    verdicts: Rows = np.zeros(len(tables.labels) if n_bytes else 0, VERDICT_DTYPE)
+    words = np.arange(1 << n_features if n_bytes else 0)
+    rows, clicks, crc = np.zeros_like(words), np.zeros_like(words), np.full(len(words), tables.crc_zero[0])
+    for byte in range(n_bytes):
+        part = words >> 8 * byte & 0xFF
+        rows += tables.word_rows[byte, part]
+        clicks += ONES[part]
+        crc ^= tables.word_crc[byte, part]
+    if n_bytes:
+        verdicts["label"], verdicts["probability"] = tables.labels, tables.probabilities
+        why = np.where(tables.probabilities > 0, int(DecisionFlag.AMBIGUOUS), int(DecisionFlag.NOT_FINITE))
+        verdicts["flags"] = np.where(tables.labels == NO_LABEL, why | int(DecisionFlag.ABSTAINED), 0)
+        verdicts["clicks"][rows], verdicts["counts_crc"][rows] = clicks, crc
+    return verdicts
+
+
+def is_numbered(decider: Decider, shots: int, plan: Plan) -> bool:
+    """Whether frames of parallel channels are decided word by word: by a table, each by itself."""
+    by_table = hasattr(decider, "radix") and decider.n_features <= WORD_FEATURES
+    return shots == 1 and plan.mode == "parallel" and by_table
+
+
 def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     """Return what decides without asking `decider`: its table, or the leaves of the plan's automaton (empty arrays for any other), and the
     tables of the counts' checksum for K = `shots`.
@@ -236,7 +309,7 @@ def decision_tables(decider: Decider, shots: int, plan: Plan) -> DecisionTables:
     if found is not None or (plan.automaton is not None and getattr(decider, "automaton", None) is plan.automaton):
         labels, probabilities = _finite(getattr(decider, "labels"), getattr(decider, "probabilities"))  # noqa: B009
     table, zero = count_crc_tables(n_features, shots)
-    n_bytes = -(-n_features // 8) if shots == 1 and found is not None and n_features <= WORD_FEATURES else 0
+    n_bytes = -(-n_features // 8) if is_numbered(decider, shots, plan) else 0
     word_rows, word_crc = np.zeros((n_bytes, 256), np.int64), np.zeros((n_bytes, 256), np.uint32)
     for feature in range(n_features if n_bytes else 0):
         byte, bit = feature >> 3, feature & 7

@@ -1,11 +1,12 @@
 """What a core says: decisions with their flags, the passages and pulses that belong to them, and the output of one step.
 
-Owns the vocabulary that cores, recordings, reports and the live run share, and the row of the decision log; never decides.
+Owns the vocabulary that cores, recordings, reports and the live run share, the row of the decision log, and the run and the verdict that it
+is made of; never decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import Any, NamedTuple, Protocol, overload
@@ -47,6 +48,24 @@ DECISION_DTYPE = np.dtype(
     ]
 )
 
+VERDICT_FIELDS = ("clicks", "label", "flags", "probability", "counts_crc")
+VERDICT_DTYPE = np.dtype([(name, DECISION_DTYPE[name]) for name in VERDICT_FIELDS])
+RUN_DTYPE = np.dtype(
+    [
+        ("index", "<u8"),  # of the first decision; the following ones count up
+        ("tick", "<u8"),
+        ("exposure_index", "<u8"),
+        ("object", "<u4"),
+        ("shot", "<u4"),
+        ("count", "<u4"),  # decisions, 1 or more
+        ("tick_step", "<u4"),
+        ("exposure_step", "<u4"),
+        ("shot_step", "<u4"),
+        ("truth", "<i2"),
+        ("continues", "<u2"),  # 1: the rest of the last run of the block before; of a core's runs 0
+    ]
+)
+
 
 class Decision(NamedTuple):
     """One row of the decision log, in the order of DECISION_DTYPE; `probability` is the winning class's softmax.
@@ -72,10 +91,20 @@ class RowDecisions(Sequence[Decision]):
     """Decisions that stand in rows, DECISION_DTYPE (n,), valid until the next call, of which each is made when somebody asks for it."""
 
     def __init__(self, rows: npt.NDArray[np.void]) -> None:
-        self.rows = rows
+        self._rows = rows
+
+    @property
+    def rows(self) -> npt.NDArray[np.void]:
+        """All of them, DECISION_DTYPE (n,)."""
+        return self._rows
+
+    @property
+    def first(self) -> int:
+        """The number of the first one, behind which the others count up; 0 where there is none."""
+        return int(self._rows["index"][0]) if len(self._rows) else 0
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self._rows)
 
     def __iter__(self) -> Iterator[Decision]:
         return iter([Decision(*row) for row in self.rows.tolist()])
@@ -89,6 +118,54 @@ class RowDecisions(Sequence[Decision]):
     def __getitem__(self, at: int | slice) -> Decision | list[Decision]:
         found = self.rows[at].tolist()
         return [Decision(*row) for row in found] if isinstance(at, slice) else Decision(*found)
+
+
+class NumberedDecisions(RowDecisions):
+    """Decisions of which each is a row of a table, valid until the next call: what frames of parallel channels give, one by one.
+
+    `numbers` uint32 (n,) are places in `verdicts`, VERDICT_DTYPE. `runs` RUN_DTYPE (n,) tell the rest: the run that begins with decision i
+    stands at runs[i], and the next one behind its `count`; places in between are not looked at. Whole rows are made by `rows_of`, from
+    one place up to another, when somebody asks for them; they are valid until the next are asked for.
+    """
+
+    def __init__(
+        self,
+        verdicts: npt.NDArray[np.void],
+        numbers: npt.NDArray[np.uint32],
+        runs: npt.NDArray[np.void],
+        rows_of: Callable[[int, int], npt.NDArray[np.void]],
+    ) -> None:
+        self.verdicts, self.numbers, self.runs, self._rows_of = verdicts, numbers, runs, rows_of
+
+    @property
+    def rows(self) -> npt.NDArray[np.void]:
+        """See RowDecisions."""
+        return self._rows_of(0, len(self))
+
+    @property
+    def first(self) -> int:
+        """See RowDecisions."""
+        return int(self.runs["index"][0]) if len(self) else 0
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Decision]:
+        return iter(self[:])
+
+    @overload
+    def __getitem__(self, at: int) -> Decision: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> list[Decision]: ...
+
+    def __getitem__(self, at: int | slice) -> Decision | list[Decision]:
+        place = range(len(self))[at]
+        if isinstance(place, int):
+            return Decision(*self._rows_of(place, place + 1)[0].tolist())
+        if place.step != 1:
+            return [self[one] for one in place]
+        return [Decision(*row) for row in self._rows_of(place.start, max(place.start, place.stop)).tolist()]
 
 
 class Action(NamedTuple):

@@ -17,7 +17,7 @@ from pans.runtime.instrument.channel_health import Finding
 from pans.runtime.wire.frame import Messages
 from pans.runtime.wire.messages import NO_OBJECT, UNKNOWN_TRUTH, ClickBlock, FrameBlock
 
-from .bulk_steps import BulkSteps, rows_needed
+from .bulk_steps import NUMBERS_PER_BATCH, ROWS_PER_BATCH, BulkSteps, is_numbered, rows_needed
 from .dark_guard import DarkGuard
 from .decision import NO_LABEL, Decision, DecisionFlag, Output
 from .follower import ANY_CLASS, Follower, Place
@@ -53,7 +53,8 @@ class Core(Follower):
         if self.guard is not None:
             self.guard.warm_up()
         if self._plan.largest == 1 and (self.guard is None or self.guard.policy == "warn"):
-            rows = rows_needed(self.windows.n_windows)
+            many = is_numbered(self._decider, self.shots, self._plan)
+            rows = rows_needed(self.windows.n_windows, NUMBERS_PER_BATCH if many else ROWS_PER_BATCH)
             steps = self._bulk = BulkSteps(self, self.windows, self._plan, self._decider, self.shots, rows)
             ordinary = steps.decides and not self.windows.parallel  # others decide one by one, as `step` does
             self._steps = steps if ordinary else None

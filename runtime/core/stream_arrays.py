@@ -40,6 +40,18 @@ class MarkArrays(NamedTuple):
     photons: npt.NDArray[np.float32]
 
 
+class NumberArrays(NamedTuple):
+    """Decisions that are rows of a table, as decision.NumberedDecisions: numbers uint32 (m,) and runs RUN_DTYPE (m,).
+
+    `ends` int32 (visit,): behind which exposure ends the stretch, all dark or one window each, that an exposure of a visit belongs to. All
+    are of length 0 where kernels write whole rows at once.
+    """
+
+    numbers: npt.NDArray[np.uint32]
+    runs: npt.NDArray[np.void]
+    ends: npt.NDArray[np.int32]
+
+
 class Block(NamedTuple):
     """An accepted block: its frames (of CLICKS: exposures) from `at` on in the buffer, from exposure `first`, `relative` in the visit, on.
 
@@ -60,7 +72,10 @@ class Block(NamedTuple):
 
 
 class WalkArrays(NamedTuple):
-    """What `take_message` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f)."""
+    """What `take_message` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
+
+    Where `numbered` has room, decisions go there, and `rows` is only as long.
+    """
 
     state: npt.NDArray[np.int64]
     marks: MarkArrays
@@ -68,3 +83,4 @@ class WalkArrays(NamedTuple):
     tables: DecisionTables
     rows: npt.NDArray[np.void]
     counts: npt.NDArray[np.int64]
+    numbered: NumberArrays

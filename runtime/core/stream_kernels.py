@@ -16,7 +16,20 @@ from pans.runtime.wire.schema import DARK_PATTERN, NO_OBJECT, UNKNOWN_TRUTH
 
 from .decision import NO_LABEL, DecisionFlag
 from .stream_arrays import Block
-from .window_kernels import DARK_CLICKS, DARK_EXPOSURES, add_exposures, add_walks, complete, spill, sum_up
+from .window_kernels import (
+    DARK_CLICKS,
+    DARK_EXPOSURES,
+    ONES,
+    SPREAD,
+    add_exposures,
+    add_walks,
+    begin_visit,
+    clicks_of_words,
+    complete,
+    number_words,
+    spill,
+    sum_up,
+)
 
 # state, int64 (N_STATE,): where the stream (stream.N_PLACE columns) and the walk stand; what it continues of Core and DecisionWindows
 MESSAGE, FRAME, N_ROWS, SESSION, VISIT, NEXT_WINDOW, OBJECT = range(stream.N_PLACE, stream.N_PLACE + 7)
@@ -33,18 +46,16 @@ _ABSTAINED = int(DecisionFlag.ABSTAINED)
 _GAP, _WRONG = int(DecisionFlag.GAP) | _ABSTAINED, int(DecisionFlag.WRONG_PATTERN) | _ABSTAINED
 _NOT_FINITE, _AMBIGUOUS = int(DecisionFlag.NOT_FINITE) | _ABSTAINED, int(DecisionFlag.AMBIGUOUS) | _ABSTAINED
 _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
-SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
-ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
 
 
 @outer
-def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
     """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
 
     Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows
-    WindowArrays, tables DecisionTables, rows DECISION_DTYPE (m,), counts_out int64 (m, d_f).
+    WindowArrays, tables DecisionTables, rows DECISION_DTYPE (m,), counts_out int64 (m, d_f), numbered NumberArrays.
     """
-    marks, windows, tables = bare(marks), bare(windows), bare(tables)
+    marks, windows, tables, numbered = bare(marks), bare(windows), bare(tables), bare(numbered)
     buffer, state, rows, counts_out = bare(buffer), bare(state), bare(rows), bare(counts_out)
     blocks = 0
     while state[MESSAGE] < spans.shape[0]:
@@ -55,7 +66,7 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
         start, stop = _U(spans[state[MESSAGE], 0]), _U(spans[state[MESSAGE], 1])
         if state[STEPS] and buffer[start] == stream.MARK:
             return ODD  # a live run looks into the core's own marks
-        took = take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out)
+        took = take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered)
         if took in (ODD, ROWS_FULL):
             return took
         blocks += took == TOOK_BLOCK
@@ -64,7 +75,7 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
 
 
 @inner
-def take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+def take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
     """Take the message from `start` to `stop`, uint64: TOOK_MARK, TOOK_BLOCK, ODD where it is not ordinary (and nothing is done).
 
     ROWS_FULL: the rows are, within a block; state[FRAME] says where it goes on.
@@ -79,8 +90,8 @@ def take_message(buffer, start, stop, state, marks, windows, tables, rows, count
         if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
             return ODD
         block = _block_of(buffer, payload, state, marks, windows)
-        if tables.word_rows.size:
-            _take_words(buffer, block, state, windows, tables, rows)
+        if numbered.numbers.size:
+            _take_words(buffer, block, state, windows, tables, numbered)
         else:
             _take_windows(buffer, block, state, windows, tables, rows, counts_out)
         if state[FRAME] < block.frames:
@@ -172,7 +183,7 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     if not _is_due(visit, first - visit * state[VISIT_EXPOSURES], state, windows):
         return False
     if visit != state[VISIT]:
-        _begin_visit(windows)
+        begin_visit(windows)
         state[VISIT] = visit
         state[NEXT_WINDOW] = 0
     state[OBJECT] = number
@@ -185,20 +196,6 @@ def _accept(buffer, payload, count, state, windows):  # type: ignore[no-untyped-
     state[JITTER] = max(state[JITTER], abs(state[LAST_TICK] - due))
     stream.go_on(state, count)
     return True
-
-
-@inner
-def _begin_visit(windows):  # type: ignore[no-untyped-def]
-    """No window has anything yet; element by element: numba takes seconds to compile the assignment of a slice."""
-    counts, seen, nodes = windows.counts, windows.seen, windows.walks.nodes
-    need, last, longest = windows.walks.need, windows.last, windows.longest
-    for window in range(counts.shape[0]):
-        for feature in range(counts.shape[1]):
-            counts[window, feature] = 0
-        seen[window, 0], seen[window, 1] = 0, 0
-        need[window], last[window] = longest[0, window], longest[1, window]
-    for walk in range(nodes.size):
-        nodes[walk] = 0
 
 
 @inner
@@ -233,55 +230,56 @@ def _block_of(buffer, payload, state, marks, windows):  # type: ignore[no-untype
 
 
 @inner
-def _take_words(buffer, block, state, windows, tables, rows):  # type: ignore[no-untyped-def]
-    """K = 1 with a table, frames from state[FRAME] on: every frame with light is a window, every word a row.
-
-    Arrays are taken out of their tuples once: inside the loop that would count references for every frame.
-    """
-    window_at, seen, tallies = windows.window_at, windows.seen, windows.tallies
-    labels, probabilities, word_rows, word_crc = tables.labels, tables.probabilities, tables.word_rows, tables.word_crc
-    n_features, last, crc_zero, none = (
-        windows.counts.shape[1],
-        _U(windows.lanes.size - 1),
-        tables.crc_zero[0],
-        np.uint32(0),
-    )
-    top_mask = _U(block.top_mask)
-    n_rows, done, room, known = _U(state[N_ROWS]), block.frames, _U(rows.size), block.truth
-    before, silent, window = _U(state[N_DECISIONS]) - n_rows, np.int64(0), state[NEXT_WINDOW]
-    at, tick = block.at + _U(state[FRAME]) * block.word_bytes, block.end_tick + state[FRAME] * block.period_ticks
-    for i in range(state[FRAME], block.frames):
-        byte = _U(buffer[at + last]) & top_mask
-        clicks, word, crc = ONES[byte], word_rows[last, byte], crc_zero ^ word_crc[last, byte]
-        if last:  # one by one: a loop of one turn, made for many, took longer than all the rest
-            byte = _U(buffer[at])
-            clicks, word, crc = clicks + ONES[byte], word + word_rows[0, byte], crc ^ word_crc[0, byte]
-            if last > _U(1):
-                byte = _U(buffer[at + _U(1)])
-                clicks, word, crc = clicks + ONES[byte], word + word_rows[1, byte], crc ^ word_crc[1, byte]
-        here, ended = np.int64(window_at[block.relative + i]), tick
-        at, tick = at + block.word_bytes, tick + block.period_ticks
+def _take_words(buffer, block, state, windows, tables, numbered):  # type: ignore[no-untyped-def]
+    """K = 1 with a table, frames from state[FRAME] on: every frame with light is a window, every word a row of the table."""
+    window_at, tallies, n_features = windows.window_at, windows.tallies, windows.counts.shape[1]
+    numbers, runs, ends = numbered.numbers, numbered.runs, numbered.ends
+    n, frame, window, silent = state[N_ROWS], state[FRAME], state[NEXT_WINDOW], np.int64(0)
+    before = state[N_DECISIONS] - n
+    while frame < block.frames and n < numbers.size:
+        here = np.int64(window_at[block.relative + frame])
+        stop = min(np.int64(ends[block.relative + frame]) - block.relative, block.frames)
+        at, top = block.at + _U(frame) * block.word_bytes, _U(block.top_mask)
         if here < 0:
-            tallies[DARK_CLICKS] += clicks
-            tallies[DARK_EXPOSURES] += n_features
+            tallies[DARK_CLICKS] += clicks_of_words(buffer, at, stop - frame, block.word_bytes, top, windows.lanes.size)
+            tallies[DARK_EXPOSURES] += n_features * (stop - frame)
+            frame = stop
             continue
-        seen[_U(here), 0] = n_features
-        label, probability, flags = _look_up(labels, probabilities, _U(word))
-        row = rows[n_rows]
-        row["index"], row["tick"], row["exposure_index"], row["object"] = (
-            before + n_rows,
-            ended,
-            block.first + i,
-            block.object,
+        stop = min(stop, frame + numbers.size - n)
+        silent += number_words(
+            buffer, at, block.word_bytes, top, tables.word_rows, tables.labels, numbers, n, stop - frame
         )
-        row["shot"], row["clicks"], row["label"], row["truth"], row["flags"] = here, clicks, label, known, flags
-        row["probability"], row["counts_crc"], row["exposures"] = probability, crc, none
-        n_rows, silent, window = n_rows + _U(1), silent + (flags != 0), here + 1
-        if n_rows == room:
-            done = i + 1
-            break
-    state[N_ROWS], state[FRAME], state[NEXT_WINDOW] = n_rows, done, window
-    state[N_DECISIONS], state[N_ABSTAINED] = before + n_rows, state[N_ABSTAINED] + silent
+        run = runs[n]
+        run["index"], run["exposure_index"], run["shot"] = before + n, block.first + frame, here
+        run["tick"], run["tick_step"] = block.end_tick + frame * block.period_ticks, block.period_ticks
+        run["object"], run["truth"], run["count"] = block.object, block.truth, stop - frame
+        run["exposure_step"], run["shot_step"], run["continues"] = 1, 1, 0
+        n, window, frame = n + stop - frame, here + stop - frame, stop
+    state[N_ROWS], state[FRAME], state[NEXT_WINDOW] = n, frame, window
+    state[N_DECISIONS], state[N_ABSTAINED] = before + n, state[N_ABSTAINED] + silent
+
+
+@outer
+def write_rows(verdicts, numbers, runs, first, stop, rows):  # type: ignore[no-untyped-def]
+    """Write NumberedDecisions from place `first` to `stop` whole: rows DECISION_DTYPE (stop - first,)."""
+    begin, none = np.int64(0), np.uint32(0)
+    while begin < stop:
+        run, number = runs[begin], runs[begin]["object"]
+        index, tick, exposure, shot = _U(run["index"]), _U(run["tick"]), _U(run["exposure_index"]), _U(run["shot"])
+        tick_step, exposure_step, shot_step = _U(run["tick_step"]), _U(run["exposure_step"]), _U(run["shot_step"])
+        truth, end = run["truth"], begin + np.int64(run["count"])
+        for i in range(max(begin, first), min(end, stop)):
+            row, verdict, k = rows[i - first], verdicts[numbers[i]], _U(i - begin)
+            row["index"], row["tick"], row["exposure_index"] = (
+                index + k,
+                tick + k * tick_step,
+                exposure + k * exposure_step,
+            )
+            row["object"], row["truth"], row["shot"] = number, truth, shot + k * shot_step
+            row["clicks"], row["label"], row["flags"] = verdict["clicks"], verdict["label"], verdict["flags"]
+            row["probability"], row["counts_crc"] = verdict["probability"], verdict["counts_crc"]
+            row["exposures"] = none
+        begin = end
 
 
 @inner

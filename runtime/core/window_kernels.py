@@ -1,4 +1,5 @@
 """The compiled kernels of the windows: exposures in; clicks, and how many exposures were right, out. Sums over a whole window's clicks.
+Frames that are a window each: words in, rows of a table out.
 
 Owns the loops, and with them what every exposure of a visit means; never allocates. The arrays are window.DecisionWindows'.
 
@@ -13,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.wire.inner import inner, outer
 from pans.runtime.wire.schema import DARK_PATTERN
 
 DARK_EXPOSURES, DARK_CLICKS, WRONG_PATTERNS, LATE_SLOTS, N_TALLIES = 0, 1, 2, 3, 4
 _U = np.uint64
 _LANE = _U(0xFF)
+SPREAD = np.array([sum((byte >> bit & 1) << 8 * bit for bit in range(8)) for byte in range(256)], np.uint64)
+ONES = np.array([byte.bit_count() for byte in range(256)], np.int64)
 BROKEN = -1  # where a walk stands whose exposure was lost or showed the wrong state: nobody knows
 
 
@@ -145,6 +149,20 @@ def add_walks(relative, patterns, bits, maps, walks, counts, seen, tallies):  # 
 
 
 @inner
+def begin_visit(windows):  # type: ignore[no-untyped-def]
+    """No window has anything yet; element by element: numba takes seconds to compile the assignment of a slice."""
+    counts, seen, nodes = windows.counts, windows.seen, windows.walks.nodes
+    need, last, longest = windows.walks.need, windows.last, windows.longest
+    for window in range(counts.shape[0]):
+        for feature in range(counts.shape[1]):
+            counts[window, feature] = 0
+        seen[window, 0], seen[window, 1] = 0, 0
+        need[window], last[window] = longest[0, window], longest[1, window]
+    for walk in range(nodes.size):
+        nodes[walk] = 0
+
+
+@inner
 def complete(lanes, counts, seen, window, held, whole):  # type: ignore[no-untyped-def]
     """The counts of a window whose last exposure has come, into `whole`."""
     if seen[window, 0] != 0:  # it began in an earlier block
@@ -191,3 +209,34 @@ def sum_up(whole, radix, crc_table, crc):  # type: ignore[no-untyped-def]
         for feature in range(whole.size):
             crc ^= crc_table[byte, feature, (whole[feature] >> (8 * byte)) & 0xFF]
     return clicks, index, crc
+
+
+@inner
+def number_words(buffer, at, word_bytes, top, word_rows, labels, numbers, first, count):  # type: ignore[no-untyped-def]
+    """Put the rows of the table that `count` words from byte `at` on lead to behind numbers[:first]; return how many of them abstain.
+
+    `top` are the bits of a word's last byte that are channels; at, word_bytes and top uint64.
+    """
+    last, silent = _U(word_rows.shape[0] - 1), np.int64(0)
+    for i in range(_U(first), _U(first + count)):
+        row = word_rows[last, _U(buffer[at + last]) & top]
+        if last:  # one by one: a loop of one turn, made for many, took longer than all the rest
+            row += word_rows[0, buffer[at]]
+            if last > _U(1):
+                row += word_rows[1, buffer[at + _U(1)]]
+        numbers[i] = row
+        silent += labels[_U(row)] == NO_LABEL
+        at += word_bytes
+    return silent
+
+
+@inner
+def clicks_of_words(buffer, at, count, word_bytes, top, n_bytes):  # type: ignore[no-untyped-def]
+    """The clicks of `count` words from byte `at` on, each of them in its first `n_bytes` bytes; as number_words."""
+    clicks, last = np.int64(0), _U(n_bytes - 1)
+    for _ in range(count):
+        clicks += ONES[_U(buffer[at + last]) & top]
+        for byte in range(last):
+            clicks += ONES[buffer[at + byte]]
+        at += word_bytes
+    return clicks

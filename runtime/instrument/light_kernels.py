@@ -16,24 +16,31 @@ from pans.runtime.wire.inner import inner, outer
 DECISIONS, CLICKS, IN_BATCH, N, SUM, SQUARES, BATCHES, TOTAL, FALL, RISE, BATCH, N_COUNTS = *range(9), 11, 14, 15
 # levels, float64 (N_LEVELS,): the two sums; of the baseline mean, slack and threshold; before it, its least error and batches
 LOW, HIGH, MEAN, SLACK, THRESHOLD, ERROR, LEAST, MOST, N_LEVELS = range(9)
+_U = np.uint64
 ALL_TAKEN, LEARNT, FELL, ROSE = range(4)  # why a call ended
 
 
 @outer
-def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
+def take_clicks(rows, numbers, left_out, first, counts, levels):  # type: ignore[no-untyped-def]
     """Take decisions from `first` on, but those with one of the flags `left_out`; return where it ended, behind which, and why.
 
-    rows (n,) have fields `clicks` and `flags`, uint32: rows, since numba tells a column of one from a column of many. LEARNT: the batches
+    Decision i is rows[numbers[i]]; numbers uint32 (n,). Rows have fields `clicks` and `flags`, uint32: rows, since numba tells a column of
+    one from a column of many. LEARNT: the batches
     so far may make a baseline (levels[MEAN] is NaN without one). FELL, ROSE: that sum has passed the threshold; the other one has not
     been looked at, if it is the later.
     """
     clicks, flags, batch = rows["clicks"], rows["flags"], counts[BATCH]
     i, total, taken = np.int64(first), counts[CLICKS], counts[IN_BATCH]
-    while i < clicks.size:
+    while i < numbers.size:
         begun = taken
-        while i < clicks.size and taken < batch:
-            if not flags[i] & left_out:
-                total += np.int64(clicks[i])
+        if not left_out:  # no need to look at the flags
+            stop = min(i + batch - taken, numbers.size)
+            for k in range(_U(i), _U(stop)):
+                total += np.int64(clicks[numbers[k]])
+            i, taken = stop, taken + stop - i
+        while i < numbers.size and taken < batch:
+            if not flags[numbers[i]] & left_out:
+                total += np.int64(clicks[numbers[i]])
                 taken += 1
             i += 1
         counts[DECISIONS] += taken - begun
@@ -49,7 +56,7 @@ def take_clicks(rows, left_out, first, counts, levels):  # type: ignore[no-untyp
             if why != ALL_TAKEN:
                 return i, why
         total, taken = np.int64(0), np.int64(0)
-    return np.int64(clicks.size), ALL_TAKEN
+    return np.int64(numbers.size), ALL_TAKEN
 
 
 @inner

@@ -59,6 +59,7 @@ class LightWatch:
         self._low = self._high = 0.0  # sums of the falls and of the rises
         self._since = {"fall": (0, 0, 0), "rise": (0, 0, 0)}  # decisions, batches and clicks when the sum last was 0
         self._batches = self._total = 0
+        self._order = np.arange(1, dtype=np.uint32)
 
     def take(self, clicks: int) -> str:
         """Take one decision's clicks; return a sentence when a change has been found, else ""."""
@@ -73,13 +74,16 @@ class LightWatch:
             return ""
         return self._compare(total, self.baseline)
 
-    def take_many(self, rows: npt.NDArray[np.void], left_out: int) -> list[dict[str, Any]]:
+    def take_many(
+        self, rows: npt.NDArray[np.void], left_out: int, numbers: npt.NDArray[np.uint32] | None = None
+    ) -> list[dict[str, Any]]:
         """Take many decisions, rows (n,) with fields `clicks` and `flags`, but those with one of the flags `left_out`: as `take` of each.
 
-        Returns what was found.
+        With `numbers` uint32 (m,), the decisions are rows[numbers]. Returns what was found.
         """
         from . import light_kernels as kernels  # numba is loaded only by who takes many at once
 
+        numbers = self._in_order(len(rows)) if numbers is None else numbers
         known, at, levels = len(self.found), 0, np.empty(kernels.N_LEVELS)
         levels[kernels.ERROR :] = BASELINE_ERROR, BASELINE_LEAST, BASELINE_MOST
         while True:
@@ -92,7 +96,7 @@ class LightWatch:
                 self._high,
                 *((math.nan, 0.0, 0.0) if base is None else (base.mean, base.slack, base.threshold)),
             )
-            at, why = kernels.take_clicks(rows, np.uint32(left_out), at, counts, levels)
+            at, why = kernels.take_clicks(rows, numbers, np.uint32(left_out), at, counts, levels)
             self._go_on(counts.tolist(), levels.tolist())
             if why == kernels.LEARNT:
                 self._learnt()
@@ -101,6 +105,12 @@ class LightWatch:
                 self._tell("fall" if why == kernels.FELL else "rise", base)
             else:
                 return self.found[known:]
+
+    def _in_order(self, n: int) -> npt.NDArray[np.uint32]:
+        """Return 0 to n - 1."""
+        if n > len(self._order):
+            self._order = np.arange(max(n, 2 * len(self._order)), dtype=np.uint32)
+        return self._order[:n]
 
     def _go_on(self, counts: list[int], levels: list[float]) -> None:
         self.decisions, self._clicks, self._in_batch, self._n, self._sum, self._squares, self._batches, self._total = (

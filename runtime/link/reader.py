@@ -11,8 +11,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from pans.runtime.errors import PansError
 
@@ -31,6 +32,14 @@ class Chunk(NamedTuple):
 
     arrival_ns: int
     data: bytes
+
+
+def count_delimiters(data: bytes) -> int:
+    """Return how many frames end in `data`, of which each is long: bytes.count would look at one byte after the other."""
+    count, at = 0, data.find(0)
+    while at >= 0:
+        count, at = count + 1, data.find(0, at + 1)
+    return count
 
 
 class LinkReader:
@@ -85,20 +94,20 @@ class LinkReader:
         finally:
             self._away = True
 
-    def ahead(self, timeout_s: float, frames: int, size: int, until_ns: int) -> list[Chunk]:
-        """Read a virtual link again and again, each time as `wait` does, and return what came.
+    def ahead(self, timeout_s: float, frames: int, size: int, until_ns: int) -> Sequence[tuple[int, bytes]]:
+        """Read a virtual link again and again, each time as `wait` does, and return what came, as chunks.
 
         No more is read once `frames` delimiters or `size` bytes have come, the link's clock has passed `until_ns`, or a read brings nothing
         or fails: the next `wait` meets that again.
         """
         many = getattr(self._link, "read_ahead", None)
         if many is not None:
-            return [Chunk(*read) for read in many(timeout_s, frames, size, until_ns)]
+            return cast(Sequence[tuple[int, bytes]], many(timeout_s, frames, size, until_ns))
         chunks: list[Chunk] = []
         with suppress(PansError):  # kept
             while frames > 0 and size > 0 and self._link.now_ns() < until_ns and (more := self.wait(timeout_s)):
                 chunks += more
-                frames -= more[0].data.count(0)
+                frames -= count_delimiters(more[0].data)
                 size -= len(more[0].data)
         return chunks
 

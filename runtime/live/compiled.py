@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pans.runtime.core.bulk_steps import BulkSteps
-from pans.runtime.core.decision import Decision, Output, RowDecisions
+from pans.runtime.core.decision import Decision, NumberedDecisions, Output, RowDecisions
 from pans.runtime.core.still import Core
 from pans.runtime.core.stream_arrays import MarkArrays
 from pans.runtime.errors import LinkError
 from pans.runtime.link.base import descriptor_of
 from pans.runtime.link.connection import Arrived, Connection
-from pans.runtime.link.reader import Chunk
+from pans.runtime.link.reader import count_delimiters
 from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
@@ -33,6 +33,8 @@ from pans.runtime.wire.messages import Opcode, decode_ack
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
+from .tally import NO_DECISIONS
+
 if TYPE_CHECKING:
     from pans.runtime.flow.core import FlowCore
 
@@ -42,7 +44,7 @@ I64 = npt.NDArray[np.int64]
 Rows = npt.NDArray[np.void]
 
 NOTHING = Output([], [], None)
-GATHERED_BYTES = 1 << 17
+GATHERED_BYTES = 1 << 18
 EAGER_NS = 200_000  # as link/reader.py: an answer that was asked for is waited for awake
 LEAST_NS = 100_000
 TURN_NS = 20_000_000  # a call comes back at least so often: signals, the watchdog's heartbeat, other threads' wishes
@@ -60,6 +62,7 @@ class CompiledTurns:
         self._turn: Turn | None = None
         self._attached: Connection | None = None
         self._fd: int | None = None
+        self.none = NO_DECISIONS
         self._stamps, self._bits = np.ones(0, np.uint16), np.ones(0, np.uint8)
         self._frames: FrameWatch | None = None
         if isinstance(core, Core) and core.guard is not None and core.windows.parallel:
@@ -120,9 +123,14 @@ class CompiledTurns:
         """Compile or load what takes over what a call brought."""
         steps = turn.steps
         assert isinstance(steps, BulkSteps)
+        run, self.none = self._run, steps.decisions(slice(0, 0))
         unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
-        self._run.tally.warm_up(steps.walk.marks, steps.windows.n_windows)
-        self._judged.take(turn.blocks[:0], turn.rows[:0])
+        run.tally.warm_up(steps.walk.marks, steps.windows.n_windows, self.none)
+        self._judged.take(turn.blocks[:0], self.none)
+        if isinstance(self.none, NumberedDecisions):
+            assert not len(self.none.rows)  # compiles or loads what makes them
+            if run.recorder is not None:
+                run.recorder.prepare(self.none)
         if self._frames is not None:
             self._frames.warm_up()
 
@@ -148,10 +156,8 @@ class CompiledTurns:
         else:
             chunks = self._gathered(poll_s)
             if chunks:
-                pieces = [(piece, at_ns) for at_ns, data in chunks for piece in turn.decoder.pieces(data)]
-                data = np.frombuffer(bytearray().join([piece for piece, _ in pieces]), np.uint8)  # writable, not copied
                 self._lend(turn)
-                ended = turn.feed(data, np.array([(len(piece), at_ns) for piece, at_ns in pieces], np.int64))
+                ended = turn.feed(chunks)
                 self._settle(turn, outputs)
                 self._go_on(turn, ended, outputs, turn.feed_on)
         connection.take_pongs()
@@ -192,7 +198,7 @@ class CompiledTurns:
 
     # -- after a call --------------------------------------------------------------------------------------------------
 
-    def _gathered(self, poll_s: float) -> list[Chunk]:
+    def _gathered(self, poll_s: float) -> Sequence[tuple[int, bytes]]:
         """Return what was read elsewhere; of parallel frames in virtual time many reads, where nobody acts on the first."""
         run = self._run
         connection, link = run.connection, run.connection.link
@@ -200,8 +206,8 @@ class CompiledTurns:
         gathers = isinstance(self._core, Core) and self._core.windows.parallel
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
-        left = run.messages_granted - chunks[0].data.count(0)
-        return chunks + connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)
+        left = run.messages_granted - count_delimiters(chunks[0].data)
+        return [*chunks, *connection.reader.ahead(poll_s, left, GATHERED_BYTES, run.due_ns)]
 
     def _go_on(self, turn: Turn, ended: int, outputs: list[Output], again: Callable[[], int]) -> None:
         """Deal with what ended a call until nothing that was read is left; no more is read."""
@@ -319,34 +325,36 @@ class CompiledTurns:
 
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
         """Account for the blocks of a call and their decisions."""
-        run, blocks, rows, steps = self._run, turn.blocks, turn.rows, turn.steps
+        run, blocks, steps = self._run, turn.blocks, turn.steps
         assert isinstance(steps, BulkSteps)
+        decided = steps.decisions(turn.place)
         if run.connection.link.virtual:
             blocks[:, ring.DECODED : ring.RECORDED + 1] = blocks[:, ring.ARRIVAL, None]  # no time passes in between
-        events = self._watch(turn, rows)
+        events = self._watch(turn, decided)
         for event in events:
             run.journal.take(event)
-        runs, marked = self._judged.take(blocks, rows)
-        decisions = account_rows(run, steps.walk.marks, runs, rows)
+        runs, marked = self._judged.take(blocks, decided)
+        account_many(run, steps.walk.marks, runs, decided)
         for step, end_ns, uncertainty_ns, look in marked.tolist():
             arrival_ns, decoded_ns, decided_ns, recorded_ns, end_tick, stop = blocks[step, : ring.ROWS + 1].tolist()
             if look & kernels.IS_LATE:
                 first = int(blocks[step - 1, ring.ROWS]) if step else 0
-                for number in rows["index"][first:stop].tolist():
+                for number in range(decided.first + first, decided.first + stop):
                     run.note_late(number, (end_ns, arrival_ns, decoded_ns, decided_ns, recorded_ns), uncertainty_ns)
             if look & kernels.IS_AHEAD:
                 run.check_tick(end_tick, arrival_ns)
         run.block_came(int(blocks[-1, ring.ARRIVAL]))
-        outputs.append(Output(cast(list[Decision], decisions), events, self._core.last_tick))
+        # read like a list, by whoever looks at an output
+        outputs.append(Output(cast(list[Decision], decided), events, self._core.last_tick))
 
-    def _watch(self, turn: Turn, rows: Rows) -> list[Any]:
+    def _watch(self, turn: Turn, decided: RowDecisions) -> list[Any]:
         """Let the guard of the dark counts see the exposures of a call."""
         core = self._core
         if not isinstance(core, Core) or core.guard is None:
             return []
         if not core.windows.parallel:
             n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
-            return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, rows)
+            return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, decided.rows)
         return [] if self._frames is None else self._frames.take(turn.kept, turn.messages)
 
 
@@ -363,25 +371,24 @@ class Judged:
         self._sums: I64 = np.full(kernels.N_JUDGED, 0, np.int64)
         self._histograms = tuple(histogram.numbers for histogram in run.timing.histograms)
 
-    def take(self, blocks: I64, rows: Rows) -> tuple[Rows, I64]:
-        """Judge `rows`, the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
+    def take(self, blocks: I64, decided: RowDecisions) -> tuple[Rows, I64]:
+        """Judge the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
         timing, clock, sums = self._run.timing, self._run.connection.known_clock(), self._sums
         sums[:] = 0
         outputs = (self._histograms, sums, self._runs, self._marked)
-        n_runs, n_marked = kernels.judge_blocks(blocks, rows, *clock.numbers, timing.deadline_ns, *outputs)
-        if len(rows):
+        n_runs, n_marked = kernels.judge_blocks(blocks, decided.first, *clock.numbers, timing.deadline_ns, *outputs)
+        if len(decided):
             found = sums.tolist()
             longest, blame = found[: kernels.UNCERTAINTY], found[kernels.BLAME :]
-            timing.went_on(len(rows), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
+            timing.went_on(len(decided), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
         return self._runs[:n_runs], self._marked[:n_marked]
 
 
-def account_rows(run: LiveRun, marks: MarkArrays, runs: Rows, rows: Rows) -> Sequence[Decision]:
-    """Tally and record decisions whose times are `runs`; return them."""
-    if not len(rows):
-        return []
-    run.tally.add_rows(rows, marks)
+def account_many(run: LiveRun, marks: MarkArrays, runs: Rows, decided: RowDecisions) -> None:
+    """Tally and record decisions whose times are `runs`."""
+    if not len(decided):
+        return
+    run.tally.add_many(decided, marks)
     if run.recorder is not None:
-        run.recorder.add_decisions(rows)
+        run.recorder.add_decisions(decided if isinstance(decided, NumberedDecisions) else decided.rows)
         run.recorder.add_timing_runs(runs)
-    return RowDecisions(rows)  # read like a list, by whoever looks at an output

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pans.runtime.core.decision import Output
+    from pans.runtime.core.decision import Output, RowDecisions
     from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
     from pans.runtime.timing.ledger import TimingLedger
@@ -149,10 +149,12 @@ class Turns(Protocol):
     `prepare` once a connection is there, `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it.
     `settled` is told after each call that brought messages. Where the turns go on in another thread (`goes_on`), core, session and
     driver are behind them; `halt` ends that, and all are where the turns have come. `lives`: whether they do. `leave_off` ends it from
-    any thread and returns the id of the next command, 0: the session knows it. `close` once, at the end.
+    any thread and returns the id of the next command, 0: the session knows it. `close` once, at the end. `none` are no decisions, of the
+    kind that `turn` gives.
     """
 
     settled: Callable[[Turn, Output], None] | None
+    none: RowDecisions
 
     @property
     def goes_on(self) -> bool: ...

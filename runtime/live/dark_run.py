@@ -7,13 +7,13 @@ from the recording's header (`recorded_guard`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
-from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag, Output
+from pans.runtime.core.decision import DecisionFlag, NumberedDecisions, Output, RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
@@ -124,7 +124,7 @@ class DarkRun:
     def check_device(self, run: LiveRun) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
         if run.compiled is not None:
-            self.light.take_many(np.zeros(0, DECISION_DTYPE), int(NOT_MEASURED))  # compiles or loads its kernel
+            self._look_at(run.compiled.none)  # compiles or loads its kernel
         if self.calibration is not None:
             find_objections(self.calibration, self.profile, self.serial_of(run))
         for warning in self.warnings:
@@ -139,9 +139,9 @@ class DarkRun:
 
     def look(self, run: LiveRun, output: Output) -> None:
         """After a block: compare the clicks of its decisions with those of the run's beginning."""
-        rows = getattr(output.decisions, "rows", None)  # of many at once
-        if rows is not None:
-            for found in self.light.take_many(rows, int(NOT_MEASURED)):
+        many = cast(object, output.decisions)
+        if isinstance(many, RowDecisions):
+            for found in self._look_at(many):
                 run.journal.note("light_changed", **found)
             return
         for decision in output.decisions:
@@ -149,6 +149,11 @@ class DarkRun:
                 words = self.light.take(decision.clicks)
                 if words:
                     run.journal.note("light_changed", **self.light.found[-1])
+
+    def _look_at(self, many: RowDecisions) -> list[dict[str, Any]]:
+        if isinstance(many, NumberedDecisions):  # all measured
+            return self.light.take_many(many.verdicts, 0, many.numbers)
+        return self.light.take_many(many.rows, int(NOT_MEASURED))
 
     def figures(self, dark: DarkReport | None = None) -> DarkFigures:
         """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults.

@@ -6,7 +6,7 @@ the flow's part of the summary; the order of a run is loop.py's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,6 @@ from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.flow.matching import PassageFigures
 from pans.runtime.flow.steps import FlowSteps
-from pans.runtime.link.reader import Chunk
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Turn
 from pans.runtime.wire.messages import Mark, MessageType, decode_frames, decode_mark
@@ -115,7 +114,7 @@ class _FlowSettling(CompiledTurns):
     def _warm_up(self, turn: Turn) -> None:
         _blocks_behind(turn)
 
-    def _gathered(self, poll_s: float) -> list[Chunk]:
+    def _gathered(self, poll_s: float) -> Sequence[tuple[int, bytes]]:
         return self._run.connection.chunks(poll_s)
 
     def _settle_marks(self, turn: Turn) -> None:

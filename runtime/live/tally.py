@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
+from pans.runtime.core.decision import (
+    DECISION_DTYPE,
+    NO_LABEL,
+    Decision,
+    DecisionFlag,
+    NumberedDecisions,
+    RowDecisions,
+)
 
 if TYPE_CHECKING:
     from pans.runtime.core.stream_arrays import MarkArrays
@@ -22,6 +29,7 @@ if TYPE_CHECKING:
 _ABSTAINED, _AMBIGUOUS = int(DecisionFlag.ABSTAINED), int(DecisionFlag.AMBIGUOUS)
 MAX_OBJECTS = 1 << 14  # that may still come back; a run for days sees any number
 RUNS_AT_ONCE = 1 << 13  # decisions in a row on one object
+NO_DECISIONS = RowDecisions(np.zeros(0, DECISION_DTYPE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,27 +95,35 @@ class RunTally:
         sums[0] += 1
         sums[1] += right
 
-    def warm_up(self, marks: MarkArrays, trials: int) -> None:
-        """Compile or load what `add_rows` needs, and make room for `trials` of an object, before arming."""
+    def warm_up(self, marks: MarkArrays, trials: int, like: RowDecisions = NO_DECISIONS) -> None:
+        """Compile or load what `add_many` needs for decisions of this kind, and make room for `trials` of an object, before arming."""
         self._make_room(trials - 1)
         self._runs[:] = 0  # touched
-        self._add_from(np.zeros(0, DECISION_DTYPE), 0, marks)
+        self._add_from(like, 0, marks)
 
-    def add_rows(self, rows: npt.NDArray[np.void], marks: MarkArrays) -> None:
-        """Count many decisions, DECISION_DTYPE (n,), on objects of which `marks` tell; as `add` does for each."""
+    def add_many(self, decisions: RowDecisions, marks: MarkArrays) -> None:
+        """Count many decisions on objects of which `marks` tell; as `add` does for each."""
         first = 0
-        while first < len(rows):
-            self._make_room(int(rows["shot"][first]) // self.shots)
-            first = self._add_from(rows, first, marks)
+        while first < len(decisions):
+            if isinstance(decisions, NumberedDecisions):
+                count, shot, step = (int(decisions.runs[name][first]) for name in ("count", "shot", "shot_step"))
+                self._make_room((shot + (count - 1) * step) // self.shots)
+            else:
+                self._make_room(int(decisions.rows["shot"][first]) // self.shots)
+            first = self._add_from(decisions, first, marks)
 
-    def _add_from(self, rows: npt.NDArray[np.void], first: int, marks: MarkArrays) -> int:
+    def _add_from(self, decisions: RowDecisions, first: int, marks: MarkArrays) -> int:
         """Count decisions from `first` on; return up to where there was room."""
         from pans.runtime.turn import settling as kernels  # numba is loaded only by who counts many at once
 
         plan, sums, photons = np.array([self.shots, self.distinct]), np.zeros(kernels.N_SUMS, np.int64), np.zeros(1)
         photons[0] = self.photons
         tables = (self.confusion, self._trials, self._runs)
-        stop, n_runs = kernels.add_rows(rows, first, marks.objects, marks.photons, plan, sums, photons, tables)
+        rest = (first, marks.objects, marks.photons, plan, sums, photons, tables)
+        if isinstance(decisions, NumberedDecisions):
+            stop, n_runs = kernels.add_numbered((decisions.verdicts, decisions.numbers, decisions.runs), *rest)
+        else:
+            stop, n_runs = kernels.add_rows(decisions.rows, *rest)
         self._take_sums(stop - first, sums.tolist(), float(photons[0]))
         for number, decided, right in self._runs[:n_runs].tolist():
             mine = self._object_sums(number)

@@ -63,6 +63,28 @@ def compile_still() -> None:
 
     bundle, _ = load_bundle(STILL)
     _compile_steps(bundle, STILL_PROFILE, make_decider(bundle)).warm_up_steps()
+    compile_numbered()
+
+
+def compile_numbered() -> None:
+    """What is done with decisions that frames of parallel channels give one by one."""
+    import numpy as np
+
+    from pans.runtime.core.decision import DECISION_DTYPE, RUN_DTYPE, VERDICT_DTYPE, NumberedDecisions
+    from pans.runtime.core.stream_arrays import MarkArrays
+    from pans.runtime.core.stream_kernels import write_rows
+    from pans.runtime.instrument.light_level import LightWatch
+    from pans.runtime.live.tally import RunTally
+    from pans.runtime.record.log import LogEncoder
+
+    rows, numbers = np.zeros(0, DECISION_DTYPE), np.zeros(0, np.uint32)
+    decided = np.zeros(1, VERDICT_DTYPE), numbers, np.zeros(0, RUN_DTYPE)
+    none = NumberedDecisions(*decided, lambda first, stop: rows)
+    write_rows(*decided, 0, 0, rows)
+    LogEncoder().prepare(none)
+    LightWatch().take_many(none.verdicts, 0, numbers)
+    marks = MarkArrays(np.zeros(2, np.int64), np.zeros(2, np.int16), np.zeros(2, np.float32))
+    RunTally(2, 1).warm_up(marks, 1, none)
 
 
 class _Leaves:
@@ -132,7 +154,7 @@ def compile_settling() -> None:
     judged, marked = np.zeros(settling.N_JUDGED, np.int64), np.zeros((1, settling.N_MARKED), np.int64)
     lines = (whole, real), (whole, real)
     blocks, runs = np.zeros((0, rings.N_STEP), np.int64), np.zeros(1, TIMING_RUN_DTYPE)
-    settling.judge_blocks(blocks, rows, *lines, 1, histograms, judged, runs, marked)
+    settling.judge_blocks(blocks, 0, *lines, 1, histograms, judged, runs, marked)
     unpack_blocks(np.zeros(8, np.uint8), np.zeros((0, 4), np.int64), np.zeros(1, np.uint16), np.zeros(1, np.uint8))
 
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.core.decision import NumberedDecisions
 from pans.runtime.wire.frame import Messages
 
 from .format import Kind
@@ -39,7 +40,9 @@ class AnyRecorder(Protocol):
 
     def add_decision(self, record: Sequence[Any]) -> None: ...
 
-    def add_decisions(self, rows: NDArray[np.void]) -> None: ...
+    def prepare(self, decisions: NumberedDecisions) -> None: ...
+
+    def add_decisions(self, many: NDArray[np.void] | NumberedDecisions) -> None: ...
 
     def add_timing_runs(self, runs: NDArray[np.void]) -> None: ...
 

@@ -12,9 +12,10 @@ from pans.runtime.wire.inner import inner, outer
 
 from .format import LONG_VERDICT, MESSAGE, RUN_ROWS_MAX
 
-# state, uint64 (N_STATE,): the run that is open, as its next row would have to be, and the verdicts known so far
+# state, uint64 (N_STATE,): the run that is open, as its next row would have to be, the verdicts known so far, and of the block under way
+# its runs and the rows of the last of them. A run of one has no steps yet: they are 0, and its next row is compared with it
 RUN_ROWS, NEXT_INDEX, NEXT_TICK, NEXT_EXPOSURE, NEXT_SHOT, OBJECT, TRUTH = range(7)
-TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_STATE = range(7, 13)
+TICK_STEP, EXPOSURE_STEP, SHOT_STEP, N_VERDICTS, SLOT_MASK, N_RUNS, PART, N_STATE = range(7, 15)
 
 _MESSAGE_HEAD = MESSAGE.size
 _U = np.uint64
@@ -23,6 +24,7 @@ SLOTS_PER_VERDICT = _U(
 )  # at least: a look-up that meets no other verdict on its way is one whose branches are foreseen
 _ZERO, _ONE, _U32, _HALF_LEFT, _TRUTH_MASK = _U(0), _U(1), _U(1 << 32), _U(32), _U(0xFFFF)
 _LONG, _RUN_MAX = _U(LONG_VERDICT), _U(RUN_ROWS_MAX)
+_NO_STEPS = _ZERO, _ZERO, _ZERO
 _MIX, _FOLD = _U(0x9E3779B97F4A7C15), _U(40)  # 2^64 over the golden ratio: spreads keys over slots
 
 
@@ -36,20 +38,52 @@ def encode_rows(rows, state, keys, slots, runs, verdicts, lengths, codes):  # ty
     return _find_runs(rows, state, runs), _find_codes(rows, state, keys, slots, verdicts, lengths, codes)
 
 
+@outer
+def encode_numbered(numbered, first, stop, places, state, keys, slots, runs, verdicts, lengths, codes):  # type: ignore[no-untyped-def]
+    """As `encode_rows`, of NumberedDecisions (its verdicts, numbers and runs) from place `first` up to `stop`.
+
+    places uint16 are the numbers under which the log knows the verdicts, LONG_VERDICT where it does not yet.
+    """
+    table, numbers, stretches = numbered
+    n_runs = _join_stretches(stretches, first, stop, state, runs)
+    n_new, at_first, highest = np.int64(0), _U(first), np.uint16(0)
+    for i in range(at_first, _U(stop)):
+        code = places[numbers[i]]
+        codes[i - at_first] = code
+        highest = max(highest, code)
+    if highest != _LONG:
+        return n_runs, n_new
+    for i in range(at_first, _U(stop)):
+        number = numbers[i]
+        known = _U(places[number])
+        if known == _LONG:
+            one = table[number]
+            key = _key_of(one["clicks"], one["label"], one["probability_bits"], one["flags"], 0, one["counts_crc"])
+            at, known = _look_for(key, state[SLOT_MASK], keys, slots)
+            if known == _LONG:
+                known = _learn(key, at, state, keys, slots)
+                _keep(one, verdicts[n_new])
+                lengths[n_new] = 0
+                n_new += 1
+            places[number] = known
+        codes[i - at_first] = known
+    return n_runs, n_new
+
+
 @inner
 def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
     """Tell the runs that rows are made of; return how many were written."""
     # Columns are taken out of the rows once: a row at a time would count references for each.
     indices, ticks, exposures, objects = rows["index"], rows["tick"], rows["exposure_index"], rows["object"]
     shots, truths = rows["shot"], rows["truth"]
-    count, truth, number = state[RUN_ROWS], state[TRUTH], state[OBJECT]
-    index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
-    tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
-    n_runs, part = 0, _ZERO  # part: rows of the open run that stand in this block
+    state[N_RUNS], state[PART] = _ZERO, _ZERO
     i, n = _ZERO, _U(rows.size)
     while i < n:
-        if count > _ONE:  # in the middle of a run, up to the first row that does not go on with it
-            first, stop = i, min(n, i + (_RUN_MAX - count))
+        if state[RUN_ROWS] > _ONE:  # in the middle of a run, up to the first row that does not go on with it
+            index, tick, exposure, shot = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT]
+            tick_step, exposure_step, shot_step = state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP]
+            truth, number, first = state[TRUTH], state[OBJECT], i
+            stop = min(n, i + (_RUN_MAX - state[RUN_ROWS]))
             while i < stop:
                 apart = (_U(indices[i]) ^ index) | (_U(ticks[i]) ^ tick) | (_U(exposures[i]) ^ exposure)
                 apart |= (_U(shots[i]) ^ shot) | (_U(objects[i]) ^ number) | ((_U(truths[i]) & _TRUTH_MASK) ^ truth)
@@ -57,37 +91,97 @@ def _find_runs(rows, state, runs):  # type: ignore[no-untyped-def]
                     break
                 index, tick, exposure, shot = index + _ONE, tick + tick_step, exposure + exposure_step, shot + shot_step
                 i += _ONE
-            if part == _ZERO and i > first:
-                _open(runs[n_runs], rows[first], True)
-                n_runs += 1
-            count, part = count + (i - first), part + (i - first)
+            if i > first:
+                _go_on(i - first, state, runs)
             if i == n:
                 break
-        here_tick, here_exposure, here_shot = _U(ticks[i]), _U(exposures[i]), _U(shots[i])
-        here_index, here_truth, here_object = _U(indices[i]), _U(truths[i]) & _TRUTH_MASK, _U(objects[i])
-        fits = count == _ONE and here_index == index and here_object == number and here_truth == truth
-        if count == _ONE:  # the second row says what the steps are
-            tick_step, exposure_step, shot_step = here_tick - tick, here_exposure - exposure, here_shot - shot
-            fits = fits and tick_step < _U32 and exposure_step < _U32 and shot_step < _U32
-        if not fits:
-            if part:
-                _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
-            count, part = _ZERO, _ZERO
-            number, truth, index = here_object, here_truth, here_index
-        if part == _ZERO:
-            _open(runs[n_runs], rows[i], count != _ZERO)
-            n_runs += 1
-        count, part, index = count + _ONE, part + _ONE, index + _ONE
-        tick, exposure, shot = here_tick, here_exposure, here_shot
-        if count > _ONE:  # a run of one has no steps yet: the next row is compared with this one
-            tick, exposure, shot = tick + tick_step, exposure + exposure_step, shot + shot_step
+        whose = _U(objects[i]), _U(truths[i]) & _TRUTH_MASK
+        _add_stretch(
+            _U(indices[i]), (_U(ticks[i]), _U(exposures[i]), _U(shots[i])), _NO_STEPS, _ONE, whose, state, runs
+        )
         i += _ONE
-    if part:
-        _close(runs[n_runs - 1], part, tick_step, exposure_step, shot_step, count)
-    state[RUN_ROWS], state[TRUTH], state[OBJECT] = count, truth, number
-    state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = index, tick, exposure, shot
-    state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = tick_step, exposure_step, shot_step
-    return n_runs
+    return _close(state, runs)
+
+
+@inner
+def _join_stretches(stretches, first, stop, state, runs):  # type: ignore[no-untyped-def]
+    """Tell the runs that decisions from place `first` up to `stop` of `stretches`, runs of a core, are made of; as `_find_runs`."""
+    state[N_RUNS], state[PART] = _ZERO, _ZERO
+    at = np.int64(0)
+    while at < stop:
+        one = stretches[at]
+        end = at + np.int64(one["count"])
+        left_out, steps = _U(max(first - at, 0)), (_U(one["tick_step"]), _U(one["exposure_step"]), _U(one["shot_step"]))
+        if end > first:
+            tick, exposure = _U(one["tick"]) + left_out * steps[0], _U(one["exposure_index"]) + left_out * steps[1]
+            begins = tick, exposure, _U(one["shot"]) + left_out * steps[2]
+            whose = _U(one["object"]), _U(one["truth"]) & _TRUTH_MASK
+            count = _U(min(end, stop) - max(at, first))
+            _add_stretch(_U(one["index"]) + left_out, begins, steps, count, whose, state, runs)
+        at = end
+    return _close(state, runs)
+
+
+@inner
+def _add_stretch(index, begins, steps, count, whose, state, runs):  # type: ignore[no-untyped-def]
+    """Add `count` decisions in equal steps: to the open run as far as they go on with it, else to runs that begin with them.
+
+    begins and steps: ticks, exposures and shots; whose: object and truth. All of them uint64.
+    """
+    done = _ZERO
+    while done < count:
+        here, rows = index + done, state[RUN_ROWS]
+        tick, exposure, shot = begins[0] + done * steps[0], begins[1] + done * steps[1], begins[2] + done * steps[2]
+        fits = _ZERO < rows < _RUN_MAX and here == state[NEXT_INDEX]
+        fits = fits and whose[0] == state[OBJECT] and whose[1] == state[TRUTH]
+        by = tick - state[NEXT_TICK], exposure - state[NEXT_EXPOSURE], shot - state[NEXT_SHOT]
+        if rows == _ONE and fits:  # the second decision says what the steps are
+            fits = by[0] < _U32 and by[1] < _U32 and by[2] < _U32
+            if fits:
+                state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = by
+                state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = tick, exposure, shot
+        elif rows > _ONE:
+            fits = fits and by[0] | by[1] | by[2] == _ZERO
+        if not fits:
+            _close(state, runs)
+            state[RUN_ROWS], state[PART], state[OBJECT], state[TRUTH] = _ZERO, _ZERO, whose[0], whose[1]
+            state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE], state[NEXT_SHOT] = here, tick, exposure, shot
+            state[TICK_STEP], state[EXPOSURE_STEP], state[SHOT_STEP] = _NO_STEPS  # of a single one none are known
+        many = _ONE
+        same = steps[0] == state[TICK_STEP] and steps[1] == state[EXPOSURE_STEP] and steps[2] == state[SHOT_STEP]
+        if fits and same:
+            many = min(count - done, _RUN_MAX - state[RUN_ROWS])
+        _go_on(many, state, runs)
+        done += many
+
+
+@inner
+def _go_on(count, state, runs):  # type: ignore[no-untyped-def]
+    """Count `count` decisions more into the open run, which the next of them fits: it is opened in this block, where it is not yet."""
+    if state[PART] == _ZERO:
+        run = runs[state[N_RUNS]]
+        run["index"], run["tick"], run["exposure_index"] = state[NEXT_INDEX], state[NEXT_TICK], state[NEXT_EXPOSURE]
+        run["object"], run["shot"], run["truth"] = state[OBJECT], state[NEXT_SHOT], state[TRUTH]
+        run["continues"] = state[RUN_ROWS] != _ZERO
+        state[N_RUNS] += _ONE
+    state[RUN_ROWS], state[PART], state[NEXT_INDEX] = (
+        state[RUN_ROWS] + count,
+        state[PART] + count,
+        state[NEXT_INDEX] + count,
+    )
+    state[NEXT_TICK] += count * state[TICK_STEP]
+    state[NEXT_EXPOSURE] += count * state[EXPOSURE_STEP]
+    state[NEXT_SHOT] += count * state[SHOT_STEP]
+
+
+@inner
+def _close(state, runs):  # type: ignore[no-untyped-def]
+    """Say how many decisions of this block the last run has, and their steps; return how many runs there are."""
+    if state[PART]:
+        run = runs[state[N_RUNS] - _ONE]
+        run["count"], run["tick_step"] = state[PART], state[TICK_STEP]
+        run["exposure_step"], run["shot_step"] = state[EXPOSURE_STEP], state[SHOT_STEP]
+    return np.int64(state[N_RUNS])
 
 
 @inner
@@ -95,51 +189,50 @@ def _find_codes(rows, state, keys, slots, verdicts, lengths, codes):  # type: ig
     """Give each row the number of its verdict; return how many verdicts were written, which no row had before."""
     labels, flags, clicks, walked = rows["label"], rows["flags"], rows["clicks"], rows["exposures"]
     probabilities, checksums = rows["probability_bits"], rows["counts_crc"]
-    n_known, mask, n_new = state[N_VERDICTS], state[SLOT_MASK], 0
+    mask, n_new = state[SLOT_MASK], 0
     for i in range(_U(rows.size)):
-        first = _U(clicks[i]) << _HALF_LEFT | _U(labels[i])
-        second = _U(probabilities[i]) << _HALF_LEFT | _U(flags[i])
-        third = _U(walked[i]) << _HALF_LEFT | _U(checksums[i])
-        at = _slot_of(first, second, third) & mask
-        known = _U(slots[at])
-        while known != _LONG and (keys[known, 2] ^ third) | (keys[known, 1] ^ second) | (keys[known, 0] ^ first):
-            at = (at + _ONE) & mask
-            known = _U(slots[at])
-        if known != _LONG:
-            codes[i] = known
-            continue
-        codes[i] = n_known  # the next number, while there is room: LONG_VERDICT afterwards
-        _keep(rows[i], verdicts[n_new])
-        lengths[n_new] = walked[i]
-        n_new += 1
-        if n_known < _LONG:
-            keys[n_known, 0], keys[n_known, 1], keys[n_known, 2] = first, second, third
-            slots[at] = n_known
-            n_known += _ONE
-            if SLOTS_PER_VERDICT * n_known > mask + _ONE:
-                mask = _widen(n_known, mask, keys, slots)
-    state[N_VERDICTS], state[SLOT_MASK] = n_known, mask
+        key = _key_of(clicks[i], labels[i], probabilities[i], flags[i], walked[i], checksums[i])
+        at, known = _look_for(key, mask, keys, slots)
+        if known == _LONG:
+            known = _learn(key, at, state, keys, slots)
+            mask = state[SLOT_MASK]
+            _keep(rows[i], verdicts[n_new])
+            lengths[n_new] = walked[i]
+            n_new += 1
+        codes[i] = known
     return n_new
 
 
 @inner
-def _open(run, row, continues):  # type: ignore[no-untyped-def]
-    run["index"] = row["index"]
-    run["tick"] = row["tick"]
-    run["exposure_index"] = row["exposure_index"]
-    run["object"] = row["object"]
-    run["shot"] = row["shot"]
-    run["truth"] = row["truth"]
-    run["continues"] = continues
+def _key_of(clicks, label, probability_bits, flags, walked, checksum):  # type: ignore[no-untyped-def]
+    """A verdict as three numbers."""
+    first, second = _U(clicks) << _HALF_LEFT | _U(label), _U(probability_bits) << _HALF_LEFT | _U(flags)
+    return first, second, _U(walked) << _HALF_LEFT | _U(checksum)
 
 
 @inner
-def _close(run, part, tick_step, exposure_step, shot_step, count):  # type: ignore[no-untyped-def]
-    stepped = count != _ONE  # of a single row no steps are known
-    run["count"] = part
-    run["tick_step"] = tick_step if stepped else _U(0)
-    run["exposure_step"] = exposure_step if stepped else _U(0)
-    run["shot_step"] = shot_step if stepped else _U(0)
+def _look_for(key, mask, keys, slots):  # type: ignore[no-untyped-def]
+    """The slot of a verdict, and its number: LONG_VERDICT where it has none yet."""
+    first, second, third = key
+    at = _slot_of(first, second, third) & mask
+    known = _U(slots[at])
+    while known != _LONG and (keys[known, 2] ^ third) | (keys[known, 1] ^ second) | (keys[known, 0] ^ first):
+        at = (at + _ONE) & mask
+        known = _U(slots[at])
+    return at, known
+
+
+@inner
+def _learn(key, at, state, keys, slots):  # type: ignore[no-untyped-def]
+    """Give the verdict that belongs to slot `at` the next number, while there is room, and return it: LONG_VERDICT afterwards."""
+    number = state[N_VERDICTS]
+    if number < _LONG:
+        keys[number, 0], keys[number, 1], keys[number, 2] = key
+        slots[at] = number
+        state[N_VERDICTS] = number + _ONE
+        if SLOTS_PER_VERDICT * state[N_VERDICTS] > state[SLOT_MASK] + _ONE:
+            state[SLOT_MASK] = _widen(state[N_VERDICTS], state[SLOT_MASK], keys, slots)
+    return number
 
 
 @inner

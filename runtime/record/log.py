@@ -13,42 +13,29 @@ from __future__ import annotations
 
 import hashlib
 import struct
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
+from pans.runtime.core.decision import RUN_DTYPE as RUN_DTYPE
+from pans.runtime.core.decision import VERDICT_DTYPE as VERDICT_DTYPE
+from pans.runtime.core.decision import VERDICT_FIELDS as VERDICT_FIELDS
 from pans.runtime.errors import DamagedFileError
 
 from .format import LONG_VERDICT
 
 BLOCK_ROWS = 1 << 14  # of one block of ours: 1.2 MB when nothing repeats
 ROWS_MAX = 1 << 18  # of one block that is read, so that a small file cannot ask for much memory
-VERDICT_FIELDS = ("clicks", "label", "flags", "probability", "counts_crc")
 EXPOSURES_DTYPE = DECISION_DTYPE["exposures"]
-VERDICT_DTYPE = np.dtype([(name, DECISION_DTYPE[name]) for name in VERDICT_FIELDS])
 # The same layouts for the kernel, which compares probabilities by their bits.
 _ROW_BITS, _VERDICT_BITS = (
     np.dtype(
         [("probability_bits", "<u4") if name == "probability" else (name, dtype[name]) for name in dtype.names or ()]
     )
     for dtype in (DECISION_DTYPE, VERDICT_DTYPE)
-)
-RUN_DTYPE = np.dtype(
-    [
-        ("index", "<u8"),  # of the first decision; the following ones count up
-        ("tick", "<u8"),
-        ("exposure_index", "<u8"),
-        ("object", "<u4"),
-        ("shot", "<u4"),
-        ("count", "<u4"),  # decisions, 1 or more
-        ("tick_step", "<u4"),
-        ("exposure_step", "<u4"),
-        ("shot_step", "<u4"),
-        ("truth", "<i2"),
-        ("continues", "<u2"),  # 1: the rest of the last run of the block before
-    ]
 )
 _HEAD = struct.Struct("<III")  # runs, verdicts, decisions
 _FIRST_SLOTS, _SLOTS = 1 << 13, 1 << 19  # for record_kernels.SLOTS_PER_VERDICT
@@ -69,7 +56,7 @@ class LogEncoder:
     def __init__(self) -> None:
         from . import kernels  # numba: only who writes or replays decisions needs it
 
-        self._encode = kernels.encode_rows
+        self._encode, self._encode_numbered = kernels.encode_rows, kernels.encode_numbered
         self._hash = _LogHash()
         self._state = np.zeros(kernels.N_STATE, np.uint64)
         self._state[kernels.SLOT_MASK] = _FIRST_SLOTS - 1
@@ -81,13 +68,29 @@ class LogEncoder:
         self._verdicts: NDArray[np.void] = np.full(BLOCK_ROWS, 0, VERDICT_DTYPE)
         self._exposures = np.full(BLOCK_ROWS, 0, EXPOSURES_DTYPE)
         self._codes = np.full(BLOCK_ROWS, 0, np.uint16)
+        # what a kernel continues, and what it fills
+        known, verdicts = (self._state, self._keys, self._slots), self._verdicts.view(_VERDICT_BITS)
+        self._arrays = *known, self._runs, verdicts, self._exposures, self._codes
+        self._table: NDArray[np.void] | None = None  # of numbered decisions, and under which numbers it is known
+        self._places = np.zeros(0, np.uint16)
         self._take(np.zeros(0, DECISION_DTYPE))  # compiles the kernel, or loads it
 
     def block(self, rows: NDArray[np.void]) -> bytes:
         """Take the next rows, DECISION_DTYPE (n,), n at most BLOCK_ROWS, and return the payload that holds them."""
-        runs, verdicts, exposures, codes = self._take(rows)
-        head = _HEAD.pack(len(runs), len(verdicts), len(codes))
-        return b"".join((head, runs.data, verdicts.data, codes.data, exposures.data if exposures.any() else b""))
+        return _payload(self._take(rows))
+
+    def blocks(self, decisions: NDArray[np.void] | NumberedDecisions) -> Iterator[bytes]:
+        """Take the next decisions, rows or numbered, any number of them, and yield the payloads that hold them."""
+        for first in range(0, len(decisions), BLOCK_ROWS):
+            stop = min(first + BLOCK_ROWS, len(decisions))
+            if isinstance(decisions, NumberedDecisions):
+                yield _payload(self._take_numbered(decisions, first, stop))
+            else:
+                yield self.block(decisions[first:stop])
+
+    def prepare(self, decisions: NumberedDecisions) -> None:
+        """Compile or load what `blocks` needs for decisions by the same verdicts, and allocate its memory."""
+        self._take_numbered(decisions, 0, 0)
 
     def update(self, rows: NDArray[np.void]) -> None:
         """Take the next rows, DECISION_DTYPE (n,), for their hash alone."""
@@ -100,15 +103,29 @@ class LogEncoder:
 
     def _take(self, rows: NDArray[np.void]) -> _Parts:
         bits = np.ascontiguousarray(rows, DECISION_DTYPE).view(_ROW_BITS)
-        verdicts = self._verdicts.view(_VERDICT_BITS)
-        n_runs, n_verdicts = self._encode(
-            bits, self._state, self._keys, self._slots, self._runs, verdicts, self._exposures, self._codes
-        )
+        return self._made(len(rows), *self._encode(bits, *self._arrays))
+
+    def _take_numbered(self, decisions: NumberedDecisions, first: int, stop: int) -> _Parts:
+        if self._table is not decisions.verdicts:
+            self._table = decisions.verdicts
+            self._places = np.full(len(decisions.verdicts), LONG_VERDICT, np.uint16)
+        numbered = decisions.verdicts.view(_VERDICT_BITS), decisions.numbers, decisions.runs
+        return self._made(stop - first, *self._encode_numbered(numbered, first, stop, self._places, *self._arrays))
+
+    def _made(self, n_rows: int, n_runs: int, n_verdicts: int) -> _Parts:
+        """Return the parts of the block that a kernel has made, and add them to the hash."""
         parts = _Parts(
-            self._runs[:n_runs], self._verdicts[:n_verdicts], self._exposures[:n_verdicts], self._codes[: len(rows)]
+            self._runs[:n_runs], self._verdicts[:n_verdicts], self._exposures[:n_verdicts], self._codes[:n_rows]
         )
         self._hash.update(parts)
         return parts
+
+
+def _payload(parts: _Parts) -> bytes:
+    """Return what a block holds."""
+    runs, verdicts, exposures, codes = parts
+    head = _HEAD.pack(len(runs), len(verdicts), len(codes))
+    return b"".join((head, runs.data, verdicts.data, codes.data, exposures.data if exposures.any() else b""))
 
 
 class LogReader:

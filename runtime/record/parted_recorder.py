@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.core.decision import NumberedDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.core.plan_codec import plan_commands
 from pans.runtime.errors import PansError, RecordingError
@@ -109,9 +110,13 @@ class PartedRecorder:
         """See `Recorder`."""
         self.open_part.add_decision(record)
 
-    def add_decisions(self, rows: NDArray[np.void]) -> None:
+    def prepare(self, decisions: NumberedDecisions) -> None:
         """See `Recorder`."""
-        self.open_part.add_decisions(rows)
+        self.open_part.prepare(decisions)
+
+    def add_decisions(self, many: NDArray[np.void] | NumberedDecisions) -> None:
+        """See `Recorder`."""
+        self.open_part.add_decisions(many)
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """See `Recorder`."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.container import MIB, block_ends, canonical_json, file_prologue
-from pans.runtime.core.decision import DECISION_DTYPE
+from pans.runtime.core.decision import DECISION_DTYPE, NumberedDecisions
 from pans.runtime.errors import PansError, RecordingError, UsageError
 from pans.runtime.outputs import beside_name, place_new, refuse_existing, sync_folder
 from pans.runtime.timing.clock import CLOCK_DTYPE
@@ -39,7 +39,7 @@ from .format import (
     expand_timings,
     version_for,
 )
-from .log import BLOCK_ROWS, LogEncoder
+from .log import LogEncoder
 
 _MESSAGE_BUFFER_BYTES = MIB // 4
 _EVENT_BUFFER_BYTES = MIB // 16
@@ -77,12 +77,11 @@ class Recorder:
         self._timing_runs = RowBuffer(Kind.TIMING_RUNS, TIMING_RUN_DTYPE)
         self._in_runs = 0  # decisions in these
         # A decision goes out behind all that it is made of, so that a file that is cut off holds nothing that cannot be decided again.
-        first = (self._commands, self._answers, self._messages, self._decisions)
-        self._in_order = (*first, self._timings, self._timing_runs)
+        self._first = (self._commands, self._answers, self._messages, self._decisions)
+        self._in_order = (*self._first, self._timings, self._timing_runs)
         self._log = LogEncoder()
         self._pack, self._pack_stamped = _packing()
-        self._n_decisions = 0
-        self._n_blocks = 0
+        self._n_decisions = self._n_blocks = 0
         self._version = version = version_for(header)
         facts = {"format_version": version, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
         facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
@@ -176,18 +175,20 @@ class Recorder:
         if self._decisions.add(record):
             self._empty(self._decisions)
 
-    def add_decisions(self, rows: NDArray[np.void]) -> None:
-        """Keep many decisions, DECISION_DTYPE (n,), behind those already added; more than a buffer holds go out at once."""
-        if len(rows) < self._decisions.room():
-            self._decisions.add_many(rows)
-            return
-        self._empty(self._decisions)
-        for start in range(0, len(rows), BLOCK_ROWS):
-            self._write_decisions(rows[start : start + BLOCK_ROWS])
+    def prepare(self, decisions: NumberedDecisions) -> None:
+        """Be ready for many decisions by the same verdicts, before arming."""
+        self._log.prepare(decisions)
 
-    def _write_decisions(self, rows: NDArray[np.void]) -> None:
-        self._write_block(Kind.DECISIONS, self._log.block(rows))
-        self._n_decisions += len(rows)
+    def add_decisions(self, many: NDArray[np.void] | NumberedDecisions) -> None:
+        """Keep many decisions, rows DECISION_DTYPE (n,) or numbered; more than a buffer holds go out at once."""
+        if len(many) < self._decisions.room():
+            self._decisions.add_many(many.rows if isinstance(many, NumberedDecisions) else many)
+            return
+        n, blocks = self._decisions.used + len(many), self._blocks_of(*self._first)
+        for payload in self._log.blocks(many):
+            blocks += self._framed(Kind.DECISIONS, payload)
+        self._write(b"".join(blocks))  # a few long writes take half the time of many short ones
+        self._n_decisions += n
 
     def add_timing(self, record: Sequence[Any]) -> None:
         """Keep the host times of one decision: a tuple in the order of TIMING_DTYPE; not part of the log's hash."""
@@ -243,10 +244,13 @@ class Recorder:
 
     def _flush(self, *buffers: RowBuffer | ByteBuffer) -> None:
         n_decisions = self._decisions.used if self._decisions in buffers else 0
-        blocks = [self._block_of(buffer) for buffer in buffers if buffer.used]
-        if blocks:
+        if blocks := self._blocks_of(*buffers):
             self._write(b"".join(blocks))
             self._n_decisions += n_decisions
+
+    def _blocks_of(self, *buffers: RowBuffer | ByteBuffer) -> list[bytes | memoryview]:
+        """Empty buffers into the pieces of blocks, which must be written next."""
+        return [piece for buffer in buffers if buffer.used for piece in self._block_of(buffer)]
 
     def sync(self) -> None:
         """Flush, and wait until it survives a power cut: milliseconds, never on the hot path."""
@@ -307,15 +311,14 @@ class Recorder:
         else:
             self._flush(buffer)
 
-    def _block_of(self, buffer: RowBuffer | ByteBuffer) -> bytes:
-        """Empty a buffer into a block, which must be written next."""
+    def _block_of(self, buffer: RowBuffer | ByteBuffer) -> tuple[bytes | memoryview, ...]:
         if buffer is self._decisions:
             rows = self._decisions.rows[: self._decisions.used]
             self._decisions.used = 0
-            return b"".join(self._framed(Kind.DECISIONS, self._log.block(rows)))
+            return self._framed(Kind.DECISIONS, self._log.block(rows))
         if buffer is self._timing_runs:
             self._in_runs = 0
-        return b"".join(self._framed(buffer.kind, buffer.take()))
+        return self._framed(buffer.kind, buffer.take())
 
     def _write_block(self, kind: Kind, payload: bytes | memoryview) -> None:
         pieces = self._framed(kind, payload)

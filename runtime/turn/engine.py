@@ -7,7 +7,7 @@ is begun by `lasting`; the properties then show one bank at a time, `show_bank`,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pans.runtime.core import stream_kernels as core_kernels
 from pans.runtime.core.follower import Follower
-from pans.runtime.wire.bulk import BulkDecoder
+from pans.runtime.wire.bulk import CHUNK_BYTES, BulkDecoder
 from pans.runtime.wire.messages import Mark, MessageType, decode_mark
 from pans.runtime.wire.schema import HEADER
 
@@ -79,6 +79,7 @@ class Steps(Protocol):
 
 NO_LIMITS = Limits()
 _NOTHING = Counts(*[0] * len(Counts._fields))
+_MARK = int(MessageType.MARK)
 _FIRST = 3  # of the counts, the first that says up to where a ring is used
 
 
@@ -194,12 +195,17 @@ class Turn:
         self._show(bank, ring.N_BANKS, self.control, self._walk.state)
         self.control[ring.STOP] = 0
 
-    def feed(self, data: U8, reads: I64) -> int:
-        """Take what was read elsewhere, uint8 (n,), read by read: `reads` int64 (n, 2), bytes (at most CHUNK_BYTES) and when they came.
+    def feed(self, chunks: Sequence[tuple[int, bytes]]) -> int:
+        """Take what was read elsewhere: one read or more, each with the time at which it came.
 
         Returns why it ended; `feed_on` goes on behind what ended it, until ALL_TAKEN.
         """
-        self._fed = data, reads
+        times_ns, datas = zip(*chunks)
+        if max(map(len, datas)) > CHUNK_BYTES:
+            return self.feed([(at_ns, piece) for at_ns, data in chunks for piece in self.decoder.pieces(data)])
+        reads = np.empty((len(datas), 2), np.int64)
+        reads[:, 0], reads[:, 1] = tuple(map(len, datas)), times_ns
+        self._fed = np.frombuffer(bytearray().join(datas), np.uint8), reads  # put together once, and writable
         self.control[ring.NEXT_READ : ring.READ_AT + 1] = 0
         return self.feed_on()
 
@@ -295,5 +301,5 @@ class Turn:
     def marks(self) -> list[Mark]:
         """Return the marks among `messages`, in order."""
         found = self.messages
-        places = np.flatnonzero(found[:, ring.WHAT] == int(MessageType.MARK))
-        return [decode_mark(self.bytes_of(found[place])[HEADER.size :]) for place in places.tolist()]
+        spans = found[found[:, ring.WHAT] == _MARK, : ring.END + 1].tolist()
+        return [decode_mark(self.kept[begin + HEADER.size : end].tobytes()) for begin, end in spans]

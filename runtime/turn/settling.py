@@ -81,12 +81,7 @@ def add_rows(rows, first, marked, photons_of, plan, sums, photons, tables):  # t
             continue
         n_known += i - begun
         n_right += well
-        which = number % plan[1] if plan[1] else number
-        if which != object_before:
-            objects[n_objects, NUMBER], objects[n_objects, DECIDED], objects[n_objects, WELL] = which, 0, 0
-            n_objects, object_before = n_objects + 1, which
-        objects[n_objects - 1, DECIDED] += i - begun
-        objects[n_objects - 1, WELL] += well
+        n_objects, object_before = _note_object(number, i - begun, well, plan, objects, n_objects, object_before)
     photons[0] = total
     sums[CLICKS], sums[EXPOSURES], sums[PHOTONS_KNOWN], sums[ABSTAINED] = n_clicks, n_walked, n_photons, n_silent
     sums[UNSURE], sums[KNOWN], sums[RIGHT] = n_unsure, n_known, n_right
@@ -94,8 +89,69 @@ def add_rows(rows, first, marked, photons_of, plan, sums, photons, tables):  # t
 
 
 @outer
-def judge_blocks(steps, rows, fit, anchors, deadline_ns, histograms, judged, runs, marked):  # type: ignore[no-untyped-def]
-    """Judge the times of the decisions of many blocks, `steps` int64 (n, N_STEP); return how many runs and how many marked blocks.
+def add_numbered(numbered, first, marked, photons_of, plan, sums, photons, tables):  # type: ignore[no-untyped-def]
+    """As `add_rows`, of NumberedDecisions: its verdicts, numbers and runs. It ends before a run for which there is no room."""
+    (verdicts, numbers, runs), (table, trials, objects) = numbered, tables
+    n_clicks, n_photons, n_silent, n_unsure = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    n_known, n_right, total, per_decision = np.int64(0), np.int64(0), photons[0], plan[0]
+    i, object_before, n_objects = np.int64(first), np.int64(-1), 0
+    while i < numbers.size and n_objects < objects.shape[0]:
+        run, light, well = runs[i], np.float64(np.nan), np.int64(0)
+        stop, number, truth = i + np.int64(run["count"]), np.int64(run["object"]), np.int64(run["truth"])
+        trial, step = np.int64(run["shot"]) // per_decision, np.int64(run["shot_step"]) // per_decision
+        slot, known = number % MARK_SLOTS, 0 <= truth < table.shape[0]
+        if known and trial + (stop - i - 1) * step >= trials.shape[0]:
+            break
+        if marked[slot] == number:
+            light = np.float64(photons_of[slot]) * per_decision
+        lit = not np.isnan(light)
+        if lit:
+            n_photons += stop - i
+        for k in range(_U(i), _U(stop)):
+            if lit:
+                total += light  # one by one: a sum of floats depends on its order
+            verdict = verdicts[numbers[k]]
+            label = np.int64(verdict["label"])
+            n_clicks += np.int64(verdict["clicks"])
+            if label == _NO_LABEL:
+                n_silent += 1
+                n_unsure += (verdict["flags"] & _AMBIGUOUS) != 0
+            if known:
+                right = np.int64(label == truth)
+                if label != _NO_LABEL:
+                    table[_U(truth), _U(label)] += 1
+                trials[_U(trial), 0] += 1
+                trials[_U(trial), 1] += right
+                well += right
+                trial += step
+        if known:
+            n_known += stop - i
+            n_right += well
+            n_objects, object_before = _note_object(number, stop - i, well, plan, objects, n_objects, object_before)
+        i = stop
+    photons[0] = total
+    sums[CLICKS], sums[EXPOSURES], sums[PHOTONS_KNOWN], sums[ABSTAINED] = n_clicks, 0, n_photons, n_silent
+    sums[UNSURE], sums[KNOWN], sums[RIGHT] = n_unsure, n_known, n_right
+    return i, n_objects
+
+
+@inner
+def _note_object(number, decided, well, plan, objects, n_objects, before):  # type: ignore[no-untyped-def]
+    """Add decisions on an object to the last of `objects`, or to a new one; return how many there are, and which one is the last."""
+    which = number % plan[1] if plan[1] else number
+    if which != before:
+        objects[n_objects, NUMBER], objects[n_objects, DECIDED], objects[n_objects, WELL] = which, 0, 0
+        n_objects += 1
+    objects[n_objects - 1, DECIDED] += decided
+    objects[n_objects - 1, WELL] += well
+    return n_objects, which
+
+
+@outer
+def judge_blocks(steps, first, fit, anchors, deadline_ns, histograms, judged, runs, marked):  # type: ignore[no-untyped-def]
+    """Judge the times of the decisions, from number `first` on, of many blocks, `steps` int64 (n, N_STEP).
+
+    Returns how many runs and how many marked blocks there are.
 
     fit: ClockModel.numbers, int64 (2,) and float64 (2,); anchors: its anchors, int64 (k,) and float64 (k,); histograms: the counts of four
     stages and of the total, int64 each, and judged int64 (N_JUDGED,) are added to. runs TIMING_RUN_DTYPE (n,): one for each block with
@@ -121,7 +177,7 @@ def judge_blocks(steps, rows, fit, anchors, deadline_ns, histograms, judged, run
             if _judge(marks, count, unsure_ns, deadline_ns, histograms, judged):
                 look |= IS_LATE
             run = runs[n_runs]
-            run["index"], run["count"] = rows[before]["index"], count
+            run["index"], run["count"] = first + before, count
             run["device_end_ns"], run["arrival_ns"], run["decided_ns"], run["recorded_ns"] = (
                 end_ns,
                 arrival_ns,

@@ -9,8 +9,14 @@ import pytest
 from pans.firmware_sim.ports.serve import open_sim
 from pans.runtime.errors import LinkError
 from pans.runtime.link.connection import Connection
+from pans.runtime.link.reader import count_delimiters
 
 URL = "sim:ideal?scene=uniform&pace=fast"
+
+
+@pytest.mark.parametrize("data", [b"", b"\0", b"abc", b"ab\0c", b"\0\0a\0", bytes(70)])
+def test_the_frames_of_a_read_are_its_delimiters(data: bytes) -> None:
+    assert count_delimiters(data) == data.count(0)
 
 
 @pytest.mark.parametrize(
@@ -26,7 +32,7 @@ def test_many_reads_in_one_call_are_those_made_one_by_one(frames: int, size: int
         if not at_once:
             link.read_ahead = None
         chunks = connection.reader.ahead(1.5, frames, size, link.now_ns() + seconds * 10**9)
-        found.append([(chunk.arrival_ns, len(chunk.data)) for chunk in chunks])
+        found.append([(arrival_ns, len(data)) for arrival_ns, data in chunks])
     assert found[0] == found[1]
     assert len(found[0]) == reads
 

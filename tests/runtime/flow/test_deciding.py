@@ -50,9 +50,7 @@ def by_turn(core: FlowCore, plan: Plan, data: bytes, cuts: list[int]) -> Output:
     steps.begin(SESSION)
     turn, output = Turn(steps, decoder), NOTHING
     for first, stop in zip([0, *cuts], [*cuts, len(data)]):
-        pieces = [np.frombuffer(piece, np.uint8) for piece in decoder.pieces(data[first:stop])]
-        reads = np.array([(len(piece), 1) for piece in pieces], np.int64).reshape(-1, 2)
-        ended = turn.feed(np.concatenate([*pieces, np.zeros(0, np.uint8)]), reads)
+        ended = turn.feed([(1, data[first:stop])])
         while True:
             for _, came in settled_blocks(turn) if turn.counts.steps else ():
                 output = output if came is None else joined(output, came)

@@ -106,7 +106,8 @@ def test_a_run_with_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_many_decisions_at_once_are_those_one_by_one() -> None:
     rng = np.random.default_rng(3)
     clicks = np.concatenate([rng.poisson(5.0, 60_000), rng.poisson(3.0, 40_000)])
-    one, many = LightWatch(batch=100), LightWatch(batch=100)
+    one, many, numbered = LightWatch(batch=100), LightWatch(batch=100), LightWatch(batch=100)
+    table = np.array([(n, 2) for n in range(int(clicks.max()) + 1)], [("clicks", np.uint32), ("flags", np.uint32)])
     for number in clicks.tolist():
         one.take(number)
     at = 0
@@ -115,6 +116,7 @@ def test_many_decisions_at_once_are_those_one_by_one() -> None:
         rows = np.zeros(2 * n, [("clicks", np.uint32), ("flags", np.uint32)])
         rows["clicks"][:n], rows[n:] = clicks[at : at + n], (9, 6)  # the second half is left out
         many.take_many(rows, 4)
+        numbered.take_many(table, 0, clicks[at : at + n].astype(np.uint32))
         at += n
     assert one.found
-    assert (one.found, one.report()) == (many.found, many.report())
+    assert (one.found, one.report()) == (many.found, many.report()) == (numbered.found, numbered.report())

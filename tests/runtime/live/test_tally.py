@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numbered_rows import made, some_verdicts
 
-from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag
+from pans.runtime.core.decision import DECISION_DTYPE, NO_LABEL, Decision, DecisionFlag, RowDecisions
 from pans.runtime.core.stream_arrays import MarkArrays
 from pans.runtime.core.stream_kernels import MARK_SLOTS
 from pans.runtime.live.tally import RunTally
@@ -106,7 +107,38 @@ def test_decisions_in_rows_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) 
         known = objects[row[3]] == row[3]
         one.add(Decision(*row), float(photons[row[3]]) if known else NAN)
     for part in np.split(rows, [700, 701, 2000]):
-        many.add_rows(part, MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons))
+        many.add_many(RowDecisions(part), MarkArrays(objects, np.zeros(MARK_SLOTS, np.int16), photons))
     assert many.figures() == one.figures()
     assert many.confusion.tolist() == one.confusion.tolist()
+    assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
+
+
+def test_numbered_decisions_count_as_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pans.runtime.live.tally.RUNS_AT_ONCE", 16)
+    rng, shots = np.random.default_rng(4), 2
+    verdicts = some_verdicts(rng, 40, 4)
+    photons = rng.random(MARK_SLOTS).astype(np.float32)
+    photons[::7] = np.nan
+    marks = MarkArrays(
+        np.where(np.arange(MARK_SLOTS) % 5 > 0, np.arange(MARK_SLOTS), -1), np.zeros(0, np.int16), photons
+    )
+    one, many = RunTally(4, shots, distinct=50), RunTally(4, shots, distinct=50)
+    index = 0
+    for _ in range(3):
+        runs = []
+        for number in np.sort(rng.integers(0, 90, 60)).tolist():
+            count, shot = int(rng.integers(1, 300)), int(rng.integers(0, 50)) * shots
+            runs.append((index, 0, 0, number, shot, count, 1, 1, shots, number % 6 - 1, 0))
+            index += count
+        n = sum(run[5] for run in runs)
+        decided = made(verdicts, rng.integers(0, 40, n).astype(np.uint32), runs)
+        if not many.decisions:
+            many.warm_up(marks, 2, decided)
+            many = RunTally(4, shots, distinct=50)
+        many.add_many(decided, marks)
+        for row in decided.rows.tolist():
+            one.add(Decision(*row), float(photons[row[3]]) if marks.objects[row[3]] == row[3] else NAN)
+    assert many.figures() == one.figures()
+    assert many.confusion.tolist() == one.confusion.tolist()
+    assert 0 < many.unsure < many.abstained
     assert (many.unsure, many.exposures, many.known, many.right) == (one.unsure, one.exposures, one.known, one.right)
