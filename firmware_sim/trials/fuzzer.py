@@ -19,6 +19,7 @@ from pans.firmware_sim.checks import flowing
 from pans.firmware_sim.checks.flow_stream import FlowStream
 from pans.firmware_sim.checks.strange import StrangeCommands
 from pans.firmware_sim.checks.twin import SocketTwin
+from pans.firmware_sim.device import counting, walk_kernels
 from pans.firmware_sim.device.gates import MAX_KEPT_PULSES
 from pans.firmware_sim.device.instrument import Instrument
 from pans.firmware_sim.device.states import MAX_SHOWS
@@ -87,6 +88,15 @@ class CountingInstrument(Instrument):
             self.counting_armed += self._states.largest > 1
 
 
+@functools.cache
+def warm_up() -> None:
+    """Compile or load what hosts and instruments need, once: who measures a call does not measure the compiler."""
+    counting.warm_up()
+    walk_kernels.warm_up()
+    for mode in MODES:
+        fuzzed_core(mode).warm_up()
+
+
 class LimitBroken(AssertionError):
     """A limit that the protocol or the module states did not hold."""
 
@@ -118,6 +128,7 @@ class Fuzzer:
     """One seed: the same input on every machine."""
 
     def __init__(self, seed: int) -> None:
+        warm_up()
         self.seed = seed
         self.counts = FuzzCounts()
         self._dice = random.Random(seed)
