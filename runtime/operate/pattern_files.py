@@ -59,6 +59,7 @@ def about(bundle: Bundle) -> dict[str, Any]:
         "photons_per_level": bundle.photons_per_level,
         "photons_at_white": bundle.photons_per_level * max(bundle.levels - 1, 0),
         **({"photon_number_max": bundle.largest} if bundle.largest > 1 else {}),
+        **({"channels_at_once": bundle.n_channels} if bundle.n_channels > 1 else {}),
     }
 
 

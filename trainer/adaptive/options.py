@@ -152,10 +152,11 @@ def with_defaults(options: AutomatonOptions, profile: Profile) -> tuple[int, int
 def price_at(options: AutomatonOptions, level: int, excess: float = 0.0) -> float:
     """Return the price of light in a level that grows: dear at first, when every photon is spent on all objects.
 
-    Through optics it is dearer where more was spent than the share of the levels so far: `excess` times as much.
+    Through optics it is dearer where more was spent than the share of the levels so far: `excess` times as much. A level of several
+    channels counts as so many: else half of the budget was left when two had grown, and tuning overshot it.
     """
     last = GROWN_PRICE * price_of(photons_wanted(options))
-    price = last + (max(last, options.first_price) - last) * 0.5 ** (level / options.half)
+    price = last + (max(last, options.first_price) - last) * 0.5 ** (level * options.channels / options.half)
     return price if options.optics is None else price * min(DEARER_MAX, max(1.0, excess**DEARER_POWER))
 
 

@@ -19,7 +19,13 @@ from pans.trainer.adaptive.grow import GrowOptions, Growth
 from pans.trainer.adaptive.light import Bits, as_bits
 from pans.trainer.adaptive.machine import Aim, Level, Machine, Sight, backward, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
-from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options, started_from, with_defaults
+from pans.trainer.adaptive.options import (
+    AutomatonOptions,
+    check_automaton_options,
+    price_at,
+    started_from,
+    with_defaults,
+)
 from pans.trainer.adaptive.outcomes import WordLaw
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.evaluate.walks import measured_walks, walks_of
@@ -167,3 +173,4 @@ def test_channels_whose_clicks_are_linked_are_refused_and_need_fewer_exposures()
         check_automaton_options(SMALL, bars_task(20), linked)
     alone, pair = (AutomatonOptions(photons=10.0, channels=channels) for channels in (1, 2))
     assert 2 * with_defaults(pair, FOUR)[0] == with_defaults(alone, FOUR)[0]
+    assert [price_at(pair, level) for level in range(10)] == [price_at(alone, 2 * level) for level in range(10)]
