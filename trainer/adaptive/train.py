@@ -266,7 +266,7 @@ class _Run:
         low, high = top_limits(self.profile)
         rate_hz = self.profile.detector.dark_rate_hz
         if rate_hz > 0:
-            exposure_s = DARK_COUNTS / self.exposures / rate_hz
+            exposure_s = DARK_COUNTS / (self.exposures * self.options.channels) / rate_hz
             high = min(high, max(low, self.profile.projector.peak_photoelectrons_hz * exposure_s))
         return high
 

@@ -174,3 +174,15 @@ def test_channels_whose_clicks_are_linked_are_refused_and_need_fewer_exposures()
     alone, pair = (AutomatonOptions(photons=10.0, channels=channels) for channels in (1, 2))
     assert 2 * with_defaults(pair, FOUR)[0] == with_defaults(alone, FOUR)[0]
     assert [price_at(pair, level) for level in range(10)] == [price_at(alone, 2 * level) for level in range(10)]
+
+
+def test_dark_counts_of_a_decision_are_those_of_all_its_detectors():
+    from pans.trainer.adaptive.train import DARK_COUNTS, _Run
+
+    tops = {}
+    for channels, exposures in ((1, 24), (2, 12), (2, 24)):
+        run = _Run(bars_task(20), FOUR, replace(SMALL, channels=channels, exposures=exposures), lambda _: None, 0)
+        tops[channels, exposures] = run._highest_top()
+    exposure_s = tops[2, 24] / FOUR.projector.peak_photoelectrons_hz
+    assert 48 * FOUR.detector.dark_rate_hz * exposure_s == pytest.approx(DARK_COUNTS)
+    assert tops[1, 24] == tops[2, 12] == pytest.approx(2 * tops[2, 24])

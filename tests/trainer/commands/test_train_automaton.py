@@ -119,6 +119,9 @@ def test_refusals(images, tmp_path, capsys):
     start = ["--photons", "3", "--start", "fashion-adaptive"]
     assert "the automaton of --start has" in refusal(capsys, images, *SHORT, *start, *out)
     assert "--start belongs to an automaton" in refusal(capsys, images, "--features", "3", *start[2:], *out)
+    assert "--channels belongs to an automaton" in refusal(capsys, images, "--features", "3", "--channels", "2", *out)
+    words = refusal(capsys, images, *SHORT, "--photons", "3", "--channels", "2", *out)
+    assert "2 channels per exposure, ideal has 1 (detector.channels)" in words
     assert "--features is missing" in refusal(capsys, images, "--as-is", *out)
     fiber = refusal(capsys, "fiber", *SHORT, "--photons", "3", *out)
     assert "the light is the scene's own" in fiber
