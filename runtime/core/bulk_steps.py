@@ -32,7 +32,7 @@ from .decision import (
 )
 from .follower import Follower
 from .plan import Plan
-from .stream_arrays import DecisionTables, MarkArrays, NumberArrays, WalkArrays
+from .stream_arrays import DecisionTables, FrameWalkArrays, MarkArrays, NumberArrays, WalkArrays
 from .window import DecisionWindows
 from .window_kernels import ONES, WindowArrays
 
@@ -97,9 +97,8 @@ class BulkSteps:
     @property
     def walk(self) -> WalkArrays:
         """What a kernel continues between `load` and `store`."""
-        return WalkArrays(
-            self._state, self._marks, self._windows, self.tables, self._rows, self._counts, self._numbered
-        )
+        made = FrameWalkArrays if self._state[kernels.KIND] == place.FRAMES else WalkArrays
+        return made(self._state, self._marks, self._windows, self.tables, self._rows, self._counts, self._numbered)
 
     @property
     def decides(self) -> bool:

@@ -84,3 +84,7 @@ class WalkArrays(NamedTuple):
     rows: npt.NDArray[np.void]
     counts: npt.NDArray[np.int64]
     numbered: NumberArrays
+
+
+class FrameWalkArrays(WalkArrays):
+    """The same of a stream of frames: a turn is compiled for these (`take_frames`) or for one detector's exposures (`take_clicks`)."""

@@ -80,30 +80,72 @@ def take_message(buffer, start, stop, state, marks, windows, tables, rows, count
 
     ROWS_FULL: the rows are, within a block; state[FRAME] says where it goes on.
     """
-    if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[SESSION]):
+    if not _is_ours(buffer, start, stop, state):
         return ODD
-    kind = buffer[start]
-    payload = start + _U(stream.BODY_HEADER)
+    kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
     if kind == stream.MARK:
         return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
     if kind == stream.FRAMES:
-        if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
-            return ODD
-        block = _block_of(buffer, payload, state, marks, windows)
-        if numbered.numbers.size:
-            _take_words(buffer, block, state, windows, tables, numbered)
-        else:
-            _take_windows(buffer, block, state, windows, tables, rows, counts_out)
-        if state[FRAME] < block.frames:
-            return ROWS_FULL
-    elif kind == stream.CLICKS:
-        if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
-            return ODD
-        block = _block_of(buffer, payload, state, marks, windows)
-        if not _settle(block, state, windows, tables, rows, counts_out):
-            return ROWS_FULL
-    else:
+        return _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered)
+    if kind == stream.CLICKS:
+        return _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out)
+    return ODD
+
+
+@inner
+def take_frames(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
+    """Take a message as `take_message` does, of a stream of frames: with nothing compiled of other blocks."""
+    if not _is_ours(buffer, start, stop, state):
         return ODD
+    kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
+    if kind == stream.MARK:
+        return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
+    if kind == stream.FRAMES:
+        return _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered)
+    return ODD
+
+
+@inner
+def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    """Take a message as `take_message` does, of a stream of one detector's exposures: with nothing compiled of frames."""
+    if not _is_ours(buffer, start, stop, state):
+        return ODD
+    kind, payload = buffer[start], start + _U(stream.BODY_HEADER)
+    if kind == stream.MARK:
+        return TOOK_MARK if _take_mark(buffer, payload, stop, state, marks) else ODD
+    if kind == stream.CLICKS:
+        return _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out)
+    return ODD
+
+
+@inner
+def _is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
+    """Whether a message has a header, of the session that is followed."""
+    return stop >= start + _U(stream.BODY_HEADER) and load4(buffer, start + _U(4)) == _U(state[SESSION])
+
+
+@inner
+def _take_frames(buffer, payload, stop, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
+    if state[FRAME] == 0 and not _accept_block(buffer, payload, stop, state, windows):
+        return ODD
+    block = _block_of(buffer, payload, state, marks, windows)
+    if numbered.numbers.size:
+        _take_words(buffer, block, state, windows, tables, numbered)
+    else:
+        _take_windows(buffer, block, state, windows, tables, rows, counts_out)
+    if state[FRAME] < block.frames:
+        return ROWS_FULL
+    state[FRAME] = 0
+    return TOOK_BLOCK
+
+
+@inner
+def _take_clicks(buffer, payload, stop, state, marks, windows, tables, rows, counts_out):  # type: ignore[no-untyped-def]
+    if state[FRAME] == 0 and not _accept_clicks(buffer, payload, stop, state, windows):
+        return ODD
+    block = _block_of(buffer, payload, state, marks, windows)
+    if not _settle(block, state, windows, tables, rows, counts_out):
+        return ROWS_FULL
     state[FRAME] = 0
     return TOOK_BLOCK
 

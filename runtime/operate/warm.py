@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pans.runtime.core.still import Core
 
 WALKING, STILL = "fashion-adaptive", "fashion10"
-WALKING_PROFILE, STILL_PROFILE = "dmd-spad", "oled-qcmos"
+WALKING_PROFILE, STILL_PROFILE, PARALLEL_PROFILE = "dmd-spad", "oled-qcmos", "flow-snspd"
 PATIENCE_S = 600.0
 LOOK_EVERY_S = 0.05
 TOLD_CHARACTERS = 300
@@ -45,24 +45,22 @@ class Job:
 
 
 def compile_core() -> None:
-    """The steps of sequential streams, fixed patterns and walks alike, and the compiled turn."""
+    """The steps of sequential streams, fixed patterns and walks alike, and their compiled turn."""
     from pans.runtime.bundle.model import load_bundle
-    from pans.runtime.turn import Turn
-    from pans.runtime.wire.bulk import BulkDecoder
 
     bundle, _ = load_bundle(WALKING)
-    steps = _compile_steps(bundle, WALKING_PROFILE, _Leaves(bundle)).bulk_steps(1)
-    if steps is not None:
-        Turn(steps, BulkDecoder()).warm_up()
+    _compile_turn(_compile_steps(bundle, WALKING_PROFILE, _Leaves(bundle)))
 
 
 def compile_still() -> None:
-    """The back ends of fixed patterns, and the steps of Python's turn."""
+    """The back ends of fixed patterns, the compiled turn of parallel frames, and the steps of Python's turn."""
     from pans.runtime.bundle.model import load_bundle
     from pans.runtime.decide.backends import make_decider
 
     bundle, _ = load_bundle(STILL)
     _compile_steps(bundle, STILL_PROFILE, make_decider(bundle)).warm_up_steps()
+    bundle = _four_patterns()
+    _compile_turn(_compile_steps(bundle, PARALLEL_PROFILE, make_decider(bundle)))
     compile_numbered()
 
 
@@ -110,6 +108,15 @@ def _compile_steps(bundle: Bundle, profile: str, decider: Any) -> Core:
     core = Core(plan, decider, 1, 0)
     core.warm_up()
     return core
+
+
+def _compile_turn(core: Core) -> None:
+    from pans.runtime.turn import Turn
+    from pans.runtime.wire.bulk import BulkDecoder
+
+    steps = core.bulk_steps(1)
+    if steps is not None:
+        Turn(steps, BulkDecoder()).warm_up()
 
 
 def compile_link() -> None:
@@ -162,7 +169,6 @@ def compile_flow() -> None:
     """The steps of objects in flow."""
     import numpy as np
 
-    from pans.runtime.bundle.model import BackEnd, Shown, make_bundle
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
     from pans.runtime.flow.settings import read_flow
@@ -173,11 +179,26 @@ def compile_flow() -> None:
     from pans.runtime.wire.bulk import BulkDecoder
 
     ChannelWatch(1, np.full(1, 0.01)).warm_up(counts=True)
-    profile = load_profile("flow-snspd")
+    profile, bundle = load_profile(PARALLEL_PROFILE), _four_patterns()
+    decider = make_decider(bundle)
+    for kind in ("cells", "tape"):
+        plan, core, _ = plan_flow(profile, bundle, decider, read_flow(kind), 1, 1.0)
+        core.warm_up()
+        Turn(FlowSteps(core, plan), BulkDecoder()).warm_up()
+
+
+def _four_patterns() -> Bundle:
+    """A small bundle for parallel channels, decided by a table."""
+    import numpy as np
+
+    from pans.runtime.bundle.model import BackEnd, Shown, make_bundle
+    from pans.runtime.instrument.profile import load_profile
+
+    profile = load_profile(PARALLEL_PROFILE)
     levels = np.zeros((4, 64), np.uint16)
     levels[:, 0] = profile.projector.levels - 1
     top = profile.projector.peak_photoelectrons_hz * profile.exposure.min_us * 2e-6 / (profile.projector.levels - 1)
-    bundle = make_bundle(
+    return make_bundle(
         name="warm",
         task="warm",
         classes=("a", "b"),
@@ -186,11 +207,6 @@ def compile_flow() -> None:
         back_end=BackEnd(table=np.zeros((16, 2), np.float32)),
         provenance={},
     )
-    decider = make_decider(bundle)
-    for kind in ("cells", "tape"):
-        plan, core, _ = plan_flow(profile, bundle, decider, read_flow(kind), 1, 1.0)
-        core.warm_up()
-        Turn(FlowSteps(core, plan), BulkDecoder()).warm_up()
 
 
 JOBS: Mapping[str, Callable[[], None]] = {

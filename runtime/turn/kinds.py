@@ -1,7 +1,7 @@
 """The kernels of each kind of walk: what takes a message, and what answers a block. The class of the walk's tuple says which.
 
-Owns the choice, made when a turn is compiled: a run with objects that stand still compiles nothing of a flow's, and the other way round.
-A third kind is a tuple of arrays with `state` and `rows`, and a kernel of each sort here.
+Owns the choice, made when a turn is compiled: a run of one kind compiles nothing of the others: exposures of one detector, frames of
+parallel channels, flow. A further kind is a tuple of arrays with `state` and `rows`, and a kernel of each sort here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from pans.runtime.core import stream_kernels as core
-from pans.runtime.core.stream_arrays import WalkArrays
+from pans.runtime.core.stream_arrays import FrameWalkArrays, WalkArrays
 from pans.runtime.flow.arrays import FlowWalk
 from pans.runtime.wire.inner import inner
 
@@ -36,12 +36,14 @@ def taking(kind: Any) -> tuple[Any, tuple[str, ...]]:
         from pans.runtime.flow.deciding import take_message as take_flow
 
         return take_flow, ()
-    return core.take_message, WalkArrays._fields
+    if kind is FrameWalkArrays:
+        return core.take_frames, WalkArrays._fields
+    return core.take_clicks, WalkArrays._fields[:-1]  # exposures of one detector are not numbered
 
 
 def answering(kind: Any) -> tuple[Any, tuple[str, ...]]:
     """Return the kernel that answers a block of a walk of class `kind`, and no names: it wants the whole walk."""
-    return (_answer_nothing if kind is FlowWalk else send_show), ()
+    return (send_show if kind is WalkArrays else _answer_nothing), ()
 
 
 def _typed(choose: Callable[[Any], Any], context: Any, walk: Any, rest: tuple[Any, ...]) -> tuple[Any, Any]:
