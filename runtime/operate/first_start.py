@@ -25,7 +25,8 @@ from .warm import JOBS, PATIENCE_S, Job, cache_folder, compile_settling, start
 LARGEST = "core"  # the job of the other process
 LATER = ("live.loop", "live.lasting", "monitor.snapshot", "record.parted_recorder", "watch.attendants", "watch.host")
 BESIDE = "link"  # what this process compiles meanwhile
-PACKAGES = ("core", "decide", "wire", "turn")  # whose sources the largest kernels are made from
+# whose sources kernels are made from: SOURCES of wire/inner.py, which needs numba
+PACKAGES = ("core", "decide", "flow", "instrument", "record", "timing", "turn", "wire")
 
 
 @contextmanager

@@ -9,6 +9,9 @@ array by itself, and a turn has some forty arrays.
 Kernels are loaded from the cache alone: numba would first bring in all that it can compile, and scipy where that is installed, which took
 a quarter of a second in each process that only loads. Whatever is compiled brings that in by itself.
 
+The cache of a kernel is for its file as it is. What it calls and what it knows of other files is compiled in, too, so here a kernel is
+for all files that kernels are made from: behind a change in any of them, all are compiled again.
+
 What is left out here is numba's own, which has no option for it: other versions of numba than those it was tried with compile inner
 kernels like all others, which takes longer and gives the same results.
 """
@@ -17,6 +20,10 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import hashlib
+import os
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -25,13 +32,15 @@ from numba.core import caching, event
 from numba.core.runtime import rtsys
 
 TRIED = ((0, 68),)  # versions of numba
+# packages of runtime whose files hold kernels, or constants that are compiled into them
+SOURCES = ("core", "decide", "flow", "instrument", "record", "timing", "turn", "wire")
 
 
 def outer(function: Any) -> Any:
     """Return `function` as a kernel for Python and for other kernels to call; it must not allocate."""
     if numba.version_info.short not in TRIED:
         return njit(cache=True, nogil=True)(function)
-    return njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)(function)
+    return _for_these_sources(njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)(function))
 
 
 def inner(function: Any) -> Any:
@@ -93,6 +102,30 @@ def _compiler() -> Any:
 
         _made.append(Compiler)
     return _made[0]
+
+
+def _for_these_sources(kernel: Any) -> Any:
+    """Return `kernel`, whose cache holds what was compiled from these files; without compilation it is a function of Python."""
+    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if file is not None:
+        file._source_stamp = (file._source_stamp, digest_of(Path(__file__).parents[1]))
+    return kernel
+
+
+@cache
+def digest_of(runtime: Path) -> str:
+    """Return a digest of the names, sizes and times of all files of SOURCES in the folder `runtime`; "" where they cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for package in SOURCES:
+            with os.scandir(runtime / package) as entries:
+                for entry in sorted(entries, key=lambda one: one.name):
+                    if entry.name.endswith(".py"):
+                        facts = entry.stat()
+                        digest.update(f"{package}/{entry.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    except OSError:  # in an archive, say
+        return ""
+    return digest.hexdigest()
 
 
 class _NoEnvironment:

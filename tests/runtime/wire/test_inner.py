@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import re
+from pathlib import Path
+
 import numba
 import numpy as np
 import pytest
 from numba import njit
 
+from pans.runtime.operate import first_start
+from pans.runtime.wire import inner as wire_inner
 from pans.runtime.wire.bare import as_float32, copy_span, load4, load8
-from pans.runtime.wire.inner import TRIED, inner
+from pans.runtime.wire.inner import SOURCES, TRIED, digest_of, inner
 
 U = np.uint64
 
@@ -46,3 +53,67 @@ def test_bytes_are_numbers_and_are_copied() -> None:
 def test_an_inner_kernel_is_not_called_from_python() -> None:
     with pytest.raises(TypeError):
         _tripled(2)
+
+
+KERNEL = """
+from pans.runtime.wire.inner import outer
+
+@outer
+def doubled(x):
+    return 2 * x
+"""
+
+
+@pytest.mark.skipif(numba.version_info.short not in TRIED, reason="cached as all others with this version of numba")
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is cached")
+def test_a_cached_kernel_is_for_the_files_that_kernels_are_made_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "made.py").write_text(KERNEL)
+    found = []
+    for digest in ("as it is", "as it is", "changed", "as it is"):
+        monkeypatch.setattr(wire_inner, "digest_of", lambda runtime, digest=digest: digest)
+        spec = importlib.util.spec_from_file_location("made", tmp_path / "made.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        assert module.doubled(4) == 8
+        found.append(sum(module.doubled.stats.cache_hits.values()))
+    assert found == [0, 1, 0, 0]
+
+
+def test_the_digest_knows_every_file_of_the_packages(tmp_path: Path) -> None:
+    for package in SOURCES:
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "kernels.py").write_text("x = 1")
+    digests = [_digest(tmp_path)]
+    (tmp_path / SOURCES[-1] / "kernels.py").write_text("x = 12")
+    digests.append(_digest(tmp_path))
+    os.utime(tmp_path / SOURCES[0] / "kernels.py", ns=(1, 1))
+    digests.append(_digest(tmp_path))
+    (tmp_path / SOURCES[0] / "more.py").touch()
+    digests.append(_digest(tmp_path))
+    (tmp_path / SOURCES[0] / "notes.txt").touch()
+    assert _digest(tmp_path) == digests[-1]
+    assert len(set(digests)) == 4
+    (tmp_path / SOURCES[0] / "kernels.py").unlink()
+    (tmp_path / SOURCES[0] / "more.py").unlink()
+    (tmp_path / SOURCES[0] / "notes.txt").unlink()
+    (tmp_path / SOURCES[0]).rmdir()
+    assert _digest(tmp_path) == ""
+
+
+def _digest(folder: Path) -> str:
+    digest_of.cache_clear()
+    return digest_of(folder)
+
+
+def test_the_first_start_looks_at_the_same_files() -> None:
+    assert first_start.PACKAGES == SOURCES
+    runtime = Path(wire_inner.__file__).parents[1]
+    holding = {
+        path.parent.name for path in runtime.glob("*/*.py") if re.search(r"^@(?:inner|outer)$", path.read_text(), re.M)
+    }
+    assert holding <= set(SOURCES)
