@@ -150,6 +150,21 @@ def test_a_training_ends_in_a_bundle_that_is_evaluated_and_trained_on(tmp_path):
         started_from(replace(SMALL, channels=3), bundle, digest, task, FOUR)
 
 
+def test_a_resumed_training_ends_at_the_same_automaton(tmp_path):
+    task, path = bars_task(120), tmp_path / "two.checkpoint"
+    whole = train_automaton(task, FOUR, SMALL)
+
+    def stop(told):
+        if told.stage == "shown":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_automaton(task, FOUR, SMALL, checkpoint=path, report=stop)
+    resumed = train_automaton(task, FOUR, SMALL, checkpoint=path, resume=True)
+    for name in ("pattern_levels", "pattern", "dwell", "successors"):
+        np.testing.assert_array_equal(getattr(resumed.arrays, name), getattr(whole.arrays, name))
+
+
 @pytest.mark.parametrize(
     ("changes", "name", "error", "words"),
     [
