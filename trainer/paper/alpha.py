@@ -33,19 +33,24 @@ EPOCHS = 16
 SHOWN = (10, 1e-4)  # d_f and alpha of the paper's evolution of patterns
 STAGES = (1, 3, 8, EPOCHS)  # epochs after which it is shown
 LATE = 5  # epochs at the end, over which the growth of the light is told
+SHORT, PAPER = "short", "the paper's"  # schedules
+PAPER_EPOCHS = 100  # of up to 500
+PAPER_CELLS = tuple((10, alpha) for alpha in (0.0, 1e-4, 1e-2))  # d_f and alpha: both ends and the middle
 
 
-def recipe(features: int, alpha: float) -> Options:
+def recipe(features: int, alpha: float, schedule: str = SHORT) -> Options:
     """Return what a course is trained with: straight-through from first to last and constant rates, as the paper trains."""
     as_the_paper = Options(features, alpha=alpha, estimator="ste", constant=True, hidden=512)
+    if schedule == PAPER:
+        return replace(as_the_paper, epochs=PAPER_EPOCHS, batch=128, front_rate=1e-3, head_rate=1e-4)
     return replace(as_the_paper, epochs=EPOCHS, batch=512, front_rate=5e-3, head_rate=1e-3)
 
 
-def course_of(asked: Asked, features: int, alpha: float) -> Row | None:
+def course_of(asked: Asked, features: int, alpha: float, schedule: str = SHORT) -> Row | None:
     """Return one training: `features`, `alpha`, `epochs` (columns of course.EpochFigures) and `final`; None if not made."""
-    options = recipe(features, alpha)
-    path = asked.cache / f"alpha-{features}-{alpha:g}.json"
-    shown = (features, alpha) == SHOWN
+    options = recipe(features, alpha, schedule)
+    path = asked.cache / f"alpha-{features}-{alpha:g}{'' if schedule == SHORT else '-paper'}.json"
+    shown = (features, alpha, schedule) == (*SHOWN, SHORT)
     if shown and not path.with_suffix(".npz").is_file():
         path.unlink(missing_ok=True)  # figures without their patterns are half a part
 
@@ -55,7 +60,8 @@ def course_of(asked: Asked, features: int, alpha: float) -> Row | None:
         if shown:
             _keep_patterns(path.with_suffix(".npz"), course.patterns)
         final = measure(TASK, task, course.trained)
-        return {"features": features, "alpha": alpha, "epochs": course.columns(), "final": final}
+        which = {} if schedule == SHORT else {"schedule": schedule}
+        return {"features": features, "alpha": alpha, **which, "epochs": course.columns(), "final": final}
 
     found = kept(path, differing_options(options), make, collect=asked.collect)
     if found is not None:
@@ -75,7 +81,7 @@ def _keep_patterns(path: Path, patterns: dict[int, NDArray[np.float32]]) -> None
 
 
 def alpha_page(asked: Asked) -> Made:
-    """Return one row per training, and one picture per d_f."""
+    """Return one row per training, and one picture per d_f; then the trainings by the paper's schedule, with a picture of theirs."""
     wanted = [features for features in FEATURES if asked.wants(features)]
     found = [course_of(asked, features, alpha) for features in wanted for alpha in ALPHAS]
     rows = [row for row in found if row is not None]
@@ -83,7 +89,11 @@ def alpha_page(asked: Asked) -> Made:
     for features in wanted:
         if mine := [row for row in rows if row["features"] == features]:
             pictures[f"-{features}"] = partial(plots.courses, rows=mine)
-    return Made(rows, pictures)
+    cells = [cell for cell in PAPER_CELLS if asked.wants(cell[0])]
+    made = [course_of(asked, features, alpha, PAPER) for features, alpha in cells]
+    if long := [row for row in made if row is not None]:
+        pictures["-paper"] = partial(plots.courses, rows=long)
+    return Made(rows + long, pictures)
 
 
 def growth(row: Row) -> float:
@@ -93,15 +103,35 @@ def growth(row: Row) -> float:
 
 
 def alpha_tables(rows: Rows) -> list[Table]:
-    """Return one line per training, of the finished model."""
+    """Return one line per training, of the finished model: the short schedule, then the paper's beside it."""
+    short = [row for row in rows if "schedule" not in row]
+    by_cell = {(row["features"], row["alpha"]): row["final"] for row in short}
+    long = [row | {"short": _beside_short(row, by_cell)} for row in rows if row.get("schedule") == PAPER]
+    tables = [_table("alpha", short)]
+    if long:
+        heading = f"## The paper's batches and rates, {PAPER_EPOCHS} epochs"
+        tables.append(_table("alpha_long", long, heading))
+    return tables
+
+
+def _table(name: str, rows: Rows, heading: str = "") -> Table:
     unweighed = {row["features"]: row["final"] for row in rows if row["alpha"] == 0}
     shown = [row | {"grows": growth(row), "beside": _held_against(row, unweighed.get(row["features"]))} for row in rows]
     claims = [
-        claim(f"alpha = {alpha:g}", "alpha = 0", [row["beside"] for row in shown if row["alpha"] == alpha])
+        claim(f"alpha = {alpha:g}", "alpha = 0", compared)
         for alpha in ALPHAS
-        if alpha
+        if alpha and (compared := [row["beside"] for row in shown if row["alpha"] == alpha])
     ]
-    return [Table(columns("alpha"), shown, claims=claims)]
+    return Table(columns(name), shown, heading, claims)
+
+
+def _beside_short(row: Row, by_cell: dict[tuple[int, float], Row]) -> Row | None:
+    """A training by the paper's schedule beside the short one."""
+    short, final = by_cell.get((row["features"], row["alpha"])), row["final"]
+    if short is None:
+        return None
+    compared = against(final["value"], short["value"], final["error_objects"], short["error_objects"])
+    return {"value": short["value"], "illumination": short["illumination"]} | compared
 
 
 def _held_against(row: Row, unweighed: Row | None) -> Row | None:

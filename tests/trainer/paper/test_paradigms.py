@@ -305,13 +305,25 @@ def test_pages_of_courses_are_made_once_and_collected(task, tmp_path, monkeypatc
     monkeypatch.setattr(alpha, "ALPHAS", (0.0, 0.1))
     monkeypatch.setattr(alpha, "SHOWN", (3, 0.1))
     monkeypatch.setattr(alpha, "STAGES", (1, 6))
-    monkeypatch.setattr(alpha, "recipe", lambda _, weight: dataclasses.replace(SMALL, alpha=weight))
+    monkeypatch.setattr(alpha, "PAPER_CELLS", ((3, 0.1),))
+    more = {alpha.SHORT: 0, alpha.PAPER: 1}
+    monkeypatch.setattr(
+        alpha,
+        "recipe",
+        lambda _, weight, schedule=alpha.SHORT: dataclasses.replace(
+            SMALL, alpha=weight, epochs=SMALL.epochs + more[schedule]
+        ),
+    )
     page, said = asked(tmp_path / "cache")
     assert alpha.evolution_page(dataclasses.replace(page, collect=True)).rows == []
     assert said == ["not trained yet: pans reproduce evolution"]
     made = alpha.alpha_page(page)
-    free, held = made.rows
+    free, held, longer = made.rows
     assert held["final"]["illumination"] < free["final"]["illumination"]
+    assert len(longer["epochs"]["loss"]) == len(held["epochs"]["loss"]) + 1
+    short, paper = alpha.alpha_tables(made.rows)
+    assert [row["alpha"] for row in short.rows] == [0.0, 0.1]
+    assert [row["short"]["value"] for row in paper.rows] == [held["final"]["value"]]
     assert free["final"]["objects"] == 240
     write_page(tmp_path, "alpha", page_of("alpha"), made)
     assert (tmp_path / "alpha-3.png").read_bytes().startswith(PNG)
