@@ -121,15 +121,15 @@ def test_what_sources_give():
     def of(name, source):
         return Figures(RESULTS).values(name, source)
 
-    short = [row for row in read_rows(RESULTS, "alpha") if "schedule" not in row]
-    light = [row["final"]["illumination"] for row in short if row["alpha"] == 0]
+    unweighed = [row for row in read_rows(RESULTS, "alpha") if row["alpha"] == 0]
+    light = [row["final"]["illumination"] for row in unweighed if "schedule" not in row]  # of the first table
     assert of("alpha", '"1:illumination"["alpha = 0"]') == light
-    assert of("alpha", '"rows:final.illumination"["alpha = 0"]') == light
-    assert of("mnist", '"alpha/illumination"["alpha = 0"]') == light
-    assert of("alpha", 'max("illumination"["alpha = 0"]) - 1') == [max(light) - 1]
-    assert of("alpha", 'rows("illumination"["alpha = 0"])') == [4.0]
-    assert of("alpha", 'rows("illumination"["alpha = 9"])') == [0.0]
-    assert of("alpha", 'count("illumination"["alpha = 0"] > 600)') == [sum(one > 600 for one in light)]
+    assert of("alpha", '"rows:final.illumination"["alpha = 0"]') == [r["final"]["illumination"] for r in unweighed]
+    assert of("mnist", '"alpha/1:illumination"["alpha = 0"]') == light
+    assert of("alpha", 'max("1:illumination"["alpha = 0"]) - 1') == [max(light) - 1]
+    assert of("alpha", 'rows("1:illumination"["alpha = 0"])') == [4.0]
+    assert of("alpha", 'rows("1:illumination"["alpha = 9"])') == [0.0]
+    assert of("alpha", 'count("1:illumination"["alpha = 0"] > 600)') == [sum(one > 600 for one in light)]
     assert of("README", '"counts/level"["page = mnist", "ours = K = 1: ours"]') == [6.0]
     first = read_rows(RESULTS, "fashion-mnist")[0]["first_200"]
     assert of("fashion-mnist", '"1:ours#1"["d_f = 3", 2]') == [pytest.approx(100 * first["3"]["accuracy_mean"])]
