@@ -64,8 +64,9 @@ class Checker:
         self._stepped = False  # by the message that the host takes now
         self._last_command: dict[tuple[int, int], int] = {}
         self._gates: dict[tuple[int, int], Gate] = {}  # submitted: (session, command id)
-        self._asked: dict[Gate, None] = {}
-        self._executed: dict[Gate, None] = {}
+        # by session: behind a reset the device counts its ticks anew, and the same gate is another one
+        self._asked: dict[tuple[int, Gate], None] = {}
+        self._executed: dict[tuple[int, Gate], None] = {}
         self.books: dict[int, DeviceBooks] = {}  # by session
 
     def fail(self, text: str) -> None:
@@ -108,16 +109,16 @@ class Checker:
             )
         self._last_command[key] = command.command_id
 
-    def on_gate(self, gate: Gate, tick: int) -> None:
+    def on_gate(self, session: int, gate: Gate, tick: int) -> None:
         """The device has accepted a pulse."""
         self.counts.gates_executed += 1
         if gate.tick <= tick:
             self.fail(f"a gate for tick {gate.tick} was executed at {tick}: late")
-        if gate in self._executed:
+        if (session, gate) in self._executed:
             self.fail(f"the gate for tick {gate.tick} was executed twice")
-        if gate not in self._asked:
+        if (session, gate) not in self._asked:
             self.fail(f"a gate for tick {gate.tick} was executed without a command")
-        self._executed[gate] = None
+        self._executed[session, gate] = None
         _forget_oldest(self._executed, MAX_GATES)
 
     # -- the host's side -----------------------------------------------------------------------------------------------
@@ -184,7 +185,7 @@ class Checker:
         """The host has asked for a pulse."""
         self.counts.gates_submitted += 1
         self._gates[session, command_id] = gate
-        self._asked[gate] = None
+        self._asked[session, gate] = None
         _forget_oldest(self._asked, MAX_GATES)
         _forget_oldest(self._gates, MAX_GATES)
 
@@ -196,14 +197,14 @@ class Checker:
         gate = self._gates.pop((session, event["command_id"]), None)
         if gate is None:
             self.fail(f"a refusal of command {event['command_id']} was reported that is no open gate")
-        elif gate in self._executed:
+        elif (session, gate) in self._executed:
             self.fail(f"the gate for tick {gate.tick} was executed, and reported as refused")
 
     def settled(self, session: int, up_to_id: int) -> None:
         """Every command of `session` up to this one has been acknowledged: each gate has been executed or reported."""
         for key in [key for key in self._gates if key[0] == session and key[1] <= up_to_id]:
             gate = self._gates[key]
-            if gate not in self._executed:
+            if (session, gate) not in self._executed:
                 self.fail(f"the gate for tick {gate.tick} was neither executed nor reported as refused")
 
     def close(self) -> None:
@@ -356,7 +357,7 @@ class WatchedInstrument(Instrument):
 
     def _gate(self, body: bytes) -> None:
         super()._gate(body)
-        self.checker.on_gate(unpack_gate(body), self.tick)
+        self.checker.on_gate(self.session, unpack_gate(body), self.tick)
 
 
 def _places(first: int, stop: int) -> slice | NDArray[np.int64]:

@@ -105,7 +105,7 @@ class FlowChecker(Checker):
             return
         pulse = event["tick"], self._core.limits.gate_ticks
         asked = [key for key, gate in self._gates.items() if (gate.tick, gate.duration_ticks) == pulse]
-        gates = [self._gates.pop(key) for key in asked]
+        gates = [(key[0], self._gates.pop(key)) for key in asked]
         if event["kind"] == "gate_expired":
             if gates:
                 self.fail(f"the pulse of decision {event['decision']} was asked for, and reported as expired")
