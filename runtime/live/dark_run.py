@@ -96,9 +96,11 @@ class DarkRun:
             expected = np.where(
                 few, np.clip(said, low, high), expected
             )  # hardly measured: the profile's, as far as possible
-        expected, low, high = (
-            1 - (1 - rate) ** plan.channels_at_once for rate in (expected, low, high)
-        )  # any of them clicks
+        if plan.channels_at_once > 1:  # any of them clicks: 1 - (1 - rate)**n, for tiny rates too
+            with np.errstate(divide="ignore"):  # a rate of 1
+                expected, low, high = (
+                    -np.expm1(plan.channels_at_once * np.log1p(-rate)) for rate in (expected, low, high)
+                )
         per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,
