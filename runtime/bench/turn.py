@@ -6,14 +6,10 @@ for bytes; a round trip is wall time, from a decision to the next one and its re
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
 import tempfile
-import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +24,7 @@ from pans.runtime.core.plan import Plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.verdict import Decider
+from pans.runtime.link.base import Link, descriptor_of, open_link
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
@@ -51,6 +48,7 @@ from pans.runtime.wire.schema import SCHEMA
 
 from . import ingest
 from .flow_turn import flow_row
+from .other_end import other_end
 from .rows import BenchOptions, Row, cpu_times, per_item_ns, percentiles_us
 from .turn_c import DEVICE, built, loop_in_c
 from .walks import CLICK, SESSION, made_automaton, sequential_plan
@@ -58,7 +56,7 @@ from .walks import CLICK, SESSION, made_automaton, sequential_plan
 Rows = NDArray[np.void]
 READ_BYTES = 1 << 16
 C_ROWS = 8192  # of the loop's ring
-WAIT_NS = 1_000_000_000
+NS_PER_S = WAIT_NS = 1_000_000_000
 ROUNDS = 5
 
 
@@ -253,31 +251,68 @@ def _trips(bundle: Bundle, folder: Path, quick: bool) -> list[Row]:
     if isinstance(device, str):
         return [{"name": "command to click block, decided and recorded", "skipped": device}]
     plan, decider = _walk_plan(bundle)
-    return [_trip_row(kind, plan, decider, device, 1000 if quick else 10_000) for kind in ("pty", "TCP")]
+    n = 1000 if quick else 10_000
+    return [_trip_row(_Trips(kind, plan, decider, device, n)) for kind in ("pty", "TCP", "pyusb")]
 
 
-def _trip_row(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> Row:
+@dataclass(frozen=True, slots=True)
+class _Trips:
+    """`n` round trips each time, over a link of that kind."""
+
+    kind: str
+    plan: Plan
+    decider: Decider
+    device: Path
+    n: int
+
+    @contextmanager
+    def other_end(self, mode: int, n_in: int, n_out: int) -> Iterator[Link]:
+        """Start the device in `mode` and yield a link to it."""
+        listen = "pty" if self.kind == "pty" else "tcp"
+        facts = (mode, SESSION, SCHEMA, n_in, n_out, self.plan.slots_per_cycle)
+        with other_end([str(self.device), listen, *map(str, facts)]) as url:
+            usb = f"simusb:{url.removeprefix('serial:')}"
+            with closing(open_link(usb if self.kind == "pyusb" else url)) as link:
+                yield link
+
+
+def _trip_row(trips: _Trips) -> Row:
     """Rounds of both, in turn."""
     framed, raw, changed = list[NDArray[np.int64]](), list[NDArray[np.int64]](), 0.0
     for _ in range(ROUNDS):
-        times, command, answer, wrong = _framed(kind, plan, decider, device, n)
+        times, command, answer, wrong = _framed(trips)
         framed.append(times)
         changed = max(changed, wrong)
-        with _process(kind, device, 0, command, answer, plan.slots_per_cycle) as fd:
-            came: NDArray[np.int64] = np.zeros(n, np.int64)
-            if not echo(fd, np.ones(command, np.uint8), answer, came, np.zeros(4, np.int64)):
-                raise RuntimeError(f"the echo over {kind} ended early")
-            raw.append(came[n // 10 :])
+        with trips.other_end(0, command, answer) as link:
+            raw.append(_echoed(link, command, answer, trips.n)[trips.n // 10 :])
     ours, bare = (percentiles_us(np.concatenate(times)) for times in (framed, raw))
-    row: Row = {"name": f"command to click block, decided and recorded, {kind}, device in C", **ours}
+    row: Row = {"name": f"command to click block, decided and recorded, {trips.kind}, device in C", **ours}
     row |= {f"echo_{key}": value for key, value in bare.items() if key != "calls"}
     for key in ("p50", "p99"):
         row[f"{key}_of_echo"] = round(ours[f"{key}_us"] / bare[f"{key}_us"], 3)
     return row | {"command_bytes": command, "answer_bytes": answer, "changed_percent": changed}
 
 
-def _framed(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> tuple[NDArray[np.int64], int, int, float]:
-    """Times of `n` round trips, without the first tenth, the bytes of a command and of its answer, and percent of wrong decisions."""
+def _echoed(link: Link, command: int, answer: int, n: int) -> NDArray[np.int64]:
+    """Times of `n` raw echoes; by the link's own calls where it has no descriptor."""
+    times, fd = np.zeros(n, np.int64), descriptor_of(link)
+    if fd is not None:
+        if not echo(fd, np.ones(command, np.uint8), answer, times, np.zeros(4, np.int64)):
+            raise RuntimeError(f"the echo over {link.name} ended early")
+        return times
+    request = bytes([1]) * command
+    for k in range(n):
+        began, missing = link.now_ns(), answer
+        link.write(request)
+        while missing > 0:
+            missing -= len(link.read(WAIT_NS / NS_PER_S))
+        times[k] = link.now_ns() - began
+    return times
+
+
+def _framed(trips: _Trips) -> tuple[NDArray[np.int64], int, int, float]:
+    """Times of round trips, without the first tenth, the bytes of a command and of its answer, and percent of wrong decisions."""
+    plan, decider = trips.plan, trips.decider
     core = Core(plan, decider, 1, 0)
     core.warm_up()
     core.begin(0, 0)
@@ -292,17 +327,11 @@ def _framed(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> tu
     control[ring.DRIVES], control[ring.NEXT_ID], control[ring.OLDEST_ID] = 1, 2, 1
     control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = 0, 0
     times, bodies, rows = list[NDArray[np.int64]](), list[bytes](), list[Rows]()
-    with _process(kind, device, 1, len(first), 0, plan.slots_per_cycle) as fd:
-        os.write(fd, first)
-        while sum(map(len, times)) < n:
-            ended = turn.run(fd, Limits(due_ns=_soon()))
-            if ended not in (ring.DUE, ring.FULL):
-                raise RuntimeError(f"round trips over {kind}: {ring.WHY[ended]} after {sum(map(len, times))}")
-            left, blocks = turn.shows[:, ring.TIME], turn.blocks
-            kept = (
-                blocks[1:, ring.RECORDED] - left[1 : len(blocks)]
-            )  # keeping a block, behind the command that answers it
-            times.append(np.diff(blocks[:, ring.DECIDED]) + kept)
+    with trips.other_end(1, len(first), 0) as link:
+        link.write(first)
+        calls = _called if descriptor_of(link) is not None else _read_and_fed
+        for found in calls(turn, link, trips.n):
+            times.append(found)
             bodies += [turn.bytes_of(span) for span in turn.messages]
             rows.append(turn.rows.copy())
     again = Core(plan, decider, 1, 0)
@@ -315,31 +344,39 @@ def _framed(kind: str, plan: Plan, decider: Decider, device: Path, n: int) -> tu
     return found[len(found) // 10 :], len(first), answer, wrong
 
 
+def _called(turn: Turn, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
+    """Call again and again what reads and writes the descriptor itself, for `n` round trips; yield the times of those of each call."""
+    done, fd = 0, descriptor_of(link)
+    assert fd is not None
+    while done < n:
+        ended = turn.run(fd, Limits(due_ns=_soon()))
+        if ended not in (ring.DUE, ring.FULL):
+            raise RuntimeError(f"round trips over {link.name}: {ring.WHY[ended]} after {done}")
+        left, blocks = turn.shows[:, ring.TIME], turn.blocks
+        kept = blocks[1:, ring.RECORDED] - left[1 : len(blocks)]  # keeping a block, behind the command that answers it
+        done += len(kept)
+        yield np.diff(blocks[:, ring.DECIDED]) + kept
+
+
+def _read_and_fed(turn: Turn, link: Link, n: int) -> Iterator[NDArray[np.int64]]:
+    """Read, let the turn decide and send what it says, as a live run does where compiled code cannot read the link; `n` times.
+
+    A time is from one decision to the next and to what is kept of it. What a live run settles then, it does while the answer is on its way.
+    """
+    decided_ns, done = 0, 0
+    while done < n:
+        data = link.read(WAIT_NS / NS_PER_S)
+        ended = turn.feed([(link.now_ns(), data)])
+        if ended == ring.BROKEN:
+            link.write(turn.bytes_of(turn.shows[-1])[-turn.counts.unsent :])
+        elif ended != ring.ALL_TAKEN or not data:
+            raise RuntimeError(f"round trips over {link.name}: {ring.WHY[ended]} after {done}")
+        blocks = turn.blocks
+        if len(blocks):
+            kept_ns = int(blocks[-1, ring.RECORDED])
+            yield np.array([kept_ns - decided_ns] if decided_ns else [], np.int64)
+            decided_ns, done = int(blocks[-1, ring.DECIDED]), done + 1
+
+
 def _soon() -> int:
     return int(now_ns(np.zeros(4, np.int64))) + WAIT_NS
-
-
-@contextmanager
-def _process(kind: str, device: Path, mode: int, n_in: int, n_out: int, slots: int) -> Iterator[int]:
-    """Start the other end in `mode` behind a pseudo-terminal or TCP; yield our descriptor, which does not block."""
-    facts = [str(mode), str(SESSION), str(SCHEMA), str(n_in), str(n_out), str(slots)]
-    if kind == "pty":
-        ours, theirs = os.openpty()
-        tty.setraw(ours)
-        tty.setraw(theirs)
-        child = subprocess.Popen([device, os.ttyname(theirs), *facts])
-    else:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            child = subprocess.Popen([device, str(server.getsockname()[1]), *facts])
-            connection, _ = server.accept()
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        ours, theirs = connection.detach(), -1
-    os.set_blocking(ours, False)
-    try:
-        yield ours
-    finally:
-        child.kill()
-        child.wait()
-        os.close(ours)
-        if theirs >= 0:
-            os.close(theirs)

@@ -144,20 +144,21 @@ int64_t words(const uint8_t *data, int64_t n, uint32_t session, uint32_t schema,
 """
 )
 DEVICE = (
-    COMMON
+    "#define _GNU_SOURCE\n"
+    + COMMON
     + r"""
 #include <stdio.h>
 #include <stdlib.h>
 #include <unistd.h>
 #include <fcntl.h>
 #include <termios.h>
-#include <errno.h>
-#include <poll.h>
+#include <arpa/inet.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <sys/socket.h>
-/* PORT MODE SESSION SCHEMA IN OUT SLOTS: a path of a terminal or a TCP port to connect to. Mode 0 answers each IN bytes with OUT bytes.
-   Mode 1 answers each SHOW as an instrument does: an acknowledgement, a MARK before a new object, and the CLICKS block of the exposure. */
+/* LISTEN MODE SESSION SCHEMA IN OUT SLOTS: behind a new pseudo-terminal (pty) or a TCP port of this machine (tcp), of which it prints the
+   device URL first, until the other side closes. Mode 0 answers each IN bytes with OUT bytes. Mode 1 answers each SHOW as an instrument
+   does: an acknowledgement, a MARK before a new object, and the CLICKS block of the exposure. */
 static uint8_t in[1 << 16], out[1 << 12], body[1 << 12];
 static int fd;
 static void all(const uint8_t *p, int64_t n) { while (n) { int64_t k = write(fd, p, n); if (k <= 0) exit(1); p += k; n -= k; } }
@@ -171,13 +172,21 @@ int main(int argc, char **v) {
     uint32_t session = strtoul(v[3], 0, 10), schema = strtoul(v[4], 0, 10), seq = 0;
     int64_t n_in = atol(v[5]), n_out = atol(v[6]), have = 0;
     make_tables();
-    if (v[1][0] == '/') {
-        struct termios t; fd = open(v[1], O_RDWR | O_NOCTTY); tcgetattr(fd, &t); cfmakeraw(&t); tcsetattr(fd, TCSANOW, &t);
+    if (strcmp(v[1], "pty") == 0) {
+        struct termios t;
+        fd = posix_openpt(O_RDWR | O_NOCTTY);
+        if (fd < 0 || grantpt(fd) || unlockpt(fd)) return 1;
+        int other = open(ptsname(fd), O_RDWR | O_NOCTTY); /* stays open: nothing hangs up before the host opens it */
+        if (other < 0 || tcgetattr(other, &t)) return 1;
+        cfmakeraw(&t); tcsetattr(other, TCSANOW, &t);
+        printf("serial:%s\n", ptsname(fd)); fflush(stdout);
     } else {
-        struct sockaddr_in a = {.sin_family = AF_INET, .sin_port = htons(atoi(v[1])), .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
-        int one = 1;
-        fd = socket(AF_INET, SOCK_STREAM, 0);
-        if (connect(fd, (void *)&a, sizeof a)) return 1;
+        struct sockaddr_in a = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+        socklen_t size = sizeof a;
+        int one = 1, server = socket(AF_INET, SOCK_STREAM, 0);
+        if (bind(server, (void *)&a, size) || listen(server, 1) || getsockname(server, (void *)&a, &size)) return 1;
+        printf("serial:socket://127.0.0.1:%d\n", ntohs(a.sin_port)); fflush(stdout);
+        if ((fd = accept(server, 0, 0)) < 0) return 1;
         setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &one, sizeof one);
     }
     memset(out, 1, sizeof out);

@@ -81,9 +81,9 @@ class Connection:
         self.session.poll(self.link.now_ns())
         return self.flush()
 
-    def chunks(self, timeout_s: float) -> list[Chunk]:
-        """Send what is due and return what has been read, waiting at most `timeout_s` for it."""
-        asked = self.send_due()
+    def chunks(self, timeout_s: float, *, asked: bool = False) -> list[Chunk]:
+        """Send what is due and return what has been read, waiting at most `timeout_s` for it; `asked`: an answer is due at once."""
+        asked |= self.send_due()
         began_ns = self.link.now_ns()
         chunks = self.reader.wait(timeout_s, eager=asked)
         if self.evidence is not None:

@@ -21,7 +21,7 @@ from pans.runtime.errors import LinkError
 from pans.runtime.link.base import descriptor_of
 from pans.runtime.link.connection import Arrived, Connection
 from pans.runtime.link.reader import count_delimiters
-from pans.runtime.record.format import TIMING_RUN_DTYPE, Kind
+from pans.runtime.record.format import Kind
 from pans.runtime.timing.evidence import INFERENCE, NS_PER_S
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn import settling as kernels
@@ -33,6 +33,7 @@ from pans.runtime.wire.messages import Opcode, decode_ack
 from pans.runtime.wire.schema import HEADER
 from pans.runtime.wire.session import STREAM_TYPES, Refusal
 
+from .lateness import Judged
 from .tally import NO_DECISIONS
 
 if TYPE_CHECKING:
@@ -70,8 +71,9 @@ class CompiledTurns:
         elif isinstance(core, Core) and core.guard is not None:
             exposures = ring.KEPT_BYTES // 2  # two bytes each
             self._stamps, self._bits = np.ones(exposures, np.uint16), np.ones(exposures, np.uint8)
-        self._judged = Judged(run)
+        self._judged = Judged(run.timing)
         self._error: LinkError | None = None  # met while something is left to take
+        self._asked = False  # what Python sent of a call is about to be answered
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
 
     @property
@@ -126,7 +128,7 @@ class CompiledTurns:
         run, self.none = self._run, steps.decisions(slice(0, 0))
         unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits)
         run.tally.warm_up(steps.walk.marks, steps.windows.n_windows, self.none)
-        self._judged.take(turn.blocks[:0], self.none)
+        self._judged.take(turn.blocks[:0], self.none, run.connection.known_clock())
         if isinstance(self.none, NumberedDecisions):
             assert not len(self.none.rows)  # compiles or loads what makes them
             if run.recorder is not None:
@@ -144,12 +146,12 @@ class CompiledTurns:
             try:
                 asked = connection.send_due()
                 self._lend(turn)
-                ended = turn.run(self._fd, self._limits(poll_s, eager=asked))
+                ended = self._sent(turn, turn.run(self._fd, self._limits(poll_s, eager=asked)))
             finally:
                 connection.reader.take_back()
             self._settle(turn, outputs)
             if turn.counts.notes or turn.counts.arrivals:
-                self._note_waits(turn)
+                self._note(turn)
             self._go_on(turn, ended, outputs, turn.run)
             if ended == ring.GONE:
                 self._ask_why(turn)
@@ -157,8 +159,10 @@ class CompiledTurns:
             chunks = self._gathered(poll_s)
             if chunks:
                 self._lend(turn)
-                ended = turn.feed(chunks)
+                ended = self._sent(turn, turn.feed(chunks))
                 self._settle(turn, outputs)
+                if not run.connection.link.virtual:
+                    self._note(turn)
                 self._go_on(turn, ended, outputs, turn.feed_on)
         connection.take_pongs()
         if self._error is not None:
@@ -166,6 +170,11 @@ class CompiledTurns:
         if not outputs:
             connection.raise_failure()
         return outputs
+
+    def last(self, poll_s: float) -> list[Arrived]:
+        """See Turns: what comes behind STOP is as urgent as before; no state is named any more."""
+        CompiledTurns.turn(self, poll_s)
+        return []
 
     # -- before a call -------------------------------------------------------------------------------------------------
 
@@ -202,7 +211,7 @@ class CompiledTurns:
         """Return what was read elsewhere; of parallel frames in virtual time many reads, where nobody acts on the first."""
         run = self._run
         connection, link = run.connection, run.connection.link
-        chunks = connection.chunks(poll_s)
+        chunks, self._asked = connection.chunks(poll_s, asked=self._asked), False
         gathers = isinstance(self._core, Core) and self._core.windows.parallel
         if not (link.virtual and gathers and chunks) or self._prompt:
             return chunks
@@ -215,13 +224,11 @@ class CompiledTurns:
             try:
                 if ended == ring.ODD:
                     self._take_odd(turn, outputs)
-                elif ended == ring.BROKEN:
-                    self._send_rest(turn)
             except LinkError as error:
                 self._error = self._error or error
             self._lend(turn)
             self._run.tell(outputs)  # before the rings are filled anew
-            ended = again()
+            ended = self._sent(turn, again())
             self._settle(turn, outputs)
 
     def _take_odd(self, turn: Turn, outputs: list[Output]) -> None:
@@ -239,10 +246,16 @@ class CompiledTurns:
             connection.sort(frame, arrival_ns, arrived)
         outputs += run.take(arrived)
 
-    def _send_rest(self, turn: Turn) -> None:
-        """Send what is left of a command that the kernel could not send whole."""
-        last, unsent = turn.shows[-1], turn.counts.unsent
-        self._run.connection.link.write(turn.bytes_of(last)[-unsent:])
+    def _sent(self, turn: Turn, ended: int) -> int:
+        """Send what is left of a command that the kernel could not send whole, all of it without a descriptor; return `ended`."""
+        if ended == ring.BROKEN:
+            last, unsent = turn.shows[-1], turn.counts.unsent
+            try:
+                self._run.connection.link.write(turn.bytes_of(last)[-unsent:])
+                last[ring.TIME], self._asked = self._run.now_ns(), True
+            except LinkError as error:
+                self._error = self._error or error
+        return ended
 
     def _ask_why(self, turn: Turn) -> None:
         """The descriptor says that the other end is gone: the link says it in its words."""
@@ -253,8 +266,8 @@ class CompiledTurns:
         except LinkError as error:
             self._error = self._error or error
 
-    def _note_waits(self, turn: Turn) -> None:
-        """Give what a call has waited for to the evidence of what makes work late, in the order of time."""
+    def _note(self, turn: Turn) -> None:
+        """Give what a call has waited for, and long decisions, to the evidence of what makes work late, in the order of time."""
         evidence = self._run.lateness.evidence
         spans: list[tuple[int, int, int]] = []
         blocks = turn.blocks
@@ -333,7 +346,7 @@ class CompiledTurns:
         events = self._watch(turn, decided)
         for event in events:
             run.journal.take(event)
-        runs, marked = self._judged.take(blocks, decided)
+        runs, marked = self._judged.take(blocks, decided, run.connection.known_clock())
         account_many(run, steps.walk.marks, runs, decided)
         for step, end_ns, uncertainty_ns, look in marked.tolist():
             arrival_ns, decoded_ns, decided_ns, recorded_ns, end_tick, stop = blocks[step, : ring.ROWS + 1].tolist()
@@ -356,32 +369,6 @@ class CompiledTurns:
             n = int(unpack_blocks(turn.kept, turn.messages, self._stamps, self._bits))
             return core.watch_blocks(self._stamps[:n], self._bits[:n], core.tracker.next_exposure - n, decided.rows)
         return [] if self._frames is None else self._frames.take(turn.kept, turn.messages)
-
-
-# -- decisions in rows ------------------------------------------------------------------------------------------------------
-
-
-class Judged:
-    """What the ledger says of the decisions of each call; all memory is allocated here, before arming."""
-
-    def __init__(self, run: LiveRun) -> None:
-        self._run = run
-        self._runs: Rows = np.full(ring.MANY, 0, TIMING_RUN_DTYPE)
-        self._marked: I64 = np.full((ring.MANY, kernels.N_MARKED), 0, np.int64)
-        self._sums: I64 = np.full(kernels.N_JUDGED, 0, np.int64)
-        self._histograms = tuple(histogram.numbers for histogram in run.timing.histograms)
-
-    def take(self, blocks: I64, decided: RowDecisions) -> tuple[Rows, I64]:
-        """Judge the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
-        timing, clock, sums = self._run.timing, self._run.connection.known_clock(), self._sums
-        sums[:] = 0
-        outputs = (self._histograms, sums, self._runs, self._marked)
-        n_runs, n_marked = kernels.judge_blocks(blocks, decided.first, *clock.numbers, timing.deadline_ns, *outputs)
-        if len(decided):
-            found = sums.tolist()
-            longest, blame = found[: kernels.UNCERTAINTY], found[kernels.BLAME :]
-            timing.went_on(len(decided), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
-        return self._runs[:n_runs], self._marked[:n_marked]
 
 
 def account_many(run: LiveRun, marks: MarkArrays, runs: Rows, decided: RowDecisions) -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pans.runtime.core.decision import Output, RowDecisions
     from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
+    from pans.runtime.link.connection import Arrived
     from pans.runtime.timing.ledger import TimingLedger
     from pans.runtime.turn import Turn
     from pans.runtime.wire.frame import Messages
@@ -149,8 +150,8 @@ class Turns(Protocol):
     `prepare` once a connection is there, `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it.
     `settled` is told after each call that brought messages. Where the turns go on in another thread (`goes_on`), core, session and
     driver are behind them; `halt` ends that, and all are where the turns have come. `lives`: whether they do. `leave_off` ends it from
-    any thread and returns the id of the next command, 0: the session knows it. `close` once, at the end. `none` are no decisions, of the
-    kind that `turn` gives.
+    any thread and returns the id of the next command, 0: the session knows it. `last` is a turn while the device stops, which none that
+    goes on follows; it returns what is left to Python. `close` once, at the end. `none` are no decisions, of the kind that `turn` gives.
     """
 
     settled: Callable[[Turn, Output], None] | None
@@ -170,6 +171,8 @@ class Turns(Protocol):
     def attach(self) -> None: ...
 
     def turn(self, poll_s: float) -> list[Output]: ...
+
+    def last(self, poll_s: float) -> list[Arrived]: ...
 
     def halt(self) -> None: ...
 

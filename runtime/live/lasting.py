@@ -21,6 +21,7 @@ from .compiled import CompiledTurns
 
 if TYPE_CHECKING:
     from pans.runtime.flow.core import FlowCore
+    from pans.runtime.link.connection import Arrived
 
     from .run import LiveRun
 
@@ -95,6 +96,10 @@ class LastingTurns(CompiledTurns):
             self._begin()
         return outputs
 
+    def last(self, poll_s: float) -> list[Arrived]:
+        """See Turns; beside a call that did not stop, Python takes what comes."""
+        return self._run.connection.pump(poll_s) if self.goes_on else super().last(poll_s)
+
     def halt(self) -> None:
         """See Turns; a call that does not stop is left behind."""
         call = self._call
@@ -159,7 +164,7 @@ class LastingTurns(CompiledTurns):
     def _settle_bank(self, turn: Turn, outputs: list[Output]) -> None:
         self._settle(turn, outputs)
         if turn.counts.notes or turn.counts.arrivals:
-            self._note_waits(turn)
+            self._note(turn)
         self._take_aside(turn, outputs)
 
     def _finish(self, ended: int, outputs: list[Output]) -> None:
@@ -168,6 +173,7 @@ class LastingTurns(CompiledTurns):
         assert turn is not None
         connection.reader.take_back()
         turn.show_rest()
+        self._sent(turn, ended)
         self._settle_bank(turn, outputs)
         if ended == ring.FULL:
             self.held_up += 1

@@ -7,14 +7,25 @@ counted by timing/ledger.py.
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
+
+from pans.runtime.core.decision import RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.link.base import Link
 from pans.runtime.link.connection import Connection
 from pans.runtime.record import AnyRecorder
+from pans.runtime.record.format import TIMING_RUN_DTYPE
 from pans.runtime.timing.attribution import Incidents, LateAttribution, LateWork, MissingAttribution
+from pans.runtime.timing.clock import ClockModel
 from pans.runtime.timing.evidence import DISK, INFERENCE, NS_PER_S, Evidence, Stamped, longest_pause_ns
+from pans.runtime.timing.ledger import TimingLedger
+from pans.runtime.turn import rings as ring
+from pans.runtime.turn import settling as kernels
 from pans.runtime.wire.messages import Status
 from pans.runtime.wire.tracker import Gap
+
+I64 = npt.NDArray[np.int64]
 
 POLL_S = 0.02
 LEAST_SLACK_NS = 500_000
@@ -98,3 +109,26 @@ class Lateness:
 
     def _wrote(self, begin_ns: int, end_ns: int) -> None:
         self.evidence.worked(DISK, begin_ns, end_ns)
+
+
+class Judged:
+    """What the ledger says of the decisions of each call; all memory is allocated here, before arming."""
+
+    def __init__(self, timing: TimingLedger) -> None:
+        self._timing = timing
+        self._runs: npt.NDArray[np.void] = np.full(ring.MANY, 0, TIMING_RUN_DTYPE)
+        self._marked: I64 = np.full((ring.MANY, kernels.N_MARKED), 0, np.int64)
+        self._sums: I64 = np.full(kernels.N_JUDGED, 0, np.int64)
+        self._histograms = tuple(histogram.numbers for histogram in timing.histograms)
+
+    def take(self, blocks: I64, decided: RowDecisions, clock: ClockModel) -> tuple[npt.NDArray[np.void], I64]:
+        """Judge the decisions of `blocks` (rings.py's steps); return their times, TIMING_RUN_DTYPE (n,), and what stands out."""
+        timing, sums = self._timing, self._sums
+        sums[:] = 0
+        outputs = (self._histograms, sums, self._runs, self._marked)
+        n_runs, n_marked = kernels.judge_blocks(blocks, decided.first, *clock.numbers, timing.deadline_ns, *outputs)
+        if len(decided):
+            found = sums.tolist()
+            longest, blame = found[: kernels.UNCERTAINTY], found[kernels.BLAME :]
+            timing.went_on(len(decided), longest, found[kernels.UNCERTAINTY], found[kernels.LATE], blame)
+        return self._runs[:n_runs], self._marked[:n_marked]

@@ -28,7 +28,7 @@ from pans.runtime.errors import DeviceError, LinkError, RecordingError, UsageErr
 from pans.runtime.instrument.channel_health import DarkMonitor
 from pans.runtime.instrument.click_law import click_law, click_probability
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.link.base import Link, link_facts
+from pans.runtime.link.base import Link, descriptor_of, link_facts
 from pans.runtime.link.connection import Connection, check_device
 from pans.runtime.link.scene_fit import check_scene
 from pans.runtime.record import AnyRecorder
@@ -45,6 +45,8 @@ from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 
 NS_PER_S = 1_000_000_000
+VIRTUAL = "virtual time: what was read at once is taken at once"
+NO_DESCRIPTOR = "Python reads the link, which has no descriptor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +157,9 @@ def _light_on(
 
 
 def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> Turns:
-    """Return the compiled turns of `core`; with `prompt` a watcher acts."""
-    lasts = not run.connection.link.virtual and not prompt
+    """Return the compiled turns of `core`; with `prompt` a watcher acts. A call that goes on reads a descriptor itself."""
+    link = run.connection.link
+    lasts = not link.virtual and not prompt and descriptor_of(link) is not None
     if isinstance(core, Core):
         core.leave_steps()
         return LastingTurns(run, core) if lasts else CompiledTurns(run, core, prompt=prompt)
@@ -177,7 +180,9 @@ def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoi
         why = "pulses that decisions ask for leave sooner from it"  # docs/measurements/flow.md has both
     if why:
         return TurnChoice(PYTHON, why)
-    return TurnChoice(COMPILED, "virtual time: what was read at once is taken at once" if link.virtual else "")
+    if link.virtual:
+        return TurnChoice(COMPILED, VIRTUAL)
+    return TurnChoice(COMPILED, "" if descriptor_of(link) is not None else NO_DESCRIPTOR)
 
 
 def open_session(

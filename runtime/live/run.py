@@ -151,13 +151,13 @@ class LiveRun(Reconciled):
 
     def stop(self) -> None:
         """Tell the device to go dark. One that does not answer any more does so by itself when its lease runs out."""
-        session = self.connection.session
+        session, self._watch = self.connection.session, None
         give_up_ns = self.now_ns() + (0 if self.link_lost else STOP_GIVE_UP_NS)
         try:
             session.submit(Opcode.STOP)
             self.stops = True
             while self.now_ns() < give_up_ns and not (session.settled and self._is_dark()):
-                self.take(self.connection.pump(POLL_S))
+                self.take(self.connection.pump(POLL_S) if self.compiled is None else self.compiled.last(POLL_S))
         except LinkError as error:
             self.lose_link(error)
         except KeyboardInterrupt:  # a second Ctrl-C: STOP is sent, and the lease does the rest

@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from pans.runtime.core.still import Core
-from pans.runtime.link.base import Link, descriptor_of
+from pans.runtime.link.base import Link
 
 from .system import offered
 
@@ -27,8 +27,6 @@ def excluded(core: Any, link: Link, *, drives: bool) -> str:
         return missing
     if isinstance(core, Core) and not core.decides_compiled:
         return "the back end is no table and no automaton: it decides in Python"
-    if descriptor_of(link) is None:
-        return "the link has no descriptor that compiled code could read"
     before_ns, there_ns = time.perf_counter_ns(), link.now_ns()
     return "" if before_ns <= there_ns <= time.perf_counter_ns() else "the link stamps with a clock of its own"
 

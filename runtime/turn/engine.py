@@ -148,12 +148,10 @@ class Turn:
         self.reported, self.state = reported, state
         self._row = len(self._walk.rows) // banks * bank
         self._n_rows = int(state[core_kernels.N_ROWS]) - self._row
-        counts = reported[ring.ERRNO :].tolist()
-        first = [0] * len(counts)
+        self.first, self.counts = _NOTHING, Counts(*reported[ring.ERRNO :].tolist())
         if bank:
-            first[_FIRST:] = [len(part) // banks * bank for part in self._parts]
-        self.first = Counts(*first)
-        self.counts = Counts(*[count - begin for count, begin in zip(counts, first)])
+            self.first = Counts(*[0] * _FIRST, *[len(part) // banks * bank for part in self._parts])
+            self.counts = Counts(*[count - begin for count, begin in zip(self.counts, self.first)])
 
     # -- a call that goes on -------------------------------------------------------------------------------------------
 

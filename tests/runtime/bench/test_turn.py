@@ -8,6 +8,7 @@ import pytest
 
 from pans.runtime.bench import turn as bench
 from pans.runtime.bench.flow_turn import flow_row
+from pans.runtime.bench.link import link_rows
 from pans.runtime.bench.rows import BenchOptions
 from pans.runtime.bench.turn_c import DEVICE, built
 from pans.runtime.bench.walks import made_automaton
@@ -24,7 +25,7 @@ def test_what_is_timed_decides_as_the_plain_core_and_as_the_loop_in_c(tmp_path: 
         assert "c" in row or row["c_changed_percent"] == 0.0, row["name"]
 
 
-@pytest.mark.parametrize("kind", ["pty", "TCP"])
+@pytest.mark.parametrize("kind", ["pty", "TCP", "pyusb"])
 def test_round_trips_are_decided_as_by_the_plain_core(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -33,7 +34,7 @@ def test_round_trips_are_decided_as_by_the_plain_core(
         pytest.skip(device)
     monkeypatch.setattr(bench, "ROUNDS", 1)
     plan, decider = bench._walk_plan(made_automaton())
-    row = bench._trip_row(kind, plan, decider, device, 300)
+    row = bench._trip_row(bench._Trips(kind, plan, decider, device, 300))
     assert (row["changed_percent"], row["command_bytes"]) == (0.0, 38)
     assert row["calls"] >= 270
 
@@ -43,3 +44,11 @@ def test_the_flow_that_is_timed_is_decided_as_by_the_plain_core() -> None:
     row = flow_row(shipped, True)
     assert row["changed_percent"] == 0.0
     assert row["decisions"] == 100  # one every 500 of 400 blocks' frames
+
+
+def test_round_trips_of_a_live_run_over_pyusb() -> None:
+    rows = {row["name"]: row for row in link_rows(["usb"], samples=100)}
+    for turn in ("", ", compiled"):
+        came, decided = (rows[f"usb: command to {what}{turn}"] for what in ("click block", "decision"))
+        assert 0 < came["p50_us"] < decided["p50_us"]
+        assert (came["samples"], came["other_end"]) == (100, decided["other_end"])

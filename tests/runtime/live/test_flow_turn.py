@@ -80,18 +80,22 @@ def test_both_turns_leave_the_same(
     assert told[0] == told[1]
 
 
-def test_a_run_through_a_descriptor(flow_folder: Path) -> None:
-    """At real pace, in a thread of its own; pulses leave behind the record of their decisions, and a replay decides the same."""
+@pytest.mark.parametrize("usb", [False, True])
+def test_a_run_at_real_pace(flow_folder: Path, usb: bool) -> None:
+    """In a thread of its own, or of what Python reads from pyusb; pulses leave behind the record of their decisions, and a replay decides
+    the same.
+    """
     url = f"sim:flow-snspd?scene={flow_folder / 'cells.toml'}&seed=3"
     device, clock = build_instrument(parse_sim_url(url), time.perf_counter_ns())
     port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     thread.start()
     settings = replace(SETTINGS, gate_delay_us=400_000.0)  # a busy machine makes it
-    result, figures, recording, bundle = run(flow_folder, settings, open_link(port.url), "compiled", 0.3, port.url)
+    url = f"simusb:{port.url.removeprefix('serial:')}" if usb else port.url
+    result, figures, recording, bundle = run(flow_folder, settings, open_link(url), "compiled", 0.3, url)
     stopped.set()
     thread.join(10)
-    assert (result.ended, result.turn.words()) == ("completed", "compiled")
+    assert (result.ended, result.turn.taken) == ("completed", "compiled")
     gates = figures["gates"]
     assert gates["asked"] == gates["done"] + gates["refused"] + gates["expired"]
     assert gates["done"] > 0

@@ -95,12 +95,15 @@ def recorded(setup: Any, link: Any, path: Path, turn: str, observers: Any = NO_O
 
 
 @pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
-@pytest.mark.parametrize("listen", ["tcp:127.0.0.1:0", "pty"])
-def test_a_run_through_a_descriptor(mode: str, listen: str, tmp_path: Path) -> None:
-    setup = Served(mode, listen)
+@pytest.mark.parametrize("listen", ["tcp:127.0.0.1:0", "pty", "usb"])
+def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
+    """Through a descriptor, and through pyusb, whose bytes Python reads and sends."""
+    setup = Served(mode, "tcp:127.0.0.1:0" if listen == "usb" else listen)
+    if listen == "usb":
+        setup.url = f"simusb:{setup.url.removeprefix('serial:')}"
     result, recording = recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
     setup.close()
-    assert (result.ended, result.turn.words()) == ("completed", "compiled")
+    assert (result.ended, result.turn.taken, bool(result.turn.why)) == ("completed", "compiled", listen == "usb")
     assert result.tally.decisions == OBJECTS * setup.plan.shots_per_cycle * setup.plan.cycles_per_object
     assert not result.contradictions  # every frame is an answer or was taken
     again = replay(recording, setup.bundle)
@@ -301,7 +304,8 @@ def test_which_turn_is_taken_and_why() -> None:
     with pytest.raises(UsageError, match="--turn compiled: in virtual time"):
         choose_turn("compiled", core, link, drives=True)
     plain = SimpleNamespace(virtual=False, now_ns=time.perf_counter_ns)
-    assert "no descriptor" in choose_turn("auto", core, plain, drives=True).why  # type: ignore[arg-type]
+    read = choose_turn("auto", core, plain, drives=True)  # type: ignore[arg-type]
+    assert read.words() == "compiled: Python reads the link, which has no descriptor"
     other = SimpleNamespace(virtual=False, fileno=lambda: 0, now_ns=lambda: 7)
     assert "clock of its own" in choose_turn("auto", core, other, drives=True).why  # type: ignore[arg-type]
 
