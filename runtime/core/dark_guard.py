@@ -51,7 +51,7 @@ class DarkGuard:
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"--on-dark {policy!r}, allowed: {', '.join(POLICIES)}")
-        self._parallel = plan.mode == "parallel"
+        self._parallel, self._at_once = plan.mode == "parallel", plan.channels_at_once
         self._adapter: Adapter | None = None
         if policy in ("tables", "mask"):
             if bundle is None:
@@ -95,7 +95,7 @@ class DarkGuard:
         With one detector that afterpulses, exposures close behind a click are left out: an afterpulse is no dark count.
         """
         if self.lit is not None:
-            words = block.words if isinstance(block, FrameBlock) else _clicked(block).reshape(-1, 1)
+            words = block.words if isinstance(block, FrameBlock) else self._words(block)
             self.lit.take_exposures(words)
             self.look_for_dead()
         return self.take_rest(block)
@@ -110,10 +110,11 @@ class DarkGuard:
 
         What it says holds from this decision on; `news` has the findings.
         """
-        if not self._parallel:
+        if not self._parallel and self._at_once == 1:
             self.take_clicks(int(counts.sum()), number)
         elif self.lit is not None:
-            self.lit.take_object(counts, -1 if number == NO_OBJECT else number)
+            of_channels = counts if self._parallel else counts.reshape(-1, self._at_once).sum(axis=0)
+            self.lit.take_object(of_channels, -1 if number == NO_OBJECT else number)
             self.look_for_dead()
 
     def take_clicks(self, clicks: int, number: int) -> None:
@@ -136,12 +137,13 @@ class DarkGuard:
         found = [one for channel in self.lit.returned() for one in self.health.note_returned(channel)]
         dead = self.lit.look()
         if len(dead) > 1 and len(dead) == self.lit.n_channels:
-            words = _silence_words("no channel", self._parallel, dead[0])
+            words = _silence_words("no channel", True, dead[0])
             found += self.health.note_dead(tuple(range(len(dead))), words)
         else:
             for one in dead:
-                who = f"channel {one.channel} never" if self._parallel else "the detector never"
-                found += self.health.note_dead((one.channel,), _silence_words(who, self._parallel, one))
+                several = self.lit.n_channels > 1
+                who = f"channel {one.channel} never" if several else "the detector never"
+                found += self.health.note_dead((one.channel,), _silence_words(who, several, one))
         self._news += self._keep(found)
 
     def _take_dark(self, block: ClickBlock | FrameBlock) -> list[Finding]:
@@ -150,9 +152,10 @@ class DarkGuard:
                 return []
             slots = (block.exposure_index + np.arange(len(block.words))) % len(self._dark_slot)
             return self.take_dark_words(np.ascontiguousarray(block.words[self._dark_slot[slots]]))
-        bits, dark = _clicked(block), np.asarray(block.patterns) == DARK_PATTERN
+        words, dark = self._words(block), np.asarray(block.patterns) == DARK_PATTERN
         if not self._afterpulses:
-            return self.take_dark_words(bits[dark].reshape(-1, 1))
+            return self.take_dark_words(words[dark])
+        bits = words[:, 0]
         if block.exposure_index != self._next:
             self._silent_before = 0
         places = np.arange(len(bits) + 1)
@@ -161,7 +164,12 @@ class DarkGuard:
         )
         silent = places - 1 - last  # exposures without a click before each one, and before the next block
         self._next, self._silent_before = block.exposure_index + len(bits), int(silent[-1])
-        return self.take_dark_words(bits[dark & (silent[:-1] >= self._afterpulses)].reshape(-1, 1))
+        return self.take_dark_words(words[dark & (silent[:-1] >= self._afterpulses)])
+
+    def _words(self, block: ClickBlock) -> NDArray[np.uint8]:
+        """Which channels clicked in each exposure, uint8 (n, 1), bit c is channel c; of photon numbers all above 0 are a click."""
+        bits = np.asarray(block.bits)
+        return (bits if block.largest == 1 or self._at_once > 1 else (bits != 0).astype(np.uint8)).reshape(-1, 1)
 
     def take_dark_words(self, words: NDArray[np.uint8]) -> list[Finding]:
         """Take dark exposures, words uint8 (n, bytes), in the order of time; return the findings."""
@@ -283,7 +291,7 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     if not header:
         return None
     expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
-    channels = plan.n_patterns if plan.mode == "parallel" else 1
+    channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
     for rates in (expected, low, high):
         if rates.shape != (channels,) or not ((rates >= 0) & (rates <= 1)).all():
             raise ValueError(f"dark rates of shape {rates.shape}, allowed: {channels} of 0 to 1")
@@ -300,12 +308,6 @@ def _exposures_left_out(said: Any) -> int:
     if not isinstance(said, int) or not 0 <= said < 1 << 31:
         raise ValueError(f"afterpulses {said!r}, allowed: true, false or a number of exposures")
     return int(said)
-
-
-def _clicked(block: ClickBlock) -> NDArray[np.uint8]:
-    """Which exposures clicked, uint8 (n,) of 0 or 1; of photon numbers all above 0 have."""
-    bits = np.asarray(block.bits)
-    return bits if block.largest == 1 else (bits != 0).astype(np.uint8)
 
 
 def _silence_words(who: str, has_others: bool, silence: Silence) -> str:

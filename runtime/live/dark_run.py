@@ -85,7 +85,7 @@ class DarkRun:
             raise UsageError(
                 f"--on-dark {self.policy}: the plan has no dark slots", remedy="use --dark-slots 1 or more"
             )
-        channels = plan.n_patterns if plan.mode == "parallel" else 1
+        channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
         if self.calibration is None:
             rate = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
             expected = low = high = np.full(channels, rate)
@@ -96,11 +96,6 @@ class DarkRun:
             expected = np.where(
                 few, np.clip(said, low, high), expected
             )  # hardly measured: the profile's, as far as possible
-        if plan.channels_at_once > 1:  # any of them clicks: 1 - (1 - rate)**n, for tiny rates too
-            with np.errstate(divide="ignore"):  # a rate of 1
-                expected, low, high = (
-                    -np.expm1(plan.channels_at_once * np.log1p(-rate)) for rate in (expected, low, high)
-                )
         per_hour = (plan.dark_slots_per_cycle or plan.slots_per_cycle) * 3.6e9 / plan.cycle_us
         self._header = {
             "policy": self.policy,

@@ -11,6 +11,7 @@ its lease runs out.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -241,7 +242,9 @@ def _result(run: LiveRun, profile: Profile) -> RunResult:
     device = facts | link_facts(run.connection.link)
     # a simulator behind an ordinary port says so itself
     device["simulated"] = bool(device["simulated"] or facts.get("simulated"))
-    dark = DarkMonitor(float(click_probability(click_law(profile, run.plan.exposure_us), 0.0)))
+    one = float(click_probability(click_law(profile, run.plan.exposure_us), 0.0))
+    # an exposure counts when any of several detectors clicks in it; log1p and expm1 hold for tiny rates too
+    dark = DarkMonitor(one if one == 1.0 else -math.expm1(run.plan.channels_at_once * math.log1p(-one)))
     tallies, stream = run.core.tallies, run.core.tracker.counters
     found = dark.report(int(tallies[DARK_EXPOSURES]), int(tallies[DARK_CLICKS]))
     guard: DarkGuard | None = getattr(run.core, "guard", None)
