@@ -173,6 +173,8 @@ class CompiledTurns:
 
     def last(self, poll_s: float) -> list[Arrived]:
         """See Turns: what comes behind STOP is as urgent as before; no state is named any more."""
+        if self._attached is not self._run.connection:  # a new one, broken off before it was armed
+            return self._run.connection.pump(poll_s)
         CompiledTurns.turn(self, poll_s)
         return []
 

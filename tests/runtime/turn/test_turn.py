@@ -42,6 +42,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
 from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live.compiled import CompiledTurns
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS, choose_turn
 from pans.runtime.record import Recorder, read_recording, replay
@@ -291,6 +292,17 @@ def test_a_command_that_cannot_be_sent_whole_is_left_to_the_caller() -> None:
         command = decode_command(frame.payload)
         assert (frame.session, command.command_id, command.opcode) == (SESSION, 5, Opcode.SHOW)
         assert unpack_show(command.body)[:2] == (int(setup.plan.slot_pattern[0] == DARK_PATTERN), 0)
+
+
+def test_a_connection_that_was_never_armed_is_stopped_by_python() -> None:
+    """A run that is ended while it reconnects: the turns still hold the link before, whose descriptor may be another file's by now."""
+    asked: list[float] = []
+    connection = SimpleNamespace(pump=lambda poll_s: asked.append(poll_s) or [], known_clock=lambda: None)
+    run = SimpleNamespace(connection=connection, timing=SimpleNamespace(histograms=()))
+    core = SimpleNamespace(guard=None)
+    turns = CompiledTurns(run, core, prompt=False)  # type: ignore[arg-type]
+    assert turns.last(0.5) == []
+    assert asked == [0.5]
 
 
 def test_which_turn_is_taken_and_why() -> None:
