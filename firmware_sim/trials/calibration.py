@@ -29,7 +29,9 @@ from pans.runtime.core.calibration import (
     counts_of,
     design_run,
     profile_level,
+    shown_in_slots,
 )
+from pans.runtime.core.plan import Plan
 from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability
 from pans.runtime.instrument.estimate import CountModel, Counts, Interval, fit_light
 from pans.runtime.instrument.profile import Profile, load_profile
@@ -86,12 +88,10 @@ def simulate(truth: Profile, design: Design, seed: int, light: NDArray[np.float6
     plan, core = design.plan, CalibrationCore(design.plan, design.n_cycles)
     model = detector_model(truth, plan.exposure_us)
     light = design.drives * profile_level(truth, plan.exposure_us) if light is None else light
-    light = np.append(light, 0.0)
-    probability = first_click_probability(model, light)
-    lit_and_dark = np.stack([probability[:-1], np.full(len(light) - 1, probability[-1])])
-    rows = lit_and_dark if core.parallel else probability[:, None]
-    dark_row = 1 if core.parallel else plan.n_patterns
-    row_of_slot = np.where(plan.slot_pattern == DARK_PATTERN, dark_row, plan.slot_pattern).astype(np.int64)
+    light = light.reshape(-1, core.channels)  # what is shown together; in parallel mode all
+    light = np.concatenate([light, np.zeros((1, core.channels))])
+    rows, shown = first_click_probability(model, light), shown_in_slots(plan)
+    row_of_slot = np.where(plan.slot_pattern == DARK_PATTERN, len(rows) - 1, 0 if core.parallel else shown)
     previous, carriers = np.zeros(core.channels, np.uint8), np.zeros(core.channels)
     total = design.n_cycles * plan.slots_per_cycle
     for first in range(0, total, BLOCK):
@@ -101,15 +101,15 @@ def simulate(truth: Profile, design: Design, seed: int, light: NDArray[np.float6
             remembered_words(model, rows, row_of_slot[slots], seed, first, carriers, words)
         else:
             sample_words(model, rows, row_of_slot[slots], seed, first, previous, words)
-        core.take_block(_block(core, first, plan.slot_pattern[slots], words))
+        core.take_block(_block(core, plan, first, shown[slots].astype(np.uint16), words))
     return core
 
 
 def _block(
-    core: CalibrationCore, first: int, patterns: NDArray[np.uint16], words: NDArray[np.uint8]
+    core: CalibrationCore, plan: Plan, first: int, patterns: NDArray[np.uint16], words: NDArray[np.uint8]
 ) -> ClickBlock | FrameBlock:
     head = (0, 0, 0, first, 1, NO_OBJECT)
-    return FrameBlock(*head, words) if core.parallel else ClickBlock(*head, patterns, words[:, 0])
+    return FrameBlock(*head, words) if core.parallel else ClickBlock(*head, patterns, words[:, 0], plan.largest)
 
 
 def few_clicks(mean_clicks: float, seed: int) -> Outcome:
@@ -126,6 +126,7 @@ def few_clicks(mean_clicks: float, seed: int) -> Outcome:
 CASES: dict[str, Callable[[int], Outcome]] = {
     "oled-qcmos, 10 s": lambda seed: calibrate_one(load_profile("oled-qcmos"), 9.0, seed),
     "dmd-spad, 2 s": lambda seed: calibrate_one(load_profile("dmd-spad"), 2.0, seed),
+    "dmd-four-snspd, 1 s": lambda seed: calibrate_one(load_profile("dmd-four-snspd"), 1.0, seed),
     "wdm-snspd, 0.2 s": lambda seed: calibrate_one(load_profile("wdm-snspd"), 0.2, seed),
     "100 clicks": lambda seed: few_clicks(100.0, seed),
     "20 clicks": lambda seed: few_clicks(20.0, seed),

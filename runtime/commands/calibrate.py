@@ -29,6 +29,7 @@ from .run import profile_of
 from .run_files import files_of_url
 
 FIRST_STAGE_SHARE = 0.1
+CHANNELS_SHOWN = 8  # one line each; the file has all
 PEAK_OFF = 0.2  # of the profile's brightness: beyond it the answer says so
 OF_REGISTRATION = {"target": None, "page": None, "precision_px": 0.05, "precision_deg": 0.1}  # and their defaults
 
@@ -120,7 +121,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     if doubts:
         return EXIT_TIMING
     off = abs(values["efficiency"]["relative_to_profile"] - 1.0) > PEAK_OFF
-    return EXIT_ALERT if off else EXIT_FINE
+    return EXIT_ALERT if off or values["silent_channels"] else EXIT_FINE
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -223,10 +224,20 @@ def _words(path: Path, values: dict[str, Any]) -> str:
         f"  dark            {dark:.3g} per exposure, 95 % {dark_ci[0]:.3g} to {dark_ci[1]:.3g}",
         f"  non-uniformity  {spread['relative']:.2%} ({found}, p = {spread['p_value']:.2g})",
     ]
+    if 1 < len(values["channels"]) <= CHANNELS_SHOWN:
+        lines += [_of_channel(number, row) for number, row in enumerate(values["channels"])]
+    if values["silent_channels"]:
+        lines.append(f"  SILENT          no click in light: channel {', '.join(map(str, values['silent_channels']))}")
     if doubts := values.get("contradictions"):
         kinds = ", ".join(f"{what} {count}" for what, count in sorted(doubts.items()))
         lines.append(f"  FAULT           {sum(doubts.values())} messages contradict the evidence: {kinds}")
     return "\n".join(lines)
+
+
+def _of_channel(number: int, row: dict[str, Any]) -> str:
+    level = row["level_relative"]
+    said = "light unknown" if level is None else f"{level:.3f} of the photon level"
+    return f"  channel {number:<7} {said}, dark {row['dark_per_exposure']:.3g} per exposure"
 
 
 CALIBRATE = Command(

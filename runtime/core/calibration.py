@@ -3,7 +3,10 @@
 Owns the design (exposure, lit pixels, plan), the sums, and the choice of what is reported and when patterns are taken to differ; the
 session is live/loop.py's, the estimate instrument/estimate.py's, the file instrument/calibration.py's. Two stages: a
 short ladder of drives from far too dim to far too bright, then drives around 1.6 expected photoelectrons, where clicks tell
-most of the level per exposure (the information `n lambda^2 / (exp(lambda) - 1)` is greatest at 1.59)."""
+most of the level per exposure (the information `n lambda^2 / (exp(lambda) - 1)` is greatest at 1.59).
+
+Detectors that are read at once are measured by an automaton whose states come in a fixed order, with or without clicks: each state
+shows a pattern to every detector."""
 
 from __future__ import annotations
 
@@ -15,11 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
 from pans.runtime.instrument.click_law import click_law
+from pans.runtime.instrument.count_law import cannot_read_at_once
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import jeffreys_interval
@@ -27,7 +32,7 @@ from pans.runtime.wire.messages import DARK_PATTERN, ClickBlock, FrameBlock
 
 from .decision import Output
 from .follower import Follower
-from .plan import Plan, build_plan
+from .plan import ADAPTIVE_PATTERN, Plan, build_plan
 from .window import DARK_CLICKS, DARK_EXPOSURES, N_TALLIES, WRONG_PATTERNS
 
 F64 = NDArray[np.float64]
@@ -38,13 +43,17 @@ SEQUENTIAL_PATTERNS = 60
 PARALLEL_FRAMES = 900
 DARK_SHARE = 0.1
 LEAST_SEQUENTIAL_US, LEAST_PARALLEL_US = 40.0, 50.0  # shorter exposures would only load the link
+SILENT = 20.0  # clicks; that none of so many comes has the chance 2e-9
 PATTERNS_DIFFER = 0.01  # p-value of the test that they do not, below which the level's interval holds their spread
 _SIDES = (32, 64, 128, 256, 512)
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """Patterns as a bundle that the ordinary session uploads, the plan, and the drive of each pattern (levels, summed over pixels)."""
+    """Patterns as a bundle that the ordinary session uploads, the plan, and the drive of each pattern (levels, summed over pixels).
+
+    Of detectors that are read at once, pattern k is shown to detector k modulo their number.
+    """
 
     bundle: Bundle
     plan: Plan
@@ -68,22 +77,46 @@ def profile_level(profile: Profile, exposure_us: float) -> float:
     return profile.projector.peak_photoelectrons_hz * exposure_us * 1e-6 / (profile.projector.levels - 1)
 
 
+def detectors_at_once(profile: Profile) -> int:
+    """Return how many detectors of a sequential profile a calibration reads at once: all, or one where that cannot be done.
+
+    It takes detectors that click independently, and a device that follows automata.
+    """
+    channels = profile.detector.channels
+    states = _states_of(channels)
+    held = min(profile.projector.automaton_states // states, profile.projector.pattern_memory // (states * channels))
+    return 1 if channels == 1 or cannot_read_at_once(profile, channels) or not held else channels
+
+
+def _states_of(channels: int) -> int:
+    return SEQUENTIAL_PATTERNS // channels
+
+
 def design_run(profile: Profile, targets: Sequence[float], level: float, seconds: float, seed: int) -> Design:
     """Lay out patterns whose expected photoelectrons are `targets` in turn if one level of one pixel gives `level`.
 
-    PlanError when even one pixel at the lowest level is far too bright. `seed` chooses the lit pixels.
+    Every detector that is read at once is shown all of them. PlanError when even one pixel at the lowest level is far too
+    bright. `seed` chooses the lit pixels.
     """
-    parallel = profile.mode == "parallel"
-    n = profile.detector.channels if parallel else min(SEQUENTIAL_PATTERNS, profile.projector.pattern_memory)
-    levels = _random_patterns(profile, np.resize(np.asarray(targets), n) / level, np.random.default_rng(seed))
+    channels = 1
+    if profile.mode == "parallel":
+        n = profile.detector.channels
+    else:
+        channels = detectors_at_once(profile)
+        n = min(_states_of(channels), profile.projector.pattern_memory)
+    drives = np.repeat(np.resize(np.asarray(targets), n) / level, channels)
+    levels = _random_patterns(profile, drives, np.random.default_rng(seed))
     side = round(levels.shape[1] ** 0.5)
-    return design_of(profile, levels, (side, side), seconds)
+    return design_of(profile, levels, (side, side), seconds, channels)
 
 
-def design_of(profile: Profile, levels: NDArray[np.uint16], shape: tuple[int, int], seconds: float) -> Design:
+def design_of(
+    profile: Profile, levels: NDArray[np.uint16], shape: tuple[int, int], seconds: float, channels: int = 1
+) -> Design:
     """Lay out the patterns `levels` (n, pixels) of `shape` (rows, columns), dark slots between them, for `seconds` of instrument time.
 
-    PlanError when the profile cannot show them.
+    With `channels` above 1 so many detectors are read at once, of that many patterns in turn. PlanError when the profile cannot
+    show them.
     """
     exposure_us = calibration_exposure_us(profile)
     n = len(levels)
@@ -91,14 +124,24 @@ def design_of(profile: Profile, levels: NDArray[np.uint16], shape: tuple[int, in
         name="calibration", task="calibration", classes=("light",), encoder="active", image_shape=shape,
         levels=profile.projector.levels, pattern_levels=levels, photons_per_level=profile_level(profile, exposure_us),
         head_onnx=None, table=None, golden_means=np.zeros((0, n), np.float32), golden_scores=np.zeros((0, 1), np.float32),
-        provenance={},
+        provenance={}, automaton=None if channels == 1 else _one_after_another(n // channels, channels),
     )  # fmt: skip
     plan = _plan(profile, bundle, n, exposure_us)
     n_cycles = max(1, int(seconds * 1e6 / plan.cycle_us))
     return Design(bundle, plan, levels.sum(axis=1).astype(np.float64), n_cycles)
 
 
+def _one_after_another(n: int, channels: int) -> Automaton:
+    """An automaton of `n` states in a fixed order, with or without clicks: fully lit, each with patterns of its own."""
+    following = np.repeat(np.arange(1, n + 1, dtype=np.uint32)[:, None], 1 << channels, axis=1)
+    shown, lit = np.arange(n, dtype=np.uint16) * np.uint16(channels), np.ones(n, np.uint16)
+    return Automaton(shown, lit, 1, following, np.full((n + 1, 2), 0.5, np.float32))
+
+
 def _plan(profile: Profile, bundle: Bundle, n: int, exposure_us: float) -> Plan:
+    if bundle.automaton is not None:
+        dark = max(1, round(DARK_SHARE * bundle.automaton.n_slots))
+        return build_plan(profile, bundle, dark_slots_per_cycle=dark, drive="device")
     if profile.mode == "parallel":
         dark = max(1, round(DARK_SHARE * PARALLEL_FRAMES))
         return build_plan(profile, bundle, shots_per_object=PARALLEL_FRAMES, dark_slots_per_cycle=dark)
@@ -130,17 +173,23 @@ def _random_patterns(profile: Profile, drives: F64, rng: np.random.Generator) ->
     return levels
 
 
+def shown_in_slots(plan: Plan) -> I64:
+    """Return what each slot of a cycle shows, int64: the number of its pattern, or of the state an automaton is in, or DARK_PATTERN."""
+    adaptive = plan.slot_pattern == ADAPTIVE_PATTERN
+    return np.where(adaptive, adaptive.cumsum() - 1, plan.slot_pattern.astype(np.int64))
+
+
 class CalibrationCore(Follower):
     """Adds up clicks by channel, pattern and whether the exposure before clicked; decides nothing."""
 
     def __init__(self, plan: Plan, n_cycles: int) -> None:
         super().__init__(plan, n_cycles)
-        self.parallel = plan.mode == "parallel"
-        self.channels = plan.n_patterns if self.parallel else 1
+        self.parallel, self.channels = plan.mode == "parallel", plan.n_channels
+        n_shown = plan.n_patterns // self.channels  # patterns, or states with one for each detector
         self.tallies: I64 = np.zeros(N_TALLIES, np.int64)
         # channel, pattern (the last is dark; in parallel mode 0 is lit), was there a click before, exposures and clicks
-        self.sums: I64 = np.zeros((self.channels, (1 if self.parallel else plan.n_patterns) + 1, 2, 2), np.int64)
-        self._slot_pattern = plan.slot_pattern
+        self.sums: I64 = np.zeros((self.channels, n_shown + 1, 2, 2), np.int64)
+        self._slot_pattern = shown_in_slots(plan)
         self._before: NDArray[np.uint8] | None = None  # clicks of the exposure before, (channels,), where it is known
         self._next = 0
 
@@ -154,7 +203,7 @@ class CalibrationCore(Follower):
     def _fits(self, block: ClickBlock | FrameBlock) -> bool:
         if isinstance(block, FrameBlock):
             return self.parallel and 8 * block.words.shape[1] >= self.channels
-        return not self.parallel
+        return not self.parallel and block.largest == self._plan.largest
 
     def _take(self, block: ClickBlock | FrameBlock, n_exposures: int, end_tick: int) -> Output:
         self.take_block(block)
@@ -169,7 +218,8 @@ class CalibrationCore(Follower):
             bits = np.unpackbits(block.words, axis=1, bitorder="little", count=self.channels)
             right = np.ones(n_exposures, np.bool_)
         else:
-            bits, right = np.asarray(block.bits)[:, None], np.asarray(block.patterns) == planned
+            bits = np.asarray(block.bits)[:, None] >> np.arange(self.channels, dtype=np.uint8) & np.uint8(1)
+            right = np.asarray(block.patterns) == planned
         known = right.copy()
         known[0] &= self._before is not None
         first = np.zeros((1, self.channels), np.uint8) if self._before is None else self._before[None, :]
@@ -212,9 +262,8 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
             for neighbour in (channel - 1, channel + 1):
                 if 0 <= neighbour < core.channels:
                     across += np.log1p(-detector.crosstalk_probability * rate[neighbour])
-        n_lit = core.sums.shape[1] - 1
-        drive = np.append(design.drives[[channel]] if core.parallel else design.drives, 0.0)
-        pattern = np.append(np.arange(n_lit) + (channel if core.parallel else 0), -1)
+        own = np.arange(channel, len(design.drives), core.channels)  # what it was shown; in parallel mode one pattern
+        drive, pattern = np.append(design.drives[own], 0.0), np.append(own, -1)
         primed = -_memory_of_patterns(afterpulses, rate[channel], design.plan, core.parallel)
         result.append(
             Counts(
@@ -233,7 +282,7 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
 def _memory_of_patterns(afterpulses: Afterpulses, rate: F64, plan: Plan, parallel: bool) -> F64:
     """Return the afterpulses that an exposure of each pattern (the last: dark) sees after silence and after a click, (patterns, 2)."""
     dark = len(rate) - 1
-    shown = np.where(plan.slot_pattern == DARK_PATTERN, dark, 0 if parallel else plan.slot_pattern).astype(np.int64)
+    shown = np.where(plan.slot_pattern == DARK_PATTERN, dark, 0 if parallel else shown_in_slots(plan))
     before = afterpulses.memory_by_last(rate[shown])
     sums, counts = np.zeros((len(rate), 2)), np.bincount(shown, minlength=len(rate))
     np.add.at(sums, shown, before)
@@ -241,8 +290,18 @@ def _memory_of_patterns(afterpulses: Afterpulses, rate: F64, plan: Plan, paralle
 
 
 def joined_counts(parts: Sequence[Counts]) -> Counts:
-    """All channels' counts as one data set."""
-    return Counts(*(np.concatenate([getattr(part, name) for part in parts]) for name in Counts._fields))
+    """All channels' counts as one data set, but for those of silent ones: they tell nothing of the light."""
+    silent = silent_channels(parts)
+    heard = [part for channel, part in enumerate(parts) if channel not in silent]
+    return Counts(*(np.concatenate([getattr(part, name) for part in heard]) for name in Counts._fields))
+
+
+def silent_channels(parts: Sequence[Counts]) -> list[int]:
+    """Return the channels that never clicked in light in which the mean channel would have, `SILENT` times or more; never all."""
+    clicks = np.array([part.clicks[part.drive > 0].sum() for part in parts])
+    exposures = np.array([part.exposures[part.drive > 0].sum() for part in parts])
+    mean = clicks.sum() / max(1, exposures.sum())
+    return np.flatnonzero((clicks == 0) & (mean * exposures >= SILENT)).tolist()
 
 
 def plan_facts(design: Design) -> dict[str, Any]:
@@ -272,8 +331,9 @@ def calibration_values(parts: Sequence[Counts], model: CountModel, design: Desig
     exposure_us = design.plan.exposure_us
     to_peak = (profile.projector.levels - 1) / (exposure_us * 1e-6)
     expected = profile_level(profile, exposure_us)
-    channels = [_channel(part, model, level) for part in parts]
-    dark = sum(row["dark_clicks"] for row in channels), sum(row["dark_exposures"] for row in channels)
+    channels, silent = [_channel(part, model, level) for part in parts], silent_channels(parts)
+    heard = [row for channel, row in enumerate(channels) if channel not in silent]
+    dark = sum(row["dark_clicks"] for row in heard), sum(row["dark_exposures"] for row in heard)
     return {
         "made_utc": now_utc().isoformat(timespec="seconds"),
         "profile": {"name": profile.name, "sha256": profile.sha256},
@@ -285,6 +345,7 @@ def calibration_values(parts: Sequence[Counts], model: CountModel, design: Desig
         "dark_per_exposure": dark[0] / dark[1] if dark[1] else 0.0,
         "dark_ci": list(jeffreys_interval(*dark)),
         "channels": channels,
+        "silent_channels": silent,
         "non_uniformity": {
             "relative": spread.relative.value,
             "relative_ci": [spread.relative.low, _bound(spread.relative.high)],

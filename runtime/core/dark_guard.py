@@ -291,10 +291,9 @@ def recorded_guard(header: Mapping[str, Any], plan: Plan, bundle: Bundle, shots:
     if not header:
         return None
     expected, low, high = (np.array(header[key], np.float64) for key in ("expected", "low", "high"))
-    channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
     for rates in (expected, low, high):
-        if rates.shape != (channels,) or not ((rates >= 0) & (rates <= 1)).all():
-            raise ValueError(f"dark rates of shape {rates.shape}, allowed: {channels} of 0 to 1")
+        if rates.shape != (plan.n_channels,) or not ((rates >= 0) & (rates <= 1)).all():
+            raise ValueError(f"dark rates of shape {rates.shape}, allowed: {plan.n_channels} of 0 to 1")
     settings = WatchSettings(arl_exposures=float(header["arl_dark_exposures"]))
     watch = ChannelWatch(len(expected), expected, settings, low, high)
     lit = None

@@ -57,6 +57,11 @@ class Plan:
         return 1 if self.automaton is None else self.automaton.channels
 
     @property
+    def n_channels(self) -> int:
+        """Detectors that every exposure reads: all of a parallel plan, those of a walk, else 1."""
+        return self.n_patterns if self.mode == "parallel" else self.channels_at_once
+
+    @property
     def slots_per_cycle(self) -> int:
         """Exposures of one cycle, dark ones too."""
         return len(self.slot_pattern)

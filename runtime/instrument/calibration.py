@@ -173,13 +173,16 @@ def find_objections(calibration: Calibration, profile: Profile, serial: str | No
 
 
 def find_warnings(calibration: Calibration | None, now: datetime, max_age_h: float = MAX_AGE_H) -> list[str]:
-    """Return a sentence for the first reason to distrust: none given, contradictory, or stale."""
+    """Return a sentence for the first reason to distrust: none given, contradictory, with silent channels, or stale."""
     if calibration is None:
         return [
             "no calibration: the light and the dark rates are the profile's, not this instrument's (pans calibrate)"
         ]
     if calibration.values.get("contradictions"):
         return ["the calibration is of an instrument whose messages contradicted each other: calibrate again"]
+    if silent := calibration.values.get("silent_channels"):
+        names = ", ".join(map(str, silent[:8])) + (", ..." if len(silent) > 8 else "")
+        return [f"the calibration saw no click of channel {names} in light: check these detectors, and calibrate again"]
     age = calibration.age_h(now)
     if age > max_age_h:
         return [f"the calibration is {age:.1f} h old, allowed are {max_age_h:g} h: calibrate again"]
@@ -207,6 +210,10 @@ def _check(values: Mapping[str, Any]) -> None:
     for number, row in enumerate(rows):
         _demand(isinstance(row, dict), f"channel {number} is {number_text(row)}, allowed: an object")
         _check_channel(row, f"channel {number}")
+    silent = values.get("silent_channels", [])
+    _demand(isinstance(silent, list), f"silent_channels is {number_text(silent)}, allowed: a list of channels")
+    for channel in silent:
+        Range(0, len(rows) - 1, whole=True).checked(channel, "silent_channels")
     for key, part in (("name", "profile"), ("sha256", "profile")):
         _demand(isinstance(values[part], dict), f"{part} holds no facts")
         _demand(isinstance(values[part][key], str), f"{part}.{key} is no text")

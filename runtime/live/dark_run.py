@@ -85,7 +85,7 @@ class DarkRun:
             raise UsageError(
                 f"--on-dark {self.policy}: the plan has no dark slots", remedy="use --dark-slots 1 or more"
             )
-        channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
+        channels = plan.n_channels
         if self.calibration is None:
             rate = float(click_probability(click_law(self.profile, plan.exposure_us), 0.0))
             expected = low = high = np.full(channels, rate)

@@ -75,7 +75,7 @@ def _write(group: Any, tree: dict[str, Any], path: str = "") -> None:
 
 def _tree(path: Path, recording: Recording, plan: Plan, clicks: ClickList) -> dict[str, Any]:
     unit_s = plan.exposure_us * 1e-6 / plan.exposure_ticks
-    channels = plan.n_patterns if plan.mode == "parallel" else plan.channels_at_once
+    channels = plan.n_channels
     simulated = recording.simulated
     profile = recording.header.get("profile", {})
     device = recording.summary.get("device", {})
