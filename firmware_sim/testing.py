@@ -23,23 +23,25 @@ N_PATTERNS = 4
 EXPOSURE_US = 100.0
 
 
-def following_profile(levels: int = 65_536) -> Profile:
-    """Return the ideal instrument as one that follows automata of up to 16 states, with four dwell steps."""
+def following_profile(levels: int = 65_536, channels: int = 1) -> Profile:
+    """Return the ideal instrument as one that follows automata of up to 16 states, with four dwell steps and so many detectors."""
     profile = load_profile("ideal")
     projector = replace(profile.projector, automaton_states=16, dwell_steps=4, levels=levels)
-    return replace(profile, projector=projector, timing=replace(profile.timing, host_turn_us=50.0))
+    detector = replace(profile.detector, channels=channels)
+    return replace(profile, projector=projector, detector=detector, timing=replace(profile.timing, host_turn_us=50.0))
 
 
 def small_setup(mode: str = "sequential") -> tuple[Profile, Bundle, Plan]:
     """Return an instrument, a bundle and a plan that put many small frames on the wire.
 
     `mode` is sequential or parallel; or an automaton with binary patterns that the device follows (device-driven) or the host names
-    (host-driven), over photon numbers with -counts behind it.
+    (host-driven), with -counts behind it over photon numbers, with -detectors over the clicks of two that are read at once.
     """
-    driven, _, counts = mode.partition("-driven")
+    driven, _, what = mode.partition("-driven")
     if driven in ("device", "host"):
-        profile = following_profile(levels=2)
-        bundle = small_counting_bundle() if counts else small_automaton_bundle()
+        profile = following_profile(levels=2, channels=2 if what == "-detectors" else 1)
+        made = {"": small_automaton_bundle, "-counts": small_counting_bundle, "-detectors": small_detectors_bundle}
+        bundle = made[what]()
         plan = build_plan(profile, bundle, shots_per_object=4, drive=driven)
         return profile, bundle, replace(plan, block_exposures=min(2, plan.block_exposures))
     profile = load_profile("ideal")
@@ -73,29 +75,36 @@ def small_automaton_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) ->
 
     Patterns have 2 x 2 pixels; the light is that of the profile `ideal`. The expected figures are in range, but nobody's measurement.
     """
-    rng = np.random.default_rng(2)
-    automaton = reachable_automaton(
-        pattern=[0, 1, 2, 1, 3, 0],
-        dwell=[4, 2, 1, 4, 3, 2],
-        dwell_steps=4,
-        successors=[[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]],
-        posteriors=rng.dirichlet(np.full(3, 0.6), 10),
-    )
-    return _automaton_bundle("small automaton", automaton, rng, levels, exposure_us)
+    successors = [[1, 2], [3, 4], [4, 6], [5, 5], [5, 7], [8, 9]]
+    return _small_walks("small automaton", 2, [0, 1, 2, 1, 3, 0], successors, levels, exposure_us)
 
 
 def small_counting_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
     """Return the like of `small_automaton_bundle` over photon numbers 0, 1 and 2 or more."""
-    rng = np.random.default_rng(3)
-    automaton = reachable_automaton(
-        pattern=[0, 1, 2, 1, 3, 0],
-        dwell=[4, 2, 1, 4, 3, 2],
-        dwell_steps=4,
-        successors=[[1, 2, 2], [3, 4, 4], [4, 3, 6], [5, 5, 7], [5, 7, 10], [8, 9, 10]],
-        posteriors=rng.dirichlet(np.full(3, 0.6), 11),
-        counts=True,
-    )
-    return _automaton_bundle("small counting automaton", automaton, rng, levels, exposure_us)
+    successors = [[1, 2, 2], [3, 4, 4], [4, 3, 6], [5, 5, 7], [5, 7, 10], [8, 9, 10]]
+    return _small_walks("small counting automaton", 3, [0, 1, 2, 1, 3, 0], successors, levels, exposure_us, counts=True)
+
+
+def small_detectors_bundle(levels: int = 2, exposure_us: float = EXPOSURE_US) -> Bundle:
+    """Return the like of `small_automaton_bundle` over the clicks of two detectors: 0, the first, the second, both."""
+    successors = [[1, 2, 2, 1], [3, 4, 4, 3], [4, 3, 6, 4], [5, 5, 7, 5], [5, 7, 10, 11], [8, 9, 10, 11]]
+    return _small_walks("small automaton of two detectors", 4, [0, 1, 2, 1, 2, 0], successors, levels, exposure_us)
+
+
+def _small_walks(
+    name: str,
+    seed: int,
+    pattern: list[int],
+    successors: list[list[int]],
+    levels: int,
+    exposure_us: float,
+    counts: bool = False,
+) -> Bundle:
+    """A bundle of six states with random posteriors; the last leaf is the largest successor."""
+    rng, n_nodes = np.random.default_rng(seed), 1 + max(map(max, successors))
+    posteriors = rng.dirichlet(np.full(3, 0.6), n_nodes)
+    automaton = reachable_automaton(pattern, [4, 2, 1, 4, 3, 2], 4, successors, posteriors, counts)
+    return _automaton_bundle(name, automaton, rng, levels, exposure_us)
 
 
 def _automaton_bundle(

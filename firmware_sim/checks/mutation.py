@@ -15,15 +15,14 @@ from pans.runtime.wire.fields import ALL_MESSAGES, AUTOMATON_MESSAGES, Field
 from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.messages import BLOCK_HEADER_BYTES, STRUCTS, MessageType, Opcode
 
+COMMANDS = ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", "READ_COUNTS", "LOAD_COUNT_STATES")
 BODIES = {  # of commands: which of them holds the layout, and where in the payload it begins; of rows, the first
-    **{
-        name: (name, STRUCTS["COMMAND"].size)
-        for name in ("LOAD_PATTERN", "LOAD_PLAN", "ARM", "GATE", *AUTOMATON_MESSAGES)
-    },
+    **{name: (name, STRUCTS["COMMAND"].size) for name in (*COMMANDS, *AUTOMATON_MESSAGES)},
     "PLAN_SLOT": ("LOAD_PLAN", STRUCTS["COMMAND"].size + STRUCTS["LOAD_PLAN"].size),
     "STATE": ("LOAD_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_STATES"].size),
+    "COUNT_STATE": ("LOAD_COUNT_STATES", STRUCTS["COMMAND"].size + STRUCTS["LOAD_COUNT_STATES"].size),
 }
-STAMP = "STAMP"  # not a message: the first pattern or state that is stamped in a block of clicks
+STAMP = "STAMP"  # not a message: the first pattern or state that is stamped in a block of clicks or of photon numbers
 LAYOUTS = {**ALL_MESSAGES, STAMP: (Field("pattern", "H"),)}
 
 
@@ -58,7 +57,7 @@ def is_of(frame: Frame, message: str) -> bool:
     """Whether a frame is of the kind whose fields stand under `message` in LAYOUTS."""
     if message in BODIES:
         return frame.type == MessageType.COMMAND and frame.payload[4] == Opcode[BODIES[message][0]]
-    return frame.type == MessageType["CLICKS" if message == STAMP else message]
+    return frame.type in ((MessageType.CLICKS, MessageType.COUNTS) if message == STAMP else (MessageType[message],))
 
 
 def _layout(mutation: Mutation) -> tuple[struct.Struct, int, int]:

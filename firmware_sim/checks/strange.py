@@ -71,7 +71,9 @@ class StrangeCommands:
         if opcode == Opcode.LOAD_STATES:
             return self._states()
         if opcode == Opcode.READ_COUNTS:
-            return pack_read_counts(2 if dice.random() < 0.8 else self.number(16))
+            largest, detectors = dice.choice(((2, 0), (2, 0), (3, 2)))
+            asked = (largest, detectors) if dice.random() < 0.8 else (self.number(16), self.number(16))
+            return pack_read_counts(*asked)
         if opcode == Opcode.LOAD_COUNT_STATES:
             return self._count_states()
         if opcode == Opcode.SHOW:

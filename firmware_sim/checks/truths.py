@@ -44,20 +44,22 @@ def decoded(frame: Frame) -> ClickBlock | FrameBlock | Mark:
 
 
 def walk_truth(automaton: Automaton, stamps: list[int], clicks: list[int]) -> WalkTruth:
-    """Follow the walk through the adaptive slots of one cycle: each with its stamp and its click or photon number.
+    """Follow the walk through the adaptive slots of one cycle: each with its stamp, and its click, photon number or word of detectors.
 
-    A walk has not ended where a stamp is not its state: it is then taken to be as long as the cycle.
+    A walk has not ended where a stamp is not its state: it is then taken to be as long as the cycle. The clicks of several detectors
+    stand one by one, those of a slot together.
     """
-    counted = np.zeros(len(stamps), np.int64)
+    detectors = automaton.channels
+    counted = np.zeros((len(stamps), detectors), np.int64)
     node = 0
     for slot, (stamp, click) in enumerate(zip(stamps, clicks)):
         if stamp != node:
             break
-        counted[slot] = click
+        counted[slot] = click if detectors == 1 else [click >> detector & 1 for detector in range(detectors)]
         node = int(automaton.successors[node, click])
         if node >= automaton.n_states:
-            return WalkTruth(slot + 1, counted, True)
-    return WalkTruth(len(stamps), counted, False)
+            return WalkTruth(slot + 1, counted.ravel(), True)
+    return WalkTruth(len(stamps), counted.ravel(), False)
 
 
 def window_members(plan: Plan, shots: int) -> tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]:

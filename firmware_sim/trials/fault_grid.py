@@ -52,7 +52,10 @@ from pans.runtime.turn.system import offered
 from . import Report, Trial, figures_text
 
 SHOTS = 1
-STILL = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts")
+STILL = (
+    "sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", "host-driven-counts",
+    "device-driven-detectors", "host-driven-detectors",
+)  # fmt: skip
 MODES = (*STILL, *KINDS)  # objects that stand still, and those in flow
 SLOW_READS = 0.75  # of all, bring what came within a while; not of a host that names each state next: it would be late
 CASES = ("none", *NAMES, "host_stop", "all")
@@ -168,7 +171,7 @@ def run_case(
 
     faults = parse_faults(case_faults(case) if faults_text is None else faults_text)
     device = FaultyDevice(switch_on, clock, faults, seed, clock.tick_at(START_NS))
-    reads_again = reads_again and plan.largest == 1  # photon numbers have no compiled turn
+    reads_again = reads_again and plan.largest == 1  # COUNTS have no compiled turn
     slow = 0.0 if plan.drive == "host" else SLOW_READS
     link = (TapedLink if reads_again else ObservedLink)(SlowReads(device, clock, f"grid:{case}", seed, slow))
     flow = FlowRun(core, None) if isinstance(core, FlowCore) else None
@@ -224,8 +227,18 @@ def _backend(bundle: Bundle) -> str:
 def _recorded(one: Case, more: dict[str, Any]) -> dict[str, Any]:
     """What a replay needs to know of the run."""
     plan, tick_hz = one.plan, one.profile.clock.tick_hz
-    told = {"shots": SHOTS, "tick_hz": tick_hz, "backend": _backend(one.bundle), "drive": plan.drive, "confidence": 0.0}
-    return told | ({"photon_number_max": plan.largest} if plan.largest > 1 else {}) | more
+    told: dict[str, Any] = {
+        "shots": SHOTS,
+        "tick_hz": tick_hz,
+        "backend": _backend(one.bundle),
+        "drive": plan.drive,
+        "confidence": 0.0,
+    }
+    if plan.channels_at_once > 1:
+        told |= {"channels_at_once": plan.channels_at_once}
+    elif plan.largest > 1:
+        told |= {"photon_number_max": plan.largest}
+    return told | more
 
 
 def judged(

@@ -44,6 +44,7 @@ from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.timing.ledger import frozen_heap
 from pans.runtime.wire import messages
+from pans.runtime.wire.counts import decode_counts
 from pans.runtime.wire.fields import FACTS, wrong_facts
 from pans.runtime.wire.frame import Frame
 from pans.runtime.wire.framing import FrameDecoder, encode_frame
@@ -74,12 +75,16 @@ STRANGE_FACTS: tuple[Any, ...] = (
     {"a": [{}]},
 )
 TO_DEVICE = ("HELLO", "PING", "COMMAND", "GRANT", "LOAD_PATTERN", "LOAD_PLAN", "PLAN_SLOT", "ARM", "GATE")
-FROM_DEVICE = ("WELCOME", "PONG", "ACK", "STATUS", "CLICKS", "FRAMES", "MARK")
+BLOCKS = ("CLICKS", "FRAMES", "COUNTS")
+FROM_DEVICE = ("WELCOME", "PONG", "ACK", "STATUS", "MARK")  # and the blocks of MODES
+COUNTED = ("COUNTS", "COUNTS", STAMP, "READ_COUNTS", "READ_COUNTS", "LOAD_COUNT_STATES", "COUNT_STATE")
 MODES = {  # and what a session of each has on the wire beside what all have
     "sequential": ("CLICKS", "CLICKS", STAMP),
     "parallel": ("FRAMES", "FRAMES"),
     "device-driven": ("CLICKS", STAMP, STAMP, "LOAD_MASKS", "LOAD_STATES", "STATE", "STATE"),
     "host-driven": ("CLICKS", STAMP, STAMP, "LOAD_MASKS", "SHOW", "SHOW"),
+    "device-driven-counts": COUNTED,
+    "device-driven-detectors": COUNTED,
 }
 
 
@@ -106,9 +111,9 @@ class Evidence(NamedTuple):
         }
         always = {
             **{STAMP: ("pattern",), "MARK": ("seq", "exposure_index", "half_exposures"), "PONG": ("host_ns",)},
-            "BLOCK": ("seq", "drops", "exposure_index", "period_ticks", "count", "word_bytes"),
+            "BLOCK": ("seq", "drops", "exposure_index", "period_ticks", "count", "word_bytes", "largest"),
         }
-        kind = "BLOCK" if message in ("CLICKS", "FRAMES") else message
+        kind = "BLOCK" if message in BLOCKS else message
         return known.get((kind, name), name in always.get(kind, ()))
 
 
@@ -150,18 +155,16 @@ class MutatedLink:
                 if (
                     changed != payload
                     and frame.type >= MessageType.WELCOME
-                    and self._excludes(mutation, payload, changed)
+                    and self._excludes(mutation, frame.type, payload, changed)
                 ):
                     self.impossible.append(str(mutation))
                 payload = changed
         return encode_frame(frame.type, payload, frame.session, frame.flags)
 
-    def _excludes(self, mutation: Mutation, old: bytes, new: bytes) -> bool:
-        """Whether the changed message makes no sense, or cannot be true."""
-        kind = "CLICKS" if mutation.message == STAMP else mutation.message
-        decode = getattr(messages, f"decode_{kind.lower()}")
+    def _excludes(self, mutation: Mutation, kind: int, old: bytes, new: bytes) -> bool:
+        """Whether the changed message of that type makes no sense, or cannot be true."""
         try:
-            decoded = decode(new)
+            decoded = _decoded(kind, new)
         except MalformedMessage:
             return True
         if mutation.message == "WELCOME":
@@ -174,10 +177,15 @@ class MutatedLink:
         return self._evidence.excludes(mutation.message, mutation.name, *values)
 
 
+def _decoded(kind: int, payload: bytes) -> Any:
+    name = MessageType(kind).name.lower()
+    return decode_counts(payload) if kind == MessageType.COUNTS else getattr(messages, f"decode_{name}")(payload)
+
+
 def any_mutation(dice: random.Random, mode: str) -> Mutation:
     """Draw a mutation of a session in `mode`."""
     names = [
-        *(name for name in FROM_DEVICE if name not in ("CLICKS", "FRAMES")),
+        *FROM_DEVICE,
         *MODES[mode],
         "MARK",
         "STATUS",
@@ -308,7 +316,8 @@ def tcp_link(device: SteppedDevice, clock: DeviceClock) -> Iterator[Link]:
 
 def sessions(seed: int, count: int, over: str = "virtual") -> tuple[Counter[str], list[str]]:
     """Run `count` sessions, one mutation each, or two; return how they ended and what was wrong, with the seed of each."""
-    stages = {mode: Stage(mode, over) for mode in MODES}
+    # The instrument in C reads one detector, and counts no photons.
+    stages = {mode: Stage(mode, over) for mode, named in MODES.items() if over != "c" or named is not COUNTED}
     ended: Counter[str] = Counter()
     wrong: list[str] = []
     with TemporaryDirectory() as folder, frozen_heap():

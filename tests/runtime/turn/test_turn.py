@@ -35,7 +35,7 @@ from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import scene_from_arrays
 from pans.firmware_sim.testing import small_setup
-from pans.firmware_sim.trials.fault_grid import run_case
+from pans.firmware_sim.trials.fault_grid import STILL, run_case
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
@@ -171,9 +171,12 @@ def test_virtual_runs_are_those_of_the_python_turn(mode: str, acts: bool, tmp_pa
     assert [body[8:] for _, body in ours_recorded.messages()] == [body[8:] for _, body in theirs_recorded.messages()]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(len(STILL)))
 def test_faulty_bytes_are_decided_as_in_the_python_turn(seed: int) -> None:
-    """The quick form of the fault grid: every mode, all faults; the checkers, and the bytes once more from a socket."""
+    """The quick form of the fault grid: every kind of plan for objects that stand still, all faults, judged by the checkers.
+
+    What has a compiled turn reads the bytes once more from a socket.
+    """
     assert run_case("all", seed, 1200, None, "python", reads_again=True).violations == []
     assert run_case("all", seed, 1200, None, "auto").violations == []
 
