@@ -275,10 +275,8 @@ class _Run:
 
     def _start_bits(self, lights: list[torch.Tensor], low: float) -> None:
         shared, top = self._one_brightness(), self._highest_top()
-        means, parts = (
-            list(mean_objects(self.machine, self.sight(self.products), self._some_blocks())),
-            self.options.channels,
-        )
+        parts = self.options.channels
+        means = list(mean_objects(self.machine, self.sight(self.products), self._some_blocks()))
         made = [as_bits(light, by_row(own, parts), top, parts) for light, own in zip(lights, means)]
         typical = torch.cat([bits.log_light for bits in made]).median().reshape(1, 1)
         for level, bits in zip(self.machine.levels, made):

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pans.runtime.outputs import replace_file
 from pans.trainer.frontier.summary import by_point, click_budgets, error_of, margins
-from pans.trainer.paper.page import Column, Rows, Table, read_rows
+from pans.trainer.frontier.ways import TRAINED
+from pans.trainer.paper.page import Column, Row, Rows, Table, read_rows
 from pans.trainer.paper.tables import FIRST, FIRST_OBJECTS
 from pans.trainer.verdicts import VERDICTS, Claim, against, claim, sampling_error
 
@@ -61,12 +62,18 @@ def _of_the_frontier(rows: Rows) -> list[tuple[str, Claim]]:
     beside = margins(points)
     for task, way in dict.fromkeys((row["task"], row["way"]) for row in beside):
         mine = [row for row in beside if (row["task"], row["way"]) == (task, way)]
-        compared = [
-            against(100 * row["all"]["accuracy_mean"], 100 * row["beside"]["accuracy_mean"], 100 * row["error"])
-            for row in mine
-        ]
-        found.append((task, claim(way, "exact direct imaging at equal photons", compared)))
+        found.append((task, claim(way, "exact direct imaging at equal photons", _compared(mine))))
+        sure = [row | row["sure"] for row in mine if "sure" in row]
+        if sure and way in TRAINED:
+            found.append((task, claim(way, "direct imaging that stops when sure, at equal photons", _compared(sure))))
     return found
+
+
+def _compared(rows: Rows) -> list[Row]:
+    return [
+        against(100 * row["all"]["accuracy_mean"], 100 * row["beside"]["accuracy_mean"], 100 * row["error"])
+        for row in rows
+    ]
 
 
 def rewrite_index(folder: Path) -> None:

@@ -1,30 +1,24 @@
-"""Fixed patterns on the frontier: the paper's, ours of other pages, which are not measured again, and ours held to photons.
+"""Fixed patterns on the frontier: the paper's, and ours of other pages, which are not measured again.
 
-Owns the training of the last, the reading of NAME.json of the pages `fashion-mnist`, `mnist` (held to clicks) and `alpha` (a weight on the
-light) beside the page that is written, and of the paper's printed figures. The bound on the paper's photons is `photons_at_least`.
+Owns the reading of NAME.json of the pages `fashion-mnist`, `mnist` (held to clicks), `alpha` (a weight on the light) and `equal-photons`
+(held to photons, or to illumination) beside the page that is written, and of the paper's printed figures. The bound on the paper's photons
+is `photons_at_least`.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
 from pathlib import Path
 
-from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import UsageError
-from pans.runtime.instrument.profile import load_profile
-from pans.trainer.evaluate.accuracy import evaluate_sampled, light_of
-from pans.trainer.options import Options, plain_options
-from pans.trainer.paper.active import PROFILE, parts_of
-from pans.trainer.paper.page import Asked, Row, Rows, check_cached_bundle, read_rows
+from pans.trainer.paper.equal import HELD, SENT
+from pans.trainer.paper.page import Row, Rows, read_rows
 from pans.trainer.paper.tables import ACTIVE, FIRST, FIRST_OBJECTS
-from pans.trainer.tasks.registry import Task
 
 PAPER, FIXED, FIXED_LIGHT = "paper, fixed patterns", "ours, fixed, held to clicks", "ours, fixed, light weighed"
-FIXED_BUDGET = "ours, fixed, held to photons"
-TRIALS = {FIRST: 100, "all": 10}
+FIXED_BUDGET, FIXED_SENT = "ours, fixed, held to photons", "ours, fixed, held to illumination"
+EQUAL = {HELD: FIXED_BUDGET, SENT: FIXED_SENT}  # by the way on the page `equal-photons`
 
 
 def photons_at_least(clicks: float, features: int) -> float:
@@ -73,6 +67,12 @@ def fixed_rows(results: Path | None) -> Rows:
             rows.append(
                 {**facts, "exposures": found["features"], **_final(found["final"]), "cpu_seconds": found["cpu_seconds"]}
             )
+    for found in _page(results, "equal-photons"):
+        if found["task"] in ACTIVE and found["way"] in EQUAL:
+            asked = found["options"]
+            facts = {"task": found["task"], "way": EQUAL[found["way"]], "level": found["asked"], "seed": asked["seed"]}
+            facts |= {"exposures": asked["features"], "cpu_seconds": found["cpu_seconds"]}
+            rows.append({**facts, **_final(found)})
     return rows
 
 
@@ -88,34 +88,6 @@ def _final(final: Row) -> Row:
         "objects": final["objects"],
     }
     return {"all": whole, FIRST: {"accuracy_mean": final[FIRST] / 100, "objects": FIRST_OBJECTS}}
-
-
-def budget_row(asked: Asked, path: Path, task: Task, photons: float, features: int, seed: int) -> Row:
-    """Train fixed patterns that may take that many photons on average, write their bundle to `path` in the cache, and measure them."""
-    from pans.trainer.export.writer import export_trained
-    from pans.trainer.train.loop import train
-
-    check_cached_bundle(path)
-    options, profile = budget_recipe(photons, features, seed), load_profile(PROFILE)
-    checkpoint, started = path.with_suffix(".checkpoint"), time.process_time()
-    trained = train(task, profile, options, checkpoint=checkpoint, resume=checkpoint.is_file())
-    provenance = {"command": "pans reproduce frontier", "options": plain_options(options)}
-    exported = export_trained(path, trained, task, profile, name=path.stem, provenance=provenance, force=True)
-    checkpoint.unlink(missing_ok=True)
-    asked.report(f"{path.stem}: trained")
-    facts = {"sha256": exported.sha256, "exposures": features, "training_seconds": time.process_time() - started}
-    bundle, found = load_bundle(path)[0], {}
-    for part, objects in parts_of(task.test).items():
-        drawn = light_of(bundle, profile, objects.images)
-        measured = evaluate_sampled(bundle, drawn, objects.labels, shots=1, trials=TRIALS[part], seed=1)
-        found[part] = asdict(measured)
-    return facts | found
-
-
-def budget_recipe(photons: float, features: int, seed: int) -> Options:
-    """Return the schedule that `equal-photons` trains 32 patterns and more with, for a budget of light alone."""
-    shared = Options(features=features, alpha=0.0, photons=0.97 * photons, estimator="local", seed=seed)
-    return replace(shared, epochs=44, warm=0.4, hidden=256, head_rate=3e-3)
 
 
 def _page(results: Path, name: str) -> Rows:

@@ -18,7 +18,7 @@ from .fixed import PAPER, fixed_rows, paper_rows
 from .one_photon import one_photon_page, one_photon_tables
 from .reaching import reaching_page, reaching_tables
 from .summary import by_point, click_budgets, commands, largest, margins, missing
-from .ways import AUTOMATON, TASKS, Point, points, row_of
+from .ways import AUTOMATON, TASKS, Point, beyond_reach, points, row_of
 
 SHOWN = ("fashion-mnist", 10.0)  # task and photons of the automaton that the pictures explain
 ORDER = 0  # its seed
@@ -51,10 +51,10 @@ class _Tasks(dict[str, Task]):
 
 
 def _missing(asked: Asked, found: dict[tuple[Point, int], Row]) -> Rows:
-    """One row per task and way that lacks something: how many seeds of each level are measured."""
+    """One row per task and way that lacks something: how many seeds of each level are measured, or known to be beyond reach."""
     lines: dict[tuple[str, str], list[str]] = {}
     for point in points():
-        there = sum((point, seed) in found for seed in range(asked.seeds))
+        there = sum((point, seed) in found or beyond_reach(asked, point, seed) for seed in range(asked.seeds))
         if there < asked.seeds:
             lines.setdefault((point.task, point.way), []).append(f"{point.level:g}: {there} of {asked.seeds}")
     for (task, way), levels in lines.items():

@@ -15,19 +15,42 @@ from pans.trainer.paper.page import Rows
 from pans.trainer.paper.plots import TITLES
 from pans.trainer.paper.tables import FIRST
 
-from .fixed import FIXED, FIXED_BUDGET, FIXED_LIGHT, PAPER
+from .fixed import FIXED, FIXED_BUDGET, FIXED_LIGHT, FIXED_SENT, PAPER
 from .summary import error_of
-from .ways import AUTOMATON, DIRECT, EARLY, HADAMARD, HELD_TO_CLICKS, MASKS, ON, SMALL, STOPPING, TASKS
+from .ways import (
+    AUTOMATON,
+    DIRECT,
+    EARLY,
+    HADAMARD,
+    HELD_TO_CLICKS,
+    LARGER,
+    LARGER_ON,
+    MASKS,
+    ON,
+    SMALL,
+    STOPPING,
+    TASKS,
+)
 
 STYLES: dict[str, dict[str, Any]] = {
     AUTOMATON: {"color": "C3", "marker": "o", "lw": 2.2, "zorder": 5},
     ON: {"color": "C3", "marker": "*", "ms": 10, "mfc": "w", "ls": "", "zorder": 6},
+    LARGER: {"color": "C8", "marker": "o", "ls": "", "zorder": 6},
+    LARGER_ON[-1]: {
+        "color": "C8",
+        "marker": "*",
+        "ms": 10,
+        "mfc": "w",
+        "ls": "",
+        "zorder": 6,
+    },  # those before lie between
     SMALL: {"color": "C3", "marker": "o", "mfc": "w", "lw": 1.2, "ls": "--", "zorder": 4},
     HELD_TO_CLICKS: {"color": "C3", "marker": "^", "lw": 1.0, "ls": ":", "zorder": 4},
     EARLY: {"color": "C6", "marker": "o", "mfc": "w", "lw": 1.0, "ls": ":", "zorder": 4},
     FIXED: {"color": "C1", "marker": "s"},
     FIXED_LIGHT: {"color": "C1", "marker": "s", "mfc": "w", "ls": "--"},
     FIXED_BUDGET: {"color": "C5", "marker": "s"},
+    FIXED_SENT: {"color": "C5", "marker": "s", "mfc": "w", "ls": "--"},
     PAPER: {"color": "k", "marker": "x", "ls": ":"},
     DIRECT: {"color": "C0", "marker": "."},
     STOPPING: {"color": "C0", "marker": "v", "mfc": "w", "ls": "--"},
@@ -39,6 +62,7 @@ REACHING: dict[str, dict[str, Any]] = {  # by encoder
     "conserving": {"color": "C1", "marker": "s", "ls": "--"},
     "of intensities, conserving": {"color": "C2", "marker": "D", "ls": "--"},
 }
+MISSING = " (not measured yet)"
 AXES = (("photons_mean", "photons detected per decision"), ("clicks_mean", "clicks per decision"))
 
 
@@ -57,8 +81,14 @@ def frontier(path: Path, points: Rows) -> None:
             low, high = axis.get_xlim()
             axis.set_xticks([tick for tick in ticks if low <= tick <= high])
             axis.grid(alpha=0.3)
-    handles, labels = panels[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+    measured = {row["way"] for row in points}
+    handles: dict[str, Any] = {}
+    for across in panels:
+        for handle, label in zip(*across[0].get_legend_handles_labels()):
+            way = label.removesuffix(MISSING)
+            if way not in measured or label == way:  # of a task that it is measured for, if of any
+                handles.setdefault(way if way in measured else label, handle)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=9)
     words = "all 10 000 test images, the paper's points on its first 200 with the least photons of its clicks; bars: standard errors"
     figure.suptitle(f"{words} (SIMULATED)", fontsize=10)
     save_figure(figure, path)
@@ -71,7 +101,7 @@ def _ways(axis: Any, points: Rows, key: str) -> None:
             (row for row in points if row["way"] == way and part in row), key=lambda row: float(row[part][key])
         )
         if not curve:
-            axis.plot([], [], **style, label=f"{way} (not measured yet)")
+            axis.plot([], [], **style, label=f"{way}{MISSING}")
             continue
         errors = None if way == PAPER else [100 * error_of(row) for row in curve]
         words = f"{way}{', photons at least' if way == PAPER else ''}"

@@ -14,7 +14,7 @@ from pans.trainer.paper.page import Row, Rows, at
 from pans.trainer.paper.tables import ACTIVE, FIRST
 
 from .fixed import PAPER
-from .ways import AUTOMATA, AUTOMATON, DIRECT, ON, STOPPING, TASKS, TRAINED
+from .ways import AUTOMATA, DIRECT, LONGER, STOPPING, TASKS, TRAINED
 
 SUMMED = ("accuracy_mean", "accuracy_se_objects", "clicks_mean", "photons_mean", "illumination")
 
@@ -50,24 +50,33 @@ def error_of(row: Row) -> float:
 def margins(points: Rows) -> Rows:
     """Return all points of other ways within the levels of exact direct imaging, with `beside`, `ahead` and `error` at their own photons.
 
-    Direct imaging is interpolated in the logarithm of the photons between neighbouring levels. Both errors count, as if the
-    images were drawn for each: they are the same, so the true error is smaller.
+    Where direct imaging that stops when it is sure can take as many photons, `sure` has its accuracy, and the same two against it.
+    Between neighbouring levels it is interpolated in the logarithm of the photons. Both errors count, as if the images were
+    drawn for each: they are the same, so the true error is smaller.
     """
     found = []
     for point in points:
         if point["way"] in (DIRECT, STOPPING) or "all" not in point:
             continue
-        beside = direct_at([row for row in points if row["task"] == point["task"]], point["all"]["photons_mean"])
+        of_task = [row for row in points if row["task"] == point["task"]]
+        beside, sure = (
+            _ahead(point, direct_at(of_task, point["all"]["photons_mean"], way)) for way in (DIRECT, STOPPING)
+        )
         if beside is not None:
-            ahead = point["all"]["accuracy_mean"] - beside["accuracy_mean"]
-            error = math.hypot(error_of(point), beside["error"])
-            found.append(point | {"beside": beside, "ahead": ahead, "error": error})
+            found.append(point | beside | ({} if sure is None else {"sure": sure}))
     return found
 
 
-def direct_at(points: Iterable[Row], photons: float) -> Row | None:
-    """Return accuracy and error of exact direct imaging at that many photons, None beyond its levels."""
-    curve = sorted((row for row in points if row["way"] == DIRECT), key=lambda row: float(row["all"]["photons_mean"]))
+def _ahead(point: Row, beside: Row | None) -> Row | None:
+    if beside is None:
+        return None
+    ahead = point["all"]["accuracy_mean"] - beside["accuracy_mean"]
+    return {"beside": beside, "ahead": ahead, "error": math.hypot(error_of(point), beside["error"])}
+
+
+def direct_at(points: Iterable[Row], photons: float, way: str = DIRECT) -> Row | None:
+    """Return accuracy and error of a way of direct imaging at that many photons, None beyond its levels."""
+    curve = sorted((row for row in points if row["way"] == way), key=lambda row: float(row["all"]["photons_mean"]))
     for low, high in pairwise(curve):
         x0, x1 = (math.log(row["all"]["photons_mean"]) for row in (low, high))
         if x0 - 1e-6 <= math.log(photons) <= x1 + 1e-6:
@@ -91,12 +100,14 @@ def largest(found: Rows) -> Rows:
 def click_budgets(points: Rows) -> Rows:
     """Return the paper's rows, each with `ours`: of the automata with no more clicks on all images, the one that comes nearest to them.
 
-    It is chosen by clicks, not by accuracy. An automaton that was trained on stands for the one it began with. Rows without one
-    have no `ours`.
+    It is chosen by clicks, not by accuracy. Of the large automata of one level the one that was trained longest stands for all
+    (`LONGER`). Rows without one have no `ours`.
     """
     automata = [row for row in points if row["way"] in AUTOMATA]
-    finished = {(row["task"], row["level"]) for row in automata if row["way"] == ON}
-    automata = [row for row in automata if row["way"] != AUTOMATON or (row["task"], row["level"]) not in finished]
+    longest: dict[tuple[str, float], str] = {}
+    for row in sorted((row for row in automata if row["way"] in LONGER), key=lambda row: LONGER.index(row["way"])):
+        longest[row["task"], row["level"]] = row["way"]
+    automata = [row for row in automata if row["way"] not in LONGER or row["way"] == longest[row["task"], row["level"]]]
     found = []
     for name in TASKS:
         for printed in ACTIVE[name]:

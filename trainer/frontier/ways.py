@@ -16,21 +16,22 @@ from typing import Any
 from pans.trainer.baselines.common import silent
 from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
-from pans.trainer.options import plain_options
 from pans.trainer.paper.page import Asked, Row, cached_row, kept
 from pans.trainer.paper.paradigms import MEASURED
 from pans.trainer.paper.tables import ACTIVE, FIRST
 from pans.trainer.tasks.registry import Task
 
 from .automata import automaton_recipe, automaton_row, bundle_path, made_so, train_unless_kept
-from .fixed import FIXED_BUDGET, budget_recipe, budget_row
 
 TASKS = tuple(ACTIVE)
 AUTOMATON, SMALL, HELD_TO_CLICKS = "automaton", "small automaton", "automaton, held to clicks"
 ON = "automaton, trained on"
+LARGER = "larger automaton"
+LARGER_ON = (f"{LARGER}, trained on", f"{LARGER}, trained on twice")
 EARLY = "small automaton, ends early"
 FEW = {count: f"small automaton, {count} patterns" for count in (96, 1000)}
-AUTOMATA = (AUTOMATON, ON, SMALL, HELD_TO_CLICKS)
+AUTOMATA = (AUTOMATON, ON, SMALL, HELD_TO_CLICKS, LARGER, *LARGER_ON)
+LONGER = (AUTOMATON, ON, LARGER, *LARGER_ON)  # by how much training went into those of one level
 TRAINED = (*AUTOMATA, EARLY, *FEW.values())  # the last are variations of the small one at its budgets
 DIRECT, STOPPING = "direct, exact posterior", "direct, stops when sure"
 MASKS, HADAMARD = "trained masks, counts", "Hadamard pairs, network"
@@ -56,6 +57,19 @@ ON_OF: dict[str, dict[float, tuple[tuple[str, float], ...]]] = {
     "fashion-mnist": {40.0: (("photons", 39.0), *AFTER)},
     "mnist": {18.0: (("photons", 17.2), *AFTER), 40.0: (("photons", 38.0), *AFTER)},
 }
+# More exposures and stronger distortions, as large as the bundle's states allow: docs/measurements/training.md, Stronger distortions.
+LARGER_OF: dict[str, dict[float, dict[str, tuple[tuple[str, float], ...]]]] = {
+    "mnist": {
+        40.0: {
+            LARGER: (
+                *(("photons", 37.2), ("exposures", 128), ("states", 320)),
+                *(("epochs", 12), ("rate", 0.03), ("reroutes", 5), ("strength", 0.6)),
+            ),
+            LARGER_ON[0]: (("photons", 37.9), ("epochs", 12), ("rate", 0.03), ("reroutes", 6), ("strength", 0.6)),
+            LARGER_ON[1]: (("photons", 37.1), ("epochs", 14), ("rate", 0.03), ("reroutes", 6), ("strength", 0.6)),
+        }
+    }
+}
 CLICKS_OF = {"fashion-mnist": (1.281, 2.145), "mnist": (2.164,)}  # the automata above serve the larger ones
 UNDER_CLICKS = 0.97  # of the paper's clicks is what training aims at, so that test images take no more
 SMALL_PHOTONS = (4.0, 6.0, 10.0)
@@ -65,9 +79,7 @@ EARLY_PRICE = (
 )
 FEW_PHOTONS = {"fashion-mnist": (6.0,)}
 DIRECT_PHOTONS = (2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 17.0, 25.0, 40.0, 65.0, 100.0)
-STOPPING_PHOTONS = (4.0, 6.0, 10.0, 17.0, 40.0, 65.0, 100.0)
-BUDGET_PHOTONS = (10.0, 17.0, 40.0)  # of fixed patterns held to photons
-BUDGET_FEATURES = 32
+STOPPING_PHOTONS = (4.0, 6.0, 10.0, 17.0, 25.0, 40.0, 65.0, 100.0)
 NETWORK_PHOTONS = (4.0, 10.0, 17.0, 40.0, 100.0)
 MASKS_EPOCHS, HADAMARD_EPOCHS = 20, 10
 # Masks by task and photons. On held-back training images the best of 8, 16, 24, 32 (FashionMNIST, 10 photons), 8, 16 (4), 16, 32 (40)
@@ -104,13 +116,11 @@ class Point:
 
     def training_seed(self, seed: int) -> int:
         """Return the seed that the training of the row of that seed is given."""
-        return seed if self.start is None else seed + 1
+        return seed if self.start is None else self.start.training_seed(seed) + 1
 
     def command(self, seed: int) -> str:
         """Return the command that measures the point alone; what it starts from is called as in the cache."""
         given = dict(self.recipe)
-        if self.way == FIXED_BUDGET:
-            return "pans reproduce frontier"  # the whole recipe is `fixed.budget_recipe`
         if self.way in TRAINED:
             words = " ".join(f"--{key.replace('_', '-')} {value:g}" for key, value in given.items())
             words += "" if self.start is None else f" --start {bundle_path(Path(), self.start.stem, seed)}"
@@ -144,9 +154,12 @@ def points() -> Iterator[Point]:
     for name in TASKS:
         for photons, recipe in ON_OF[name].items():
             yield Point(name, ON, photons, recipe, Point(name, AUTOMATON, photons, AUTOMATA_OF[name][photons]))
-    for name in TASKS:
-        for photons in BUDGET_PHOTONS:
-            yield Point(name, FIXED_BUDGET, photons, (("photons", photons), ("features", BUDGET_FEATURES)))
+    for name, larger in LARGER_OF.items():
+        for photons, recipes in larger.items():
+            start = None
+            for way, recipe in recipes.items():
+                start = Point(name, way, photons, recipe, start)
+                yield start
     for name in TASKS:
         for photons in STOPPING_PHOTONS:
             yield _baseline(name, STOPPING, photons, BaselineOptions("direct", "stopping", trials=1))
@@ -188,8 +201,6 @@ def made_with(point: Point, seed: int) -> Row:
         if point.start is not None:
             begun = made_with(point.start, seed)
             options |= {"start": begun, "exposures": begun["exposures"], "states": begun["states"]}
-    elif point.way == FIXED_BUDGET:
-        options = plain_options(budget_recipe(point.level, BUDGET_FEATURES, seed))
     return {**options, "way": point.way, "seed": seed}
 
 
@@ -200,7 +211,19 @@ def _recipe_kept(path: Path, point: Point, seed: int) -> Row:
     return found["made_with"] if found is not None and made_so(wanted, found["made_with"]) else wanted
 
 
+def beyond_reach(asked: Asked, point: Point, seed: int) -> bool:
+    """Return whether stopping was measured with that seed and does not take as many photons as the level of `point`."""
+    levels = _stopping_levels(asked, point, seed, None) if point.way == STOPPING else None
+    return levels is not None and f"{point.level:g}" not in levels
+
+
 def _stopping_row(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | None:
+    row = (_stopping_levels(asked, point, seed, task) or {}).get(f"{point.level:g}")
+    return None if row is None else _plain(row, point, seed)
+
+
+def _stopping_levels(asked: Asked, point: Point, seed: int, task: Task | None) -> Row | None:
+    """Return the rows of all levels of a seed by level, those out of reach left out; None where they are not there and no task is given."""
     path = asked.cache / f"frontier-{point.task}-stopping-seed{seed}.json"
 
     def make() -> Row:
@@ -211,8 +234,7 @@ def _stopping_row(asked: Asked, point: Point, seed: int, task: Task | None) -> R
 
     whole = {**made_with(point, seed), "levels": STOPPING_PHOTONS}
     found = kept(path, whole, make, collect=task is None)
-    row = None if found is None else found["rows"].get(f"{point.level:g}")
-    return None if row is None else _plain(row, point, seed)
+    return None if found is None else dict(found["rows"])
 
 
 def _options(point: Point, seed: int) -> BaselineOptions:
@@ -222,15 +244,18 @@ def _options(point: Point, seed: int) -> BaselineOptions:
 def _made(asked: Asked, point: Point, seed: int, task: Task) -> Row:
     asked.report(f"frontier: {point.task}, {point.way}, {point.level:g}, seed {seed}")
     if point.way in TRAINED:
-        path, start = bundle_path(asked.cache, point.stem, seed), None
-        if point.start is not None:
-            start = bundle_path(asked.cache, point.start.stem, seed)
-            train_unless_kept(asked, start, task, dict(point.start.recipe), seed)
-        return automaton_row(asked, path, task, dict(point.recipe), point.training_seed(seed), start)
-    if point.way == FIXED_BUDGET:
+        start = None if point.start is None else _bundle_of(asked, point.start, seed, task)
         path = bundle_path(asked.cache, point.stem, seed)
-        return budget_row(asked, path, task, point.level, BUDGET_FEATURES, seed)
+        return automaton_row(asked, path, task, dict(point.recipe), point.training_seed(seed), start)
     return next(iter(baseline_rows(task, _options(point, seed), [point.level], silent)))
+
+
+def _bundle_of(asked: Asked, point: Point, seed: int, task: Task) -> Path:
+    """Return where the automaton of a point lies, trained now unless it is there; before it, what it goes on from."""
+    start = None if point.start is None else _bundle_of(asked, point.start, seed, task)
+    path = bundle_path(asked.cache, point.stem, seed)
+    train_unless_kept(asked, path, task, dict(point.recipe), point.training_seed(seed), start)
+    return path
 
 
 def _plain(found: Row, point: Point, seed: int) -> Row:

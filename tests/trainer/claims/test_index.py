@@ -8,6 +8,7 @@ from tree import ROOT
 pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.claims.index import BEGIN, END, claims_of, index_counts, rewrite_index
+from pans.trainer.frontier.ways import TRAINED
 from pans.trainer.paper.page import read_rows
 
 RESULTS = ROOT / "docs" / "results"
@@ -41,4 +42,6 @@ def test_a_folder_without_an_index_stays_as_it_is(tmp_path):
 def test_automata_are_held_against_the_papers_sampling_error():
     (_, budgets), *others = claims_of("frontier", read_rows(RESULTS, "frontier"))
     assert len(budgets.verdicts) == 13
-    assert {one.beside for _, one in others} == {"exact direct imaging at equal photons"}
+    frame, sure = "exact direct imaging at equal photons", "direct imaging that stops when sure, at equal photons"
+    assert {one.beside for _, one in others} == {frame, sure}
+    assert {one.ours for _, one in others if one.beside == sure} <= set(TRAINED)

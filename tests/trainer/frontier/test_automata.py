@@ -1,4 +1,4 @@
-"""Rows of automata and of fixed patterns held to photons: trained once, found again as bundles, and never another recipe's."""
+"""Rows of automata: trained once, found again as bundles, and never another recipe's."""
 
 # ruff: noqa: E402  (what follows needs torch)
 from __future__ import annotations
@@ -12,10 +12,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.bundle.model import load_bundle
-from pans.runtime.errors import UsageError
 from pans.trainer.adaptive import train as adaptive_train
 from pans.trainer.adaptive.options import AutomatonOptions
-from pans.trainer.frontier import automata, fixed, ways
+from pans.trainer.frontier import automata, ways
 from pans.trainer.paper import Asked
 from pans.trainer.paper.tables import FIRST
 from pans.trainer.tasks.registry import Objects, Task
@@ -129,21 +128,3 @@ def test_a_bundle_that_was_not_made_for_a_page_is_not_replaced(halves, tmp_path,
     with pytest.raises(Exception, match=r"mine-seed0\.pans"):
         automata.automaton_row(asked, path, halves, BUDGET, seed=0)
     assert path.read_bytes() == b"something of somebody"
-
-
-def test_fixed_patterns_are_held_to_photons(halves, tmp_path, monkeypatch):
-    whole = fixed.budget_recipe
-
-    def short(photons, features, seed):
-        return replace(whole(photons, features, seed), epochs=60, hidden=16, batch=128)
-
-    monkeypatch.setattr(fixed, "budget_recipe", short)
-    asked = Asked("frontier", tmp_path, report=lambda _: None)
-    row = fixed.budget_row(asked, tmp_path / "fixed.pans", halves, 3.0, 13, seed=2)
-    assert row["exposures"] == 13
-    assert row["all"]["photons_mean"] < 4.0
-    assert load_bundle(tmp_path / "fixed.pans")[0].provenance["options"]["seed"] == 2
-    json.dumps(row)
-    (tmp_path / "other.pans").write_bytes(b"mine")
-    with pytest.raises(UsageError, match=r"other\.pans"):
-        fixed.budget_row(asked, tmp_path / "other.pans", halves, 3.0, 13, seed=2)
