@@ -96,6 +96,7 @@ class Reconciled:
     taken_here: int  # messages of the present connection that the core was given, or came before ARM
     compiled: Turns | None  # where they are taken in the place of Python's
     turned_s: float
+    armed: Connection | None = None  # the connection whose session was sent ARM last
     _counted: Connection | None = None
 
     def beat(self) -> None:
@@ -141,7 +142,7 @@ class Reconciled:
     def _reconcile(self, frames: int) -> None:
         """Compare the books of the decoder, the connection and this run: every frame is an answer or was taken."""
         lost = frames - self.connection.answers - self.connection.delivered
-        untaken = self.connection.delivered - self.taken_here if self.taken_here else 0  # it was armed
+        untaken = self.connection.delivered - self.taken_here if self.connection is self.armed else 0
         self.taken_here = 0
         for what, count in (("frames_lost_in_host", lost), ("messages_not_taken", untaken)):
             if count:

@@ -124,7 +124,7 @@ class LiveRun(Reconciled):
         self.journal.session(self.connection)
         if self.compiled is not None:
             self.compiled.attach()
-        self.taken_here = self.connection.delivered
+        self.taken_here, self.armed = self.connection.delivered, self.connection
         now_ns = self.now_ns()
         start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
         if not 0 <= start_tick <= LARGEST_TICK:
@@ -264,9 +264,9 @@ class LiveRun(Reconciled):
             self.connection.flush()
 
     def take(self, arrived: list[Arrived]) -> list[Output]:
-        """Decide on what came for the core and account for what came of it."""
+        """Decide on what came for the core and account for what came of it; before ARM nothing is the core's."""
         outputs: list[Output] = []
-        for arrival_ns, what in arrived:
+        for arrival_ns, what in arrived if self.connection is self.armed else ():
             if isinstance(what, Messages):
                 self._take_messages(arrival_ns, what, outputs)
                 continue
