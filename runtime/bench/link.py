@@ -186,6 +186,7 @@ class _RoundTrip(ExitStack):
         start = clock.to_tick(link.now_ns() + 50_000_000)
         cycles = BUFFER_MESSAGES - 1  # and one mark
         session.submit(Opcode.ARM, pack_arm(Arm(start, cycles, 60_000)))
+        self._run.armed = connection
         connection.settle()
         deadline = link.now_ns() + int(PATIENCE_S * 1e9)
         while session.status is None or session.status.state != DeviceState.IDLE or session.status.tick < start:

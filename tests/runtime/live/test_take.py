@@ -29,7 +29,7 @@ def test_a_link_that_breaks_under_a_pulse_loses_nothing_that_has_arrived(monkeyp
     run.core = SimpleNamespace(step_messages=step_messages)  # type: ignore[assignment]
     run.lateness = SimpleNamespace(stepped=lambda begin, end: None)  # type: ignore[assignment]
     run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7))  # type: ignore[assignment]
-    run.recorder, run._broken, run.taken_here = None, None, 0
+    run.recorder, run._broken, run.taken_here, run.armed = None, None, 0, run.connection
     monkeypatch.setattr(LiveRun, "_act", act)
     monkeypatch.setattr(LiveRun, "_account", lambda self, output, times_ns, kept: None)
     messages = Messages(np.zeros(8, np.uint8), np.zeros((3, 2), np.int64))
@@ -53,7 +53,7 @@ def test_a_status_that_waited_is_held_against_its_own_arrival(monkeypatch: pytes
     )
     session = SimpleNamespace(status=waited[-1])
     run.connection = SimpleNamespace(link=SimpleNamespace(now_ns=lambda: 7), session=session)  # type: ignore[assignment]
-    run.recorder, run._broken, run.taken_here = None, None, 0
+    run.recorder, run._broken, run.taken_here, run.armed = None, None, 0, run.connection
     monkeypatch.setattr(LiveRun, "_account", lambda self, output, times_ns, kept: None)
     monkeypatch.setattr(LiveRun, "check_tick", lambda self, tick, at_ns: checked.append((tick, at_ns)))
     run.take([Arrived(at_ns, frame) for at_ns, frame in zip((1, 2, 3), frames)])

@@ -30,6 +30,8 @@ def test_the_summary_has_the_contracts_keys_order_and_values(
     for key in wanted:
         if key == "device":
             assert list(found[key]) == list(wanted[key])
+        elif key == "clock":  # sums whose last digits depend on the processor
+            assert found[key] == pytest.approx(wanted[key], rel=1e-9)
         elif key not in MEASURED:
             assert found[key] == wanted[key], key
             if isinstance(wanted[key], dict):
