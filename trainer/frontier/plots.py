@@ -36,14 +36,8 @@ STYLES: dict[str, dict[str, Any]] = {
     AUTOMATON: {"color": "C3", "marker": "o", "lw": 2.2, "zorder": 5},
     ON: {"color": "C3", "marker": "*", "ms": 10, "mfc": "w", "ls": "", "zorder": 6},
     LARGER: {"color": "C8", "marker": "o", "ls": "", "zorder": 6},
-    LARGER_ON[-1]: {
-        "color": "C8",
-        "marker": "*",
-        "ms": 10,
-        "mfc": "w",
-        "ls": "",
-        "zorder": 6,
-    },  # those before lie between
+    LARGER_ON[0]: {"color": "C8", "marker": "D", "ms": 5, "mfc": "w", "ls": "", "zorder": 6},
+    LARGER_ON[1]: {"color": "C8", "marker": "*", "ms": 10, "mfc": "w", "ls": "", "zorder": 6},
     SMALL: {"color": "C3", "marker": "o", "mfc": "w", "lw": 1.2, "ls": "--", "zorder": 4},
     HELD_TO_CLICKS: {"color": "C3", "marker": "^", "lw": 1.0, "ls": ":", "zorder": 4},
     EARLY: {"color": "C6", "marker": "o", "mfc": "w", "lw": 1.0, "ls": ":", "zorder": 4},
