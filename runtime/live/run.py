@@ -264,7 +264,7 @@ class LiveRun(Reconciled):
             self.connection.flush()
 
     def take(self, arrived: list[Arrived]) -> list[Output]:
-        """Decide on what came for the core and account for what came of it; before ARM nothing is the core's."""
+        """Decide on what came for the core and account for what came of it; the core takes nothing from a connection that was not armed."""
         outputs: list[Output] = []
         for arrival_ns, what in arrived if self.connection is self.armed else ():
             if isinstance(what, Messages):
