@@ -33,7 +33,7 @@ from .twin import AT_ONCE, Streamed, unlike, unlike_rows
 
 MODES = ("sequential", "parallel", "device-driven", "host-driven", *KINDS)
 CORE_TYPES = STREAM_TYPES | {MessageType.STATUS}
-FATES = ("lost", "damaged", "twice", "held", "foreign", "excluded")
+FATES = ("lost", "damaged", "twice", "changed", "held", "foreign", "excluded")
 Head = tuple[int, int, int, int, int, int]  # of a block, in the order of the fields
 CYCLES = (1, 1, 1, 2)
 SHORT = 2  # times as many of frames of all channels, whose cycles hold a block or two
@@ -208,6 +208,8 @@ class Streams:
                 message = self._excluded(message)
             if fate != "lost":
                 sent += [message] * (2 if fate == "twice" else 1)
+            if fate == "changed":  # once more, not the same
+                sent.append(self._excluded(message))
             if fate == "held" and len(sent) > 1:
                 sent[-1], sent[-2] = sent[-2], sent[-1]
         return sent

@@ -52,6 +52,7 @@ def _run(args: argparse.Namespace) -> int:
         "sha256": found.sha256,
         "recorded_sha256": recording.decisions_sha256,
         **_agreement(recording, found),
+        "contradictions": found.contradictions,
         **_figures(found),
     }
     if pictures is not None and args.pictures:
@@ -72,7 +73,7 @@ def _run_parts(args: argparse.Namespace) -> int:
     for path in parts_in(args.recording):
         recording, found = _replayed(args, path)
         facts = {"part": path.name, "decisions": found.decisions, "sha256": found.sha256}
-        rows.append(facts | _agreement(recording, found) | _figures(found))
+        rows.append(facts | _agreement(recording, found) | {"contradictions": found.contradictions} | _figures(found))
         lines += [f"{path.name}: {found.decisions} decisions: {_agreement_words(recording, found)}", *_words(found)]
     identical = all(row["identical"] for row in rows)
     payload = {"decisions": sum(row["decisions"] for row in rows), "identical": identical, "parts": rows}

@@ -93,12 +93,14 @@ class BulkSteps:
         self._state[kernels.PERIOD_TICKS], self._state[kernels.CYCLE_TICKS] = plan.slot_period_ticks, plan.cycle_ticks
         self._state[kernels.N_CLASSES] = core.n_classes
         self._state[kernels.KIND] = _KINDS[plan.mode]
+        out = self._rows, self._counts, self._numbered
+        self._walk = WalkArrays(self._state, self._marks, self._windows, self.tables, *out, core.tracker.heard)
 
     @property
     def walk(self) -> WalkArrays:
         """What a kernel continues between `load` and `store`."""
         made = FrameWalkArrays if self._state[kernels.KIND] == place.FRAMES else WalkArrays
-        return made(self._state, self._marks, self._windows, self.tables, self._rows, self._counts, self._numbered)
+        return made(*self._walk)
 
     @property
     def decides(self) -> bool:
@@ -144,18 +146,7 @@ class BulkSteps:
         self.load()
         ended = kernels.ODD
         if self.core.tracker.open:
-            buffer, spans = messages
-            ended = kernels.walk_messages(
-                buffer,
-                spans,
-                state,
-                self._marks,
-                self._windows,
-                self.tables,
-                self._rows,
-                self._counts,
-                self._numbered,
-            )
+            ended = kernels.walk_messages(*messages, self._walk)
         self.store()
         return int(state[kernels.MESSAGE]), self.labelled(int(state[kernels.N_ROWS])), ended == kernels.ODD
 

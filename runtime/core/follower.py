@@ -7,6 +7,7 @@ Owns one stream from ARM to its end and what is remembered of it; never decides:
 from __future__ import annotations
 
 import math
+from base64 import b64decode, b64encode
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from pans.runtime.wire.messages import (
     Status,
     decode_status,
 )
-from pans.runtime.wire.tracker import StreamTracker
+from pans.runtime.wire.tracker import MEMORY_BYTES, StreamTracker
 
 from .decision import BeyondPlan, CoreEvent, Output, StreamEndUnknown, joined
 from .plan import Plan
@@ -46,12 +47,14 @@ class Place:
     abstained: int
     last_tick: int
     core: dict[str, Any]
+    heard: bytes = b""  # StreamTracker.memory; b"" in recordings that were made without
 
     def facts(self) -> dict[str, Any]:
         """Return it as it stands at the beginning of a part of a recording; JSON has no NaN."""
         marks = [[*mark[:5], None if math.isnan(mark.photons) else mark.photons, *mark[6:]] for mark in self.marks]
         numbers = {"decisions": self.decisions, "abstained": self.abstained, "last_tick": self.last_tick}
-        return {"tracker": list(self.tracker), "marks": marks, **numbers, "core": self.core}
+        heard = b64encode(self.heard).decode()
+        return {"tracker": list(self.tracker), "marks": marks, **numbers, "core": self.core, "heard": heard}
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Place:
@@ -60,7 +63,10 @@ class Place:
             Mark._make([*mark[:5], math.nan if mark[5] is None else mark[5], *mark[6:]]) for mark in facts["marks"]
         )
         decisions, abstained, last_tick = (int(facts[name]) for name in ("decisions", "abstained", "last_tick"))
-        return cls(tuple(facts["tracker"]), marks, decisions, abstained, last_tick, facts["core"])
+        heard = b64decode(facts.get("heard", ""), validate=True)
+        if len(heard) not in (0, MEMORY_BYTES):
+            raise ValueError(f"heard has {len(heard)} bytes, expected {MEMORY_BYTES}")
+        return cls(tuple(facts["tracker"]), marks, decisions, abstained, last_tick, facts["core"], heard)
 
 
 class Follower:
@@ -144,11 +150,12 @@ class Follower:
         for number in list(self.marks)[:-PART_MARKS]:
             del self.marks[number]
         marks = tuple(self.marks.values())
-        return Place(self.tracker.position, marks, self.n_decisions, self.n_abstained, self.last_tick, own)
+        numbers = self.n_decisions, self.n_abstained, self.last_tick
+        return Place(self.tracker.position, marks, *numbers, own, self.tracker.memory)
 
     def resume(self, place: Place) -> None:
         """Go on from the place that `part` returned, right after `begin`."""
-        self.tracker.resume(place.tracker)
+        self.tracker.resume(place.tracker, place.heard)
         for mark in place.marks:
             self.remember(mark)
         self.n_decisions, self.n_abstained, self.last_tick = place.decisions, place.abstained, place.last_tick
@@ -198,7 +205,8 @@ class Follower:
         unexplained = self.tracker.counters.unexplained_drops
         message, gap = self.tracker.accept(frame)
         if message is None:
-            return Output([], [], None)
+            differs = self.tracker.differs
+            return Output([], [] if differs is None else [self._contradicts(Contradiction("repeat", *differs))], None)
         if isinstance(message, Mark):
             return self._take_mark(message)
         events: list[CoreEvent] = [] if gap is None else [gap]

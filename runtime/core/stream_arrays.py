@@ -74,7 +74,8 @@ class Block(NamedTuple):
 class WalkArrays(NamedTuple):
     """What `take_message` continues: state int64 (N_STATE,), marks, windows, tables, rows DECISION_DTYPE (m,), counts int64 (m, d_f).
 
-    Where `numbered` has room, decisions go there, and `rows` is only as long.
+    Where `numbered` has room, decisions go there, and `rows` is only as long. `heard` is StreamTracker's: whoever calls `take_message`
+    fills it.
     """
 
     state: npt.NDArray[np.int64]
@@ -84,6 +85,7 @@ class WalkArrays(NamedTuple):
     rows: npt.NDArray[np.void]
     counts: npt.NDArray[np.int64]
     numbered: NumberArrays
+    heard: npt.NDArray[np.int64]
 
 
 class FrameWalkArrays(WalkArrays):

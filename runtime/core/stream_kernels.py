@@ -49,14 +49,13 @@ _NO_LABEL, _NO_OBJECT, _UNKNOWN = NO_LABEL, NO_OBJECT, UNKNOWN_TRUTH
 
 
 @outer
-def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out, numbered):  # type: ignore[no-untyped-def]
+def walk_messages(buffer, spans, walk):  # type: ignore[no-untyped-def]
     """Take messages from state[MESSAGE] on until all are done, the rows are full, or one is not ordinary; say which.
 
-    Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), state int64 (N_STATE,), marks MarkArrays, windows
-    WindowArrays, tables DecisionTables, rows DECISION_DTYPE (m,), counts_out int64 (m, d_f), numbered NumberArrays.
+    Behind the state[STEPS]-th block all are done, too. buffer uint8, spans int64 (n, 2), walk WalkArrays.
     """
-    marks, windows, tables, numbered = bare(marks), bare(windows), bare(tables), bare(numbered)
-    buffer, state, rows, counts_out = bare(buffer), bare(state), bare(rows), bare(counts_out)
+    buffer, walk = bare(buffer), bare(walk)
+    state, marks, windows, tables, rows, counts_out, numbered, heard = walk
     blocks = 0
     while state[MESSAGE] < spans.shape[0]:
         if state[STEPS] and blocks == state[STEPS]:
@@ -69,6 +68,7 @@ def walk_messages(buffer, spans, state, marks, windows, tables, rows, counts_out
         took = take_message(buffer, start, stop, state, marks, windows, tables, rows, counts_out, numbered)
         if took in (ODD, ROWS_FULL):
             return took
+        stream.hear(buffer, start, stop, heard, state)
         blocks += took == TOOK_BLOCK
         state[MESSAGE] += 1
     return ALL_DONE
@@ -120,8 +120,12 @@ def take_clicks(buffer, start, stop, state, marks, windows, tables, rows, counts
 
 @inner
 def _is_ours(buffer, start, stop, state):  # type: ignore[no-untyped-def]
-    """Whether a message has a header, of the session that is followed."""
-    return stop >= start + _U(stream.BODY_HEADER) and load4(buffer, start + _U(4)) == _U(state[SESSION])
+    """Whether a message has a plain header, of the session that is followed."""
+    return (
+        stop >= start + _U(stream.BODY_HEADER)
+        and stream.is_plain(buffer, start)
+        and load4(buffer, start + _U(4)) == _U(state[SESSION])
+    )
 
 
 @inner

@@ -39,7 +39,7 @@ class FlowWalk(NamedTuple):
     ambiguous; `gated` uint8 (classes,): of which a pulse is asked. Decisions stand in `rows`, DECISION_DTYPE (m,), in the same place
     their passages int64 (m, 5), in the order of `core.decision.Passage`, and the clicks of their windows int64 (m, d_f). What the empty
     field gave stands in `empty` int64 (k, 2 + d_f), by its number modulo k: the exposure behind the block, empty frames, clicks of
-    each channel, since the run began.
+    each channel, since the run began. `heard` is StreamTracker's.
     """
 
     state: npt.NDArray[np.int64]
@@ -54,3 +54,4 @@ class FlowWalk(NamedTuple):
     counts: npt.NDArray[np.int64]
     empty: npt.NDArray[np.int64]
     edges: npt.NDArray[np.int64]
+    heard: npt.NDArray[np.int64]

@@ -232,10 +232,8 @@ class FlowCore(Follower):
         facts[: stream.MESSAGES] = (*self.tracker.position, min(self.end_exposure, 1 << 62))
         facts[columns.START_TICK], facts[columns.WATCH_AT] = self.start_tick, watch_at
         facts[columns.JITTER_TICKS] = self.jitter_ticks
-        buffer, spans = messages
-        taken = walking.walk(
-            buffer, spans, place, facts, self._slot_offsets, self.arrays, self._channel_mask, self._new
-        )
+        shape = self._slot_offsets, self.arrays, self._channel_mask
+        taken = walking.walk(messages, place, facts, *shape, self._new, self.tracker.heard)
         return int(taken)
 
     def watch_empty(self, guard: DarkGuard, empty_frames: int, empty_channels: I64) -> list[Finding]:

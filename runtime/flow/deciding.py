@@ -47,6 +47,8 @@ def take_message(walk, buffer, start, stop):  # type: ignore[no-untyped-def]
     state, flow = walk.state, walk.flow
     if stop < start + _U(stream.BODY_HEADER) or load4(buffer, start + _U(4)) != _U(state[core.SESSION]):
         return core.ODD
+    if not stream.is_plain(buffer, start):
+        return core.ODD
     payload = start + _U(stream.BODY_HEADER)
     if buffer[start] == stream.MARK:
         if not walking.mark_fits(buffer, payload, stop, state):

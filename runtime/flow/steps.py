@@ -64,6 +64,7 @@ class FlowSteps:
             np.full((n_rows, n), 0, np.int64),
             np.full((MOST_BLOCKS, 2 + n), 0, np.int64),
             np.zeros(N_EDGES, np.int64),
+            core.tracker.heard,
         )
         self.walk.state[columns.FRAMES] = core.frames
         self._told = 0  # of walk.empty

@@ -36,25 +36,30 @@ def facts_of(plan: Plan, n_classes: int, dark_cycle: int) -> npt.NDArray[np.int6
 
 
 @outer
-def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type: ignore[no-untyped-def]
+def walk(messages, place, facts, slot_offsets, flow, mask, marks, heard):  # type: ignore[no-untyped-def]
     """Take messages from `place` on; return how many, 0 when that one is not ordinary.
 
-    buffer uint8, spans int64 (n, 2), facts int64 (columns.N_FACTS,), slot_offsets int64 (slots of a cycle,) in ticks, flow FlowArrays, mask
-    uint64 of the channels. `marks` NewMarks are filled; when they are full the call ends. Without limits every block ends it, else it
-    ends behind the first block with passages (facts[PASSAGES] of them) and when facts[WATCH_AT] empty frames have been seen.
+    messages Messages, facts int64 (columns.N_FACTS,), slot_offsets int64 (slots of a cycle,) in ticks, flow FlowArrays, mask
+    uint64 of the channels, heard StreamTracker's. `marks` NewMarks are filled; when they are full the call ends. Without limits every
+    block ends it, else it ends behind the first block with passages (facts[PASSAGES] of them) and when facts[WATCH_AT] empty frames have
+    been seen.
     """
+    buffer, spans = messages
     words, counts, limits, state = flow.words, flow.counts, flow.limits, flow.state
     facts[stream.MESSAGES] = facts[stream.EXPOSURES] = facts[columns.MARKS] = facts[columns.PASSAGES] = 0
     at = place
     while at < spans.shape[0]:
         start, stop = _U(spans[at, 0]), _U(spans[at, 1])
         payload = start + _U(stream.BODY_HEADER)
+        if not stream.is_plain(buffer, start):
+            break
         if buffer[start] == stream.MARK:
             if facts[columns.MARKS] == marks.photons.size or not mark_fits(buffer, payload, stop, facts):
                 break
             _take_mark(buffer, payload, marks, facts[columns.MARKS])
             facts[columns.MARKS] += 1
             stream.go_on(facts, 0)
+            stream.hear(buffer, start, stop, heard, facts)
             at += 1
             continue
         if buffer[start] != stream.FRAMES:
@@ -63,6 +68,7 @@ def walk(buffer, spans, place, facts, slot_offsets, flow, mask, marks):  # type:
         count = take_frames(buffer, payload, stop, facts, slot_offsets, flow, mask)
         if count == 0:
             break
+        stream.hear(buffer, start, stop, heard, facts)
         at += 1
         if not limits.size:
             break

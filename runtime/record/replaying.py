@@ -89,6 +89,8 @@ class ClickLog:
 class Replayed(NamedTuple):
     """What a replay gave: how many decisions, the SHA-256 of their log, what those about passing objects were worth, the agreement.
 
+    `contradictions` are those of the stream with the plan and with itself, by what is wrong, as the core counted them in the run.
+
     `as_recorded`: every recorded decision was made again, bit for bit, and, where the recording has its end, no other one. A
     recording that was cut off may hold messages of decisions that it has lost: there may be more than the `recorded` ones.
     """
@@ -98,6 +100,7 @@ class Replayed(NamedTuple):
     passages: PassageFigures | None
     recorded: int
     as_recorded: bool
+    contradictions: dict[str, int]
 
     @property
     def more(self) -> int:
@@ -108,12 +111,13 @@ class Replayed(NamedTuple):
 def replay(recording: Recording, bundle: Bundle, pictures: ClickLog | None = None) -> Replayed:
     """Decide `recording` again with `bundle`; `pictures`, or another log, collects what the back end is asked."""
     if never_armed(recording):
-        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True)
+        return Replayed(0, recording.decisions_sha256, None, 0, as_recorded=True, contradictions={})
     core, log = _replayed(recording, bundle, pictures)
     passages = replayed_figures(core, recording.events()) if isinstance(core, FlowCore) else None
     sha256 = log.sha256()
     same = sha256 if recording.complete else log.sha256_as_far
-    return Replayed(log.decisions, sha256, passages, recording.n_decisions, same == recording.decisions_sha256)
+    agrees, told = same == recording.decisions_sha256, dict(core.contradictions)
+    return Replayed(log.decisions, sha256, passages, recording.n_decisions, agrees, told)
 
 
 class _Log:

@@ -37,8 +37,8 @@ def taking(kind: Any) -> tuple[Any, tuple[str, ...]]:
 
         return take_flow, ()
     if kind is FrameWalkArrays:
-        return core.take_frames, WalkArrays._fields
-    return core.take_clicks, WalkArrays._fields[:-1]  # exposures of one detector are not numbered
+        return core.take_frames, WalkArrays._fields[:-1]  # who calls it notes what was heard
+    return core.take_clicks, WalkArrays._fields[:-2]  # exposures of one detector are not numbered
 
 
 def answering(kind: Any) -> tuple[Any, tuple[str, ...]]:

@@ -6,13 +6,14 @@ framing.py and bulk.py do.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .schema import HEADER, MalformedMessage
+from .schema import HEADER, SCHEMA, MalformedMessage
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -37,6 +38,11 @@ def unpack_body(body: bytes) -> Frame:
         raise MalformedMessage(f"a message has {len(body)} bytes, at least {HEADER.size} expected")
     message_type, flags, _, session = HEADER.unpack_from(body)
     return Frame(message_type, flags, session, body[HEADER.size :])
+
+
+def content_crc(frame: Frame) -> int:
+    """Return the CRC-32 that a stream frame has on the wire with flags and reserved bits 0: those are ignored (rule 1.10)."""
+    return zlib.crc32(frame.payload, zlib.crc32(HEADER.pack(frame.type, 0, 0, frame.session), SCHEMA))
 
 
 class Messages(NamedTuple):

@@ -10,8 +10,9 @@ import numpy as np
 
 from .bare import as_float32, load4, load8
 from .inner import inner
-from .schema import BLOCK_HEADER_BYTES, HEADER, STRUCTS, MessageType
-from .tracker import MAX_GAP_EXPOSURES
+from .kernels import crc32_span
+from .schema import BLOCK_HEADER_BYTES, HEADER, SCHEMA, STRUCTS, MessageType
+from .tracker import MAX_GAP_EXPOSURES, RECEIVE_WINDOW
 
 # Where the stream stands, the first columns of a walk's state, int64: as StreamTracker knows it, the exposure at which the plan ends,
 # and what the walk has taken.
@@ -22,6 +23,7 @@ LARGEST = np.uint64(1 << 62)  # ticks and exposure numbers beyond are left to Py
 _INFINITE = np.uint64(0x7F800000)  # float32's bits: numbers from 0 on lie below, NaN above once the sign is taken away
 _MAGNITUDE = np.uint64(0x7FFFFFFF)
 _U = np.uint64
+_SCHEMA, _WINDOW = np.int64(SCHEMA), RECEIVE_WINDOW
 
 
 @inner
@@ -106,6 +108,26 @@ def go_on(place, count):  # type: ignore[no-untyped-def]
     place[MESSAGES] += 1
     place[NEXT_EXPOSURE] += count
     place[EXPOSURES] += count
+
+
+@inner
+def is_plain(buffer, start):  # type: ignore[no-untyped-def]
+    """Whether flags and reserved bits of the body at `start` are 0, so that its CRC-32 is that of its content (frame.content_crc)."""
+    return load4(buffer, start) <= _U(0xFF)
+
+
+@inner
+def note_heard(heard, place, crc):  # type: ignore[no-untyped-def]
+    """Remember the CRC-32 of the message that `go_on` has accounted for last; `heard` is StreamTracker's."""
+    number = (place[NEXT_SEQ] - 1) & 0xFFFFFFFF
+    row = heard[number % _WINDOW]
+    row[0], row[1] = number, np.int64(crc)
+
+
+@inner
+def hear(buffer, start, stop, heard, place):  # type: ignore[no-untyped-def]
+    """As `note_heard`, of the body from `start` to `stop`, behind which its CRC need not stand (in a recording)."""
+    note_heard(heard, place, crc32_span(buffer, start, stop, _SCHEMA))
 
 
 @inner

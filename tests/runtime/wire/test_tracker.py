@@ -65,6 +65,66 @@ def test_repeated_and_overtaken_messages_are_dropped() -> None:
     assert tracker.accept(clicks(3, 12, 4))[1] is None
 
 
+def changed(frame: Frame) -> Frame:
+    return frame._replace(payload=frame.payload[:-1] + bytes([frame.payload[-1] ^ 1]))
+
+
+@pytest.mark.parametrize("first", [0, 2**32 - 3])
+def test_a_repeat_with_another_content_differs_from_what_was_taken(first: int) -> None:
+    tracker = StreamTracker()
+    tracker.next_seq = first
+    frames = [clicks(first + n, 4 * n, 4) for n in range(6)]
+    for frame in frames:
+        assert tracker.accept(frame)[0] is not None
+        assert tracker.differs is None
+    for frame in frames:
+        assert tracker.accept(frame._replace(flags=5)) == (None, None)  # flags are ignored
+        assert tracker.differs is None
+    assert tracker.counters.repeats_differing == 0
+    for n, frame in enumerate(frames):
+        assert tracker.accept(changed(frame)) == (None, None)
+        assert tracker.differs is not None
+        assert tracker.differs.exposure_index == 4 * n
+        assert tracker.differs.found != tracker.differs.expected
+    counters = tracker.counters
+    assert (counters.messages, counters.repeated, counters.repeats_differing) == (6, 12, 6)
+
+
+def test_what_was_lost_or_is_older_than_the_window_cannot_be_compared() -> None:
+    tracker = StreamTracker()
+    for seq in range(1, 4100):  # 0 is lost; of 1 to 3 the places have been taken by later messages
+        tracker.accept(clicks(seq, seq, 1))
+    for seq in range(4):
+        tracker.accept(changed(clicks(seq, seq, 1)))
+    assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (4, 0)
+    tracker.accept(changed(clicks(4, 4, 1)))
+    assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (4, 1)
+
+
+def test_another_stream_has_other_messages_under_the_same_numbers() -> None:
+    tracker = StreamTracker()
+    tracker.accept(clicks(0, 0, 4))
+    tracker.restart()
+    tracker.finish(0, 0)
+    tracker.accept(changed(clicks(0, 0, 4)))
+    assert (tracker.counters.repeats_unchecked, tracker.counters.repeats_differing) == (1, 0)
+
+
+@pytest.mark.parametrize("first", [0, 2**32 - 3])
+def test_the_memory_goes_on_in_another_tracker(first: int) -> None:
+    one, other = StreamTracker(), StreamTracker()
+    one.next_seq = first
+    for n in (0, 1, 3, 4):
+        one.accept(clicks(first + n, n, 1))
+    other.resume(one.position, one.memory)
+    for n in range(5):
+        for tracker in (one, other):
+            tracker.accept(changed(clicks(first + n, n, 1)))
+        assert one.differs == other.differs
+        assert (one.differs is None) == (n == 2)
+    assert other.counters.repeats_unchecked == 1
+
+
 def test_sequence_and_drop_counters_wrap() -> None:
     tracker = StreamTracker()
     tracker.next_seq = 2**32 - 1

@@ -1,0 +1,153 @@
+"""Messages that come twice: equal ones change nothing, another content under the same number is a contradiction, whichever came first."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from bundles import made_bundle
+from commands import json_of
+
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.firmware_sim.trials import fault_grid
+from pans.runtime.bundle.model import write_bundle
+from pans.runtime.flow.core import FlowCore
+from pans.runtime.live import Observers, RunConfig, RunResult, run_live
+from pans.runtime.live.config import COMPILED, PYTHON
+from pans.runtime.live.flow_run import FlowRun
+from pans.runtime.record import Recorder, Recording, read_recording, replay
+from pans.runtime.report.summary import contradictions_of, find_faults
+from pans.runtime.turn.system import offered
+from pans.runtime.wire.framing import FrameDecoder, encode_frame
+from pans.runtime.wire.messages import MessageType
+from pans.runtime.wire.session import STREAM_TYPES
+
+FRAMES = 150  # stream messages of a session
+MOST_LATER = 40  # messages between the two
+CLEAN, EQUAL, CHANGED_FIRST, CHANGED_LATER, MIXED = range(5)  # what comes twice in a session
+HOW = ("clean", "equal", "changed first", "changed later", "mixed")
+
+
+class Repeats:
+    """Some of a device's stream messages twice, at once or up to MOST_LATER messages later; `changed` counts those of another content."""
+
+    def __init__(self, how: int, seed: int, often: float) -> None:
+        self.equal = self.changed = 0
+        self._how, self._often, self._dice = how, often, random.Random(seed)
+        self._later: list[list[Any]] = []  # messages to pass, frame
+
+    def spoil(self, sent: bytes) -> bytes:
+        return b"".join(self._twice(piece + b"\0") for piece in sent.split(b"\0")[:-1])
+
+    def _twice(self, message: bytes) -> bytes:
+        dice, frame = self._dice, FrameDecoder().feed(message)[0]
+        if frame.type not in STREAM_TYPES:
+            return message
+        out, rest = message, []
+        for held in self._later:
+            held[0] -= 1
+            if held[0] <= 0:
+                out += held[1]
+            else:
+                rest.append(held)
+        self._later = rest
+        how = dice.choice((EQUAL, CHANGED_FIRST, CHANGED_LATER)) if self._how == MIXED else self._how
+        if how == CLEAN or dice.random() >= self._often:
+            return out
+        if how == EQUAL:
+            self.equal += 1
+        else:
+            self.changed += 1
+        if how == CHANGED_FIRST:
+            return self._change(frame) + out
+        again = message if how == EQUAL else self._change(frame)
+        if how == EQUAL and dice.random() < 0.5:
+            self._later.append([dice.randint(1, MOST_LATER), again])
+            return out
+        return out + again
+
+    def _change(self, frame: Any) -> bytes:
+        """The same number (the first four bytes), one bit of what follows another: clicks, where there are some."""
+        payload = bytearray(frame.payload)
+        first = 4 if frame.type == MessageType.MARK or self._dice.random() < 0.3 else 36
+        payload[self._dice.randrange(first, len(payload))] ^= 1 << self._dice.randrange(8)
+        return encode_frame(frame.type, bytes(payload), frame.session)
+
+
+class Repeating(Instrument):
+    """An instrument whose messages `repeats` spoils."""
+
+    repeats: Repeats
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        return self.repeats.spoil(super().step(tick, data))
+
+
+def session(path: Path, mode: str, turn: str, how: int, seed: int, often: float) -> tuple[RunResult, Recording, Repeats]:
+    one, (result, repeats) = fault_grid.Case.of(mode, FRAMES), (None, Repeats(how, seed, often))
+    clock = DeviceClock(one.profile.clock.tick_hz)
+    device = Repeating(one.profile, one.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
+    device.repeats = repeats
+    flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
+    config = RunConfig(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=turn)
+    header = fault_grid._recorded(one, {} if flow is None else {"flow": flow.header()})
+    observers = Observers(prepared=lambda run: None if flow is None else flow.prepared(run))
+    with Recorder(path, {"config": header}, overwrite=True) as recorder:
+        link = VirtualLink(device, clock, "sim:repeats")
+        result = run_live(link, one.profile, one.bundle, one.plan, one.core, config, recorder, None, observers)
+        recorder.close({})
+    recording = read_recording(path)
+    again = replay(recording, one.bundle)
+    assert again.as_recorded
+    told = {what: count for what, count in result.contradictions.items() if what != "future_tick"}  # no clock in a replay
+    assert again.contradictions == told
+    events = [event["what"] for event in recording.events() if event["kind"] == "contradiction"]
+    assert events.count("repeat") == told.get("repeat", 0) == result.stream["repeats_differing"]
+    return result, recording, repeats
+
+
+def wrong_verdicts(folder: Path, sessions: int, monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[int]]:
+    """Run so many sessions; return those whose verdict is wrong, and how many were of each kind of HOW."""
+    wrong, kinds = [], [0] * len(HOW)
+    monkeypatch.setattr("pans.runtime.link.connection.secrets", SimpleNamespace(randbelow=random.Random(1).randrange))
+    modes = fault_grid.MODES
+    for number in range(sessions):
+        mode, turn = modes[number % len(modes)], (PYTHON, COMPILED)[number // len(modes) % 2]
+        if turn == COMPILED and (mode.startswith("host") or mode.endswith(("counts", "detectors"))):
+            turn = PYTHON  # there is no compiled turn of these in virtual time
+        dice = random.Random(number)
+        how, often = dice.randrange(1, len(HOW)), dice.choice((0.01, 0.1, 1.0))
+        result, recording, repeats = session(folder / "run.pansrec", mode, turn, how, number, often)
+        clean, undisturbed, _ = session(folder / "clean.pansrec", mode, turn, CLEAN, number, 0.0)
+        kinds[how if repeats.changed or how == EQUAL else EQUAL] += 1
+        assert (result.turn.taken, result.ended) == (turn, "completed")
+        faults = [words for words in find_faults(result, 0, aborts_are_faults=False) if "contradict" in words]
+        same = recording.decisions().tobytes() == undisturbed.decisions().tobytes()
+        told = contradictions_of(result)
+        verdict = (bool(faults), bool(told)) == (bool(repeats.changed),) * 2 and not contradictions_of(clean)
+        labels = same or (repeats.changed and how in (CHANGED_FIRST, MIXED))
+        counted = repeats.changed or result.stream["repeated"] <= repeats.equal
+        if not (verdict and labels and counted):
+            wrong.append(f"{number}: {mode}, {turn}, {HOW[how]}, {repeats.changed} changed: {told}, same {same}")
+    return wrong, kinds
+
+
+@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
+def test_no_session_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong, kinds = wrong_verdicts(tmp_path, 48, monkeypatch)
+    assert wrong == []
+    assert min(kinds[1:]) > 4
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
+def test_no_session_of_many_is_judged_wrongly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong, kinds = wrong_verdicts(tmp_path, 200, monkeypatch)
+    assert wrong == []
+    assert min(kinds[1:]) > 20
