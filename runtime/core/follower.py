@@ -174,6 +174,10 @@ class Follower:
         self.start_tick, self.end_exposure = start_tick, self._exposures_of(n_cycles)
         return output
 
+    def begin_later(self, start_tick: int) -> None:
+        """The ARM of the stream that was begun was refused, so that nothing of it came, and another one starts it."""
+        self.start_tick, self._status, self._told_end = start_tick, None, None
+
     def end(self) -> Output:
         """End the stream: report what the device says that it exposed and never came, or that this is not known."""
         if not self._begun or self.completed:

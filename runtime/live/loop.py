@@ -37,6 +37,7 @@ from pans.runtime.timing.cpu import busy_core
 from pans.runtime.timing.ledger import arm_realtime
 from pans.runtime.timing.page_faults import ThreadCounts
 from pans.runtime.turn.eligible import excluded
+from pans.runtime.wire.session import ArmTooLate
 
 from .compiled import CompiledTurns
 from .config import AUTO, COMPILED, PYTHON, RunConfig, RunResult, TurnChoice, Turns
@@ -226,6 +227,8 @@ def _until_ended(
         except LinkError as error:
             stop.polled = False
             run.halt()
+            if isinstance(error, ArmTooLate) and run.arm_later():
+                continue
             if isinstance(error, DeviceError) and refusals.again(run, error):
                 run.ended = f"{REFUSED}{error.message}"
             elif recovery is None:

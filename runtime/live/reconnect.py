@@ -21,6 +21,7 @@ from .run import LiveRun
 NS_PER_MS = 1_000_000
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
+MOST_FRUITLESS = 8  # reconnections in a row without one decision in between
 
 
 def pauses_s(first_s: float = FIRST_PAUSE_S, longest_s: float = LONGEST_PAUSE_S) -> Iterator[float]:
@@ -84,14 +85,17 @@ def reconnect(
 
 
 class Refusals:
-    """What the device refused last. The same refusal without progress in between ends a run: asking again would change nothing."""
+    """What the device refused last. The same refusal without progress in between ends a run: asking again would change nothing.
+
+    Refusals are the same that differ in numbers alone: ids of commands, ticks.
+    """
 
     def __init__(self) -> None:
         self._latest: tuple[str | int, ...] = ()
 
     def again(self, run: LiveRun, error: DeviceError) -> bool:
         """Whether the device has refused the same since the run last made progress."""
-        words = re.sub(r"command \d+", "command", error.message)
+        words = re.sub(r"\d+", "0", error.message)
         now = (words, run.core.tracker.counters.exposures, run.tally.decisions)
         again, self._latest = now == self._latest, now
         return again
@@ -100,6 +104,10 @@ class Refusals:
 def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: Callable[[Link], Connection]) -> None:
     """Find the device again and arm it for what is left of the run, or end the run because that failed."""
     run.take_rest()
+    if run.is_fruitless(MOST_FRUITLESS):
+        words = f"lost {MOST_FRUITLESS + 1} times in a row without one whole decision in between"
+        run.lose_link(LinkError(f"the device was {words}; the last time: {error.message}"))
+        return
     now_ns = run.now_ns()
     run.outage_ns = now_ns if run.outage_ns is None else run.outage_ns
     run.journal.note("link_lost", reason=error.message)

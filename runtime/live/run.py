@@ -41,6 +41,7 @@ PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this 
 RECEIVE_WINDOW = 4096  # stream messages
 FLUSH_EVERY_NS = 500 * NS_PER_MS
 POLL_S = 0.02
+LONGEST_LEAD_NS = 32 * ARM_LEAD_NS  # five refusals, each twice as far ahead
 STOP_GIVE_UP_NS = 1 * NS_PER_S
 UNHEARD_NS = 2_500 * NS_PER_MS  # without any frame: STATUS alone comes every second
 SILENCE_NS = 5 * NS_PER_S  # without clicks
@@ -93,6 +94,8 @@ class LiveRun(Reconciled):
         self.compiled: Turns | None = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
+        self._fruitless = self._decided = 0
+        self._lead_ns = ARM_LEAD_NS  # of a start before its first exposure; a host that is too slow for it learns
         self._probe_due_ns = self._flush_due_ns = self._lease_due_ns = self._granted_until = 0
         self._over_ns = 0  # when the plan has long been done
 
@@ -125,27 +128,47 @@ class LiveRun(Reconciled):
         if self.compiled is not None:
             self.compiled.attach()
         self.taken_here, self.armed = self.connection.delivered, self.connection
+        now_ns, start_tick = self._start()
+        self.settle(self.core.begin(start_tick, n_cycles))
+        self._send_arm(now_ns, Arm(start_tick, n_cycles, self.config.lease_ms))
+
+    def arm_later(self) -> bool:
+        """ARM came too late: ask for a start twice as far ahead, in the same session; False where that has been done often enough."""
+        if self._lead_ns >= LONGEST_LEAD_NS:
+            return False
+        self._lead_ns *= 2
+        self.journal.note("armed_too_late", lead_ms=self._lead_ns // NS_PER_MS)
+        n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
+        now_ns, start_tick = self._start()
+        self.core.begin_later(start_tick)
+        self._send_arm(now_ns, Arm(start_tick, n_cycles, self.config.lease_ms))
+        return True
+
+    def _start(self) -> tuple[int, int]:
+        """Return the time, and the tick at which exposures that are asked for now can begin."""
         now_ns = self.now_ns()
-        start_tick = self.connection.known_clock().to_tick(now_ns + ARM_LEAD_NS)
+        start_tick = self.connection.known_clock().to_tick(now_ns + self._lead_ns)
         if not 0 <= start_tick <= LARGEST_TICK:
             raise DeviceError(
                 f"the device's clock says that it is tick {start_tick}, allowed 0 to {LARGEST_TICK}",
                 remedy="restart the device, so that its counter begins anew",
             )
-        self.lateness.attach(self.connection, now_ns + ARM_LEAD_NS)
-        self.settle(self.core.begin(start_tick, n_cycles))
-        arm = Arm(start_tick, n_cycles, self.config.lease_ms)
+        return now_ns, start_tick
+
+    def _send_arm(self, now_ns: int, arm: Arm) -> None:
+        start_ns = now_ns + self._lead_ns
+        self.lateness.attach(self.connection, start_ns)
         self.connection.session.submit(Opcode.ARM, pack_arm(arm))
         if self.driver is not None:
             self.driver.begin(self.connection)
         if isinstance(self.recorder, PartedRecorder):
             self._setup = repeated_setup(self.plan, arm, self.connection.session.nonce)
-        self.last_data_ns = now_ns + ARM_LEAD_NS
-        planned_ns = round((n_cycles + 1) * self.plan.cycle_us * NS_PER_US)
-        self._over_ns = now_ns + ARM_LEAD_NS + planned_ns + SILENCE_NS if n_cycles else 1 << 63
+        self.last_data_ns = start_ns
+        planned_ns = round((arm.n_cycles + 1) * self.plan.cycle_us * NS_PER_US)
+        self._over_ns = start_ns + planned_ns + SILENCE_NS if arm.n_cycles else 1 << 63
         self._flush_due_ns = now_ns + FLUSH_EVERY_NS
         if not self.reconnects:
-            self.start_ns = now_ns + ARM_LEAD_NS
+            self.start_ns = start_ns
             self.armed_after_s = (time.perf_counter_ns() - self._started_ns) / NS_PER_S
         self._renew(now_ns)
 
@@ -178,6 +201,12 @@ class LiveRun(Reconciled):
     def _is_dark(self) -> bool:
         status = self.connection.session.status
         return status is not None and status.state in (DeviceState.IDLE, DeviceState.SAFE)
+
+    def is_fruitless(self, most: int) -> bool:
+        """Note that the device was lost; whether that is now more than `most` times in a row without one whole decision in between."""
+        decided = self.tally.decisions - self.tally.abstained + self.tally.unsure  # those given up do not count
+        self._fruitless, self._decided = (0 if decided > self._decided else self._fruitless) + 1, decided
+        return self._fruitless > most
 
     # -- acting --------------------------------------------------------------------------------------------------------
 

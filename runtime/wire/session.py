@@ -57,6 +57,10 @@ class Refusal(NamedTuple):
     opcode: int = Opcode.GATE
 
 
+class ArmTooLate(DeviceError):
+    """ARM came when its start had passed: the session goes on, and a later start may be asked for."""
+
+
 class HostSession:
     """One session with one device; `nonce` must be fresh (not 0) for each."""
 
@@ -305,4 +309,5 @@ class HostSession:
                 self.refusals.append(Refusal(acknowledged, status, text, allowed))
                 continue
             name = AckStatus(status).name if status in set(AckStatus) else str(status)
-            raise DeviceError(f"the device refused command {acknowledged} ({name}): {text}")
+            refused = ArmTooLate if status == AckStatus.TOO_LATE else DeviceError  # GATE and SHOW may be refused
+            raise refused(f"the device refused command {acknowledged} ({name}): {text}")

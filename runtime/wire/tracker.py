@@ -60,7 +60,9 @@ class StreamCounters:
     device_drops: int = 0
     repeated: int = 0
     repeats_differing: int = 0  # of another content than what came first under their number
-    repeats_unchecked: int = 0  # overtaken and reported lost, or more than RECEIVE_WINDOW numbers ago: nothing to compare with
+    repeats_unchecked: int = (
+        0  # overtaken and reported lost, or more than RECEIVE_WINDOW numbers ago: nothing to compare with
+    )
     malformed: int = 0
     unexplained_drops: int = 0  # messages whose drops do not agree with what is missing
 

@@ -17,10 +17,13 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
 from pans.runtime.live import Observers, Recovery, RunConfig, run_live
+from pans.runtime.live.reconnect import MOST_FRUITLESS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command
+from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command, encode_welcome
+from pans.runtime.wire.session import STREAM_TYPES
 
 CYCLES = 3000
+FEW = 400
 
 
 class Counted:
@@ -107,3 +110,110 @@ def test_what_comes_before_arm_is_no_part_of_the_run(tmp_path: Path, turn: str) 
     assert result.contradictions == {}
     recording = read_recording(path)
     assert replay(recording, bundle).as_recorded
+
+
+class SlowArm:
+    """An ordinary link on which each ARM takes `seconds` to arrive."""
+
+    def __init__(self, link: Any, seconds: float) -> None:
+        self.link, self._seconds, self.sent = link, seconds, 0
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.now_ns, self.close, self.read, self.pause = link.now_ns, link.close, link.read, link.pause
+        self._decoder = FrameDecoder()
+
+    def write(self, data: bytes) -> None:
+        commands = [frame for frame in self._decoder.feed(data) if frame.type == MessageType.COMMAND]
+        if any(decode_command(frame.payload).opcode == Opcode.ARM for frame in commands):
+            self.sent += 1
+            self.link.pause(self._seconds)
+        self.link.write(data)
+
+    def reopen(self) -> SlowArm:
+        self.link.reopen()
+        return self
+
+
+def recorded_run(path: Path, link: Any, mode: str, turn: str) -> tuple[Any, Any, Any]:
+    """A run of FEW cycles over `link`, with the usual way back: its result, its recording and a replay."""
+    profile, bundle, plan = small_setup(mode)
+    backend = "table" if bundle.automaton is None else "automaton"
+    core = Core(plan, make_decider(bundle, shots=1, backend=backend), 1, FEW)
+    config = RunConfig(n_cycles=FEW, deadline_us=1e9, realtime=False, turn=turn)
+    facts = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
+    with Recorder(path, {"config": facts}) as recorder:
+        result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, "", 60.0))
+        recorder.close({})
+    recording = read_recording(path)
+    return result, recording, replay(recording, bundle)
+
+
+def small_link(mode: str) -> VirtualLink:
+    profile, _, _ = small_setup(mode)
+    clock = DeviceClock(profile.clock.tick_hz)
+    scene = load_scene("uniform")
+    return VirtualLink(Instrument(profile, scene, seed=1, power_on_tick=clock.tick_at(START_NS)), clock, "sim:small")
+
+
+@pytest.mark.parametrize(
+    ("mode", "turn"),
+    [("sequential", "python"), ("sequential", "compiled"), ("parallel", "compiled"), ("host-driven", "python")],
+)
+def test_an_arm_that_comes_too_late_is_sent_again_with_a_longer_lead(tmp_path: Path, mode: str, turn: str) -> None:
+    link = SlowArm(small_link(mode), 0.25)
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, mode, turn)
+    assert (result.ended, result.reconnects, result.turn.taken, link.sent) == ("completed", 0, turn, 3)
+    assert (result.contradictions, result.stream["lost_exposures"], result.tally.abstained) == ({}, 0, 0)
+    events = list(recording.events())
+    assert [event["lead_ms"] for event in events if event["kind"] == "armed_too_late"] == [200, 400]
+    assert sum(event["kind"] == "session" for event in events) == 1
+    assert (again.as_recorded, again.decisions) == (True, result.tally.decisions)
+
+
+def test_a_host_that_is_always_too_late_ends_with_the_refusal(tmp_path: Path) -> None:
+    link = SlowArm(small_link("sequential"), 5.0)
+    result, _, _ = recorded_run(tmp_path / "run.pansrec", link, "sequential", "auto")
+    assert result.ended.startswith("the device refused") or "TOO_LATE" in result.ended
+    assert (result.tally.decisions, result.reconnects, link.sent) == (0, 1, 7)  # the last one in a new session
+
+
+class NewEpochs:
+    """An ordinary link to a device that restarts again and again: after each `most` messages it says WELCOME with another epoch."""
+
+    def __init__(self, link: Any, most: int) -> None:
+        self.link, self._most, self._left, self.opened = link, most, most, 1
+        self.name, self.simulated, self.virtual = link.name, link.simulated, link.virtual
+        self.now_ns, self.close, self.write, self.pause = link.now_ns, link.close, link.write, link.pause
+        self._decoder = FrameDecoder()
+
+    def read(self, timeout_s: float) -> bytes:
+        data = bytes(self.link.read(timeout_s))
+        frames = self._decoder.feed(data)
+        self._left -= sum(frame.type in STREAM_TYPES for frame in frames)
+        if self._left > 0:
+            return data
+        self._left = 1 << 30
+        return data + encode_welcome({"epoch": 1000 + self.opened}, frames[-1].session)
+
+    def reopen(self) -> NewEpochs:
+        self.link.reopen()
+        self._left, self.opened, self._decoder = self._most, self.opened + 1, FrameDecoder()
+        return self
+
+
+@pytest.mark.parametrize("turn", ["python", "compiled"])
+def test_a_device_that_always_restarts_is_given_up(tmp_path: Path, turn: str) -> None:
+    link = NewEpochs(small_link("sequential"), 2)  # a mark and a block, of an object that takes many
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", link, "sequential", turn)
+    assert (result.link_lost, result.reconnects, link.opened) == (True, MOST_FRUITLESS, MOST_FRUITLESS + 1)
+    assert f"lost {MOST_FRUITLESS + 1} times in a row without one whole decision" in result.ended
+    assert "restarted" in result.ended
+    assert (recording.complete, again.as_recorded) == (True, True)
+    assert result.stream["exposures"] > 0
+
+
+def test_a_device_that_restarts_between_decisions_is_not_given_up(tmp_path: Path) -> None:
+    link = NewEpochs(small_link("sequential"), 60)
+    result, _, again = recorded_run(tmp_path / "run.pansrec", link, "sequential", "python")
+    assert not result.link_lost
+    assert result.reconnects > 2 * MOST_FRUITLESS
+    assert again.as_recorded

@@ -89,7 +89,9 @@ class Repeating(Instrument):
         return self.repeats.spoil(super().step(tick, data))
 
 
-def session(path: Path, mode: str, turn: str, how: int, seed: int, often: float) -> tuple[RunResult, Recording, Repeats]:
+def session(
+    path: Path, mode: str, turn: str, how: int, seed: int, often: float
+) -> tuple[RunResult, Recording, Repeats]:
     one, (result, repeats) = fault_grid.Case.of(mode, FRAMES), (None, Repeats(how, seed, often))
     clock = DeviceClock(one.profile.clock.tick_hz)
     device = Repeating(one.profile, one.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
@@ -105,7 +107,9 @@ def session(path: Path, mode: str, turn: str, how: int, seed: int, often: float)
     recording = read_recording(path)
     again = replay(recording, one.bundle)
     assert again.as_recorded
-    told = {what: count for what, count in result.contradictions.items() if what != "future_tick"}  # no clock in a replay
+    told = {
+        what: count for what, count in result.contradictions.items() if what != "future_tick"
+    }  # no clock in a replay
     assert again.contradictions == told
     events = [event["what"] for event in recording.events() if event["kind"] == "contradiction"]
     assert events.count("repeat") == told.get("repeat", 0) == result.stream["repeats_differing"]
