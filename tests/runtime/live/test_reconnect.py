@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -10,16 +12,28 @@ import pytest
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
+from pans.firmware_sim.device.upload import Refused
+from pans.firmware_sim.ports.shell import open_port, serve
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.firmware_sim.scene.still import load_scene
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
+from pans.runtime.link.base import open_link
 from pans.runtime.live import Observers, Recovery, RunConfig, run_live
 from pans.runtime.live.reconnect import MOST_FRUITLESS
 from pans.runtime.record import Recorder, read_recording, replay
-from pans.runtime.wire.messages import FrameDecoder, MessageType, Opcode, decode_command, encode_welcome
+from pans.runtime.turn.system import offered
+from pans.runtime.wire.messages import (
+    AckStatus,
+    CommandMessage,
+    FrameDecoder,
+    MessageType,
+    Opcode,
+    decode_command,
+    encode_welcome,
+)
 from pans.runtime.wire.session import STREAM_TYPES
 
 CYCLES = 3000
@@ -133,7 +147,7 @@ class SlowArm:
         return self
 
 
-def recorded_run(path: Path, link: Any, mode: str, turn: str) -> tuple[Any, Any, Any]:
+def recorded_run(path: Path, link: Any, mode: str, turn: str, url: str = "") -> tuple[Any, Any, Any]:
     """A run of FEW cycles over `link`, with the usual way back: its result, its recording and a replay."""
     profile, bundle, plan = small_setup(mode)
     backend = "table" if bundle.automaton is None else "automaton"
@@ -141,7 +155,7 @@ def recorded_run(path: Path, link: Any, mode: str, turn: str) -> tuple[Any, Any,
     config = RunConfig(n_cycles=FEW, deadline_us=1e9, realtime=False, turn=turn)
     facts = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
     with Recorder(path, {"config": facts}) as recorder:
-        result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, "", 60.0))
+        result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, url, 60.0))
         recorder.close({})
     recording = read_recording(path)
     return result, recording, replay(recording, bundle)
@@ -167,6 +181,38 @@ def test_an_arm_that_comes_too_late_is_sent_again_with_a_longer_lead(tmp_path: P
     assert [event["lead_ms"] for event in events if event["kind"] == "armed_too_late"] == [200, 400]
     assert sum(event["kind"] == "session" for event in events) == 1
     assert (again.as_recorded, again.decisions) == (True, result.tally.decisions)
+
+
+class Strict(Instrument):
+    """An instrument that takes no ARM but the third."""
+
+    arms = 0
+
+    def _execute(self, command: CommandMessage) -> None:
+        if command.opcode == Opcode.ARM:
+            self.arms += 1
+            if self.arms < 3:
+                raise Refused(AckStatus.TOO_LATE, f"the start has passed, attempt {self.arms}")
+        super()._execute(command)
+
+
+@pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
+@pytest.mark.parametrize("mode", ["sequential", "parallel", "device-driven", "host-driven"])
+def test_a_call_that_goes_on_arms_again_too(tmp_path: Path, mode: str) -> None:
+    """At real pace, where a thread of its own reads the descriptor."""
+    profile, _, _ = small_setup(mode)
+    clock = DeviceClock(profile.clock.tick_hz)
+    device = Strict(profile, load_scene("uniform"), seed=1, power_on_tick=clock.tick_at(time.perf_counter_ns()))
+    port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
+    thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
+    thread.start()
+    result, recording, again = recorded_run(tmp_path / "run.pansrec", open_link(port.url), mode, "compiled", port.url)
+    stopped.set()
+    thread.join(10)
+    assert (result.ended, result.turn.taken, again.as_recorded) == ("completed", "compiled", True)
+    late = [event["lead_ms"] for event in recording.events() if event["kind"] == "armed_too_late"]
+    assert late[:2] == [200, 400]
+    assert (result.contradictions, result.stream["lost_exposures"]) == ({}, 0)
 
 
 def test_a_host_that_is_always_too_late_ends_with_the_refusal(tmp_path: Path) -> None:
