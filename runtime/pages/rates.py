@@ -23,6 +23,7 @@ from .pixels import heat_png
 BINS = 120
 DARK_BINS, DARK_PER_BIN = 40, 200  # stretches of the dark counts' strip, and exposures in one
 EXPOSURES_PER_BIN = 25  # of each pattern: a rate from fewer is noise
+OBJECTS_KEPT = 1 << 14  # whose true class is remembered: the exposures of an object come soon after its mark
 F64 = NDArray[np.float64]
 
 
@@ -45,67 +46,90 @@ class Rates(NamedTuple):
 
 
 def count_rates(recording: Recording, plan: Plan, n_classes: int = 0) -> Rates:
-    """Sum clicks and exposures over at most `BINS` equal stretches of device time; a clock that went back starts no new bin."""
-    n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
-    of_states = np.zeros((2, 0 if plan.automaton is None else plan.automaton.n_states))
-    of_classes = np.zeros((2, n, n_classes if plan.automaton is None else 0))
-    truth = _truths(recording, n_classes)
-    sums: list[tuple[int, F64, F64, int, int]] = []
-    for item in iter_exposures(recording, plan):
-        if isinstance(item, Exposures):
-            row = _sums(item, plan, n, of_states)
-            sums.append((int(item.start_tick[0]), *row))
-            known = truth.get(item.object, -1)
-            if known >= 0 and of_classes.size:
-                of_classes[0, :, known] += row[0]
-                of_classes[1, :, known] += row[1]
-    if not sums:
-        empty = np.zeros((1, n))
-        return Rates(np.array([0.0, 1.0]), empty, empty, np.zeros(1), np.zeros(1), *of_states, *of_classes)
-    ticks = np.array([row[0] for row in sums], np.int64)
-    seconds = np.maximum(ticks - ticks[0], 0) * plan.tick_us * 1e-6
-    per_pattern = sum(float(row[2].sum()) for row in sums) / n
-    bins = int(np.clip(per_pattern / EXPOSURES_PER_BIN, 1, BINS))
-    edges = np.linspace(0.0, float(seconds.max()) + plan.cycle_us * 1e-6, bins + 1)
-    which = np.clip(np.searchsorted(edges, seconds, "right") - 1, 0, len(edges) - 2)
-    totals = [np.zeros((len(edges) - 1, n)) for _ in range(2)] + [np.zeros(len(edges) - 1) for _ in range(2)]
-    for total, column in zip(totals, range(1, 5)):
-        np.add.at(total, which, np.array([row[column] for row in sums], np.float64))
-    return Rates(edges, totals[0], totals[1], totals[2], totals[3], *of_states, *of_classes)
+    """Sum clicks and exposures over at most `BINS` equal stretches of device time; a clock that went back starts no new bin.
 
-
-def _truths(recording: Recording, n_classes: int) -> dict[int, int]:
-    """The true class of each object, as the decision log has it."""
-    rows = recording.decisions()
-    known = rows[(rows["truth"] >= 0) & (rows["truth"] < n_classes)]
-    return dict(zip(known["object"].tolist(), known["truth"].tolist()))
-
-
-def _sums(item: Exposures, plan: Plan, n: int, of_states: F64) -> tuple[F64, F64, int, int]:
-    """Clicks and exposures of one message per pattern, channel or step; clicks and exposures in the dark. `of_states` (2, states) are
-    added to.
+    The messages are read twice, first for the length of the run: what is kept does not grow with it.
     """
-    dark = is_dark(item.pattern)
-    lit = item.clicks[~dark]
-    if plan.channels_at_once > 1:  # exposures in which any of the channels clicked
-        lit = np.asarray(lit.any(axis=1))[:, None]
-    if plan.mode == "parallel":
-        clicks, exposures = lit.sum(axis=0).astype(np.float64), np.full(n, float(len(lit)))
-        return clicks, exposures, int(item.clicks[dark].sum()), int(dark.sum()) * n
-    shown = item.pattern[~dark]
+    n = plan.n_patterns if plan.automaton is None else plan.automaton.n_slots
+    edges = _edges(recording, plan, n)
+    bins, first_tick = len(edges) - 1, None
+    rates = Rates(
+        edges,
+        *np.zeros((2, bins, n)),
+        *np.zeros((2, bins)),
+        *np.zeros((2, 0 if plan.automaton is None else plan.automaton.n_states)),
+        *np.zeros((2, n, n_classes if plan.automaton is None else 0)),
+    )
+    truths: dict[int, int] = {}
+    for item in iter_exposures(recording, plan):
+        truths |= item.truths
+        if not len(item.message_tick):
+            continue
+        first_tick = int(item.message_tick[0]) if first_tick is None else first_tick
+        seconds = np.maximum(item.message_tick - first_tick, 0) * plan.tick_us * 1e-6
+        which = np.clip(np.searchsorted(edges, seconds, "right") - 1, 0, bins - 1)
+        _add(rates, item, which, plan, _classes(item.object, truths, n_classes))
+        while len(truths) > OBJECTS_KEPT:
+            del truths[next(iter(truths))]
+    return rates
+
+
+def _edges(recording: Recording, plan: Plan, n: int) -> F64:
+    """The ends of the stretches of time: as many as the exposures of each of `n` patterns, channels or steps are enough for."""
+    first, last, lit = None, 0, 0
+    for item in iter_exposures(recording, plan):
+        if len(item.message_tick):
+            first = int(item.message_tick[0]) if first is None else first
+            last = max(last, int(item.message_tick.max()))
+            lit += int((~is_dark(item.pattern)).sum())
+    if first is None:
+        return np.array([0.0, 1.0])
+    per_pattern = lit if plan.mode == "parallel" else lit / n
+    bins = int(np.clip(per_pattern / EXPOSURES_PER_BIN, 1, BINS))
+    return np.linspace(0.0, (last - first) * plan.tick_us * 1e-6 + plan.cycle_us * 1e-6, bins + 1)
+
+
+def _classes(objects: NDArray[np.int64], truths: Mapping[int, int], n_classes: int) -> NDArray[np.int64]:
+    """The true class of each object, -1 where it is not known."""
+    different, at = np.unique(objects, return_inverse=True)
+    known = np.array([truths.get(number, -1) for number in different.tolist()], np.int64)
+    return np.where(known < n_classes, known, -1)[at]
+
+
+def _add(rates: Rates, item: Exposures, which: NDArray[np.int64], plan: Plan, truth: NDArray[np.int64]) -> None:
+    """Add clicks and exposures of `item`, in the bins `which` and of the classes `truth` (-1: unknown)."""
+    dark, (bins, n) = is_dark(item.pattern), rates.clicks.shape
+    parallel = plan.mode == "parallel"
+    clicks = item.clicks[:, :n] if parallel else item.clicks.any(axis=1)[:, None]  # in any of the channels
+    rates.dark_clicks[:] += np.bincount(which[dark], clicks[dark].sum(axis=1), bins)
+    rates.dark_exposures[:] += np.bincount(which[dark], minlength=bins) * (n if parallel else 1)
+    lit, at, truth = clicks[~dark], which[~dark], truth[~dark]
+    if parallel:
+        for channel in range(lit.shape[1]):
+            _add_lit(rates, at, np.full(len(at), channel), lit[:, channel], truth)
+        return
+    shown = item.pattern[~dark].astype(np.int64)
     if plan.automaton is not None:
         states = np.minimum(item.state[~dark], plan.automaton.n_states - 1)
-        np.add.at(of_states[0], states, lit[:, 0])
-        np.add.at(of_states[1], states, 1)
-        shown = plan.automaton.depth[states]
-    shown = np.minimum(shown, n - 1)
-    clicks = np.bincount(shown, weights=lit[:, 0], minlength=n).astype(np.float64)
-    return (
-        clicks,
-        np.bincount(shown, minlength=n).astype(np.float64),
-        int(item.clicks[dark].any(axis=1).sum()),
-        int(dark.sum()),
-    )
+        rates.state_clicks[:] += np.bincount(states, lit[:, 0], plan.automaton.n_states)
+        rates.state_exposures[:] += np.bincount(states, minlength=plan.automaton.n_states)
+        shown = plan.automaton.depth[states].astype(np.int64)
+    _add_lit(rates, at, np.minimum(shown, n - 1), lit[:, 0], truth)
+
+
+def _add_lit(
+    rates: Rates, at: NDArray[np.int64], shown: NDArray[np.int64], clicked: NDArray[np.bool_], truth: NDArray[np.int64]
+) -> None:
+    """Add exposures in the bins `at`, one pattern, channel or step each."""
+    bins, n = rates.clicks.shape
+    places = at * n + shown
+    rates.clicks[:] += np.bincount(places, clicked, bins * n).reshape(bins, n)
+    rates.exposures[:] += np.bincount(places, minlength=bins * n).reshape(bins, n)
+    if sums := rates.class_clicks.size:
+        known = truth >= 0
+        places = shown[known] * rates.class_clicks.shape[1] + truth[known]
+        rates.class_clicks[:] += np.bincount(places, clicked[known], sums).reshape(rates.class_clicks.shape)
+        rates.class_exposures[:] += np.bincount(places, minlength=sums).reshape(rates.class_clicks.shape)
 
 
 def add_rates(page: Page, plan: Plan, rates: Rates) -> None:
