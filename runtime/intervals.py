@@ -45,7 +45,7 @@ def jeffreys_interval(clicks: int, exposures: int, coverage: float = 0.95) -> tu
     return low, high
 
 
-def wilson_interval(clicks: int, exposures: int) -> tuple[float, float]:
+def wilson_interval(clicks: float, exposures: int) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of a click probability (Wilson 1927); (0, 1) without data."""
     if exposures == 0:
         return 0.0, 1.0

@@ -77,7 +77,7 @@ class Finding:
     def as_json(self) -> dict[str, Any]:
         """Return it JSON-able; what is not finite becomes None."""
         facts = {key: _finite(value) for key, value in asdict(self).items()}
-        return facts | {"significant": self.significant}
+        return facts | {"difference_is": "a / b" if self.is_ratio else "a - b", "significant": self.significant}
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +216,7 @@ def _accuracy(first: Side, second: Side, paired: bool) -> list[Finding]:
         return []
     one, two = (float(value or 0.0) for value in values)
     counts = round(one * sizes[0]), sizes[0], round(two * sizes[1]), sizes[1]
-    between = newcombe_difference(*counts)
+    between = newcombe_difference(one * sizes[0], sizes[0], two * sizes[1], sizes[1])  # of the shares that are shown
     method = f"two shares of {sizes[0]} and {sizes[1]} distinct objects, Fisher exact; interval by Newcombe"
     return [Finding("accuracy", "share", one, two, *between, False, fisher_exact(*counts), method)]
 
@@ -232,7 +232,7 @@ def _paired_accuracy(first: dict[int, float], second: dict[int, float]) -> Findi
 
 
 def _abstained(first: Side, second: Side) -> list[Finding]:
-    counts, shares = [], []
+    counts, shares, sizes = [], [], []
     for side in (first, second):
         abstained, decisions = (int(side.summary.get(name) or 0) for name in ("abstained", "decisions"))
         trials = max(1, int(side.summary.get("trials") or 1))
@@ -241,9 +241,10 @@ def _abstained(first: Side, second: Side) -> list[Finding]:
         n = max(1, decisions // trials)
         counts += [min(n, round(abstained / trials)), n]
         shares.append(abstained / decisions)
+        sizes.append(n)
     if not any(shares):
         return []
-    between = newcombe_difference(*counts)
+    between = newcombe_difference(shares[0] * sizes[0], sizes[0], shares[1] * sizes[1], sizes[1])
     method = "two shares, the trials of an object count once; Fisher exact; interval by Newcombe"
     return [Finding("abstained", "share", shares[0], shares[1], *between, False, fisher_exact(*counts), method)]
 

@@ -6,8 +6,9 @@ Owns the order; layout and charts are pages'.
 from __future__ import annotations
 
 from pans.runtime.pages.page import Page
-from pans.runtime.pages.results import accuracy_bins, accuracy_chart
+from pans.runtime.pages.results import accuracy_bins, accuracy_chart, sum_decisions
 from pans.runtime.pages.timing import NO_TIME_US, latency_chart, stages_of
+from pans.runtime.record.recording import together
 
 from .comparison import Comparison
 from .side import Side
@@ -76,12 +77,12 @@ def _add_accuracy(page: Page, comparison: Comparison) -> None:
             if number:
                 page.side()
             assert side.decisions is not None
-            known = side.decisions[side.decisions["truth"] >= 0]
-            mean = float((known["label"] == known["truth"]).mean())
-            bins = accuracy_bins(side.decisions, float(side.header["config"]["tick_hz"]))
-            classes = int(max(known["truth"].max() + 1, 2))
+            rows = side.decisions
+            sums = sum_decisions(lambda rows=rows: [rows], 0)
+            bins = accuracy_bins(lambda rows=rows: [rows], sums, float(side.header["config"]["tick_hz"]))
+            classes = int(max(rows["truth"].max() + 1, 2))
             page.figure(
-                accuracy_chart(bins, mean, classes),
+                accuracy_chart(bins, sums.accuracy, classes),
                 f"{name}: {len(bins.seconds)} stretches with their 95 % intervals.",
                 half=True,
             )
@@ -99,6 +100,6 @@ def _add_latency(page: Page, comparison: Comparison) -> None:
             if number:
                 page.side()
             deadline = side.summary.get("deadline_us")
-            timings = [rows for rows in (one.timings() for one in side.recordings) if len(rows)]
-            chart = latency_chart(stages_of(timings[-1]), float(deadline) if deadline else None)
+            stages = stages_of(together(rows for one in side.recordings for rows in one.iter_timings()))
+            chart = latency_chart(stages, float(deadline) if deadline else None)
             page.figure(chart, f"{name}: share of decisions that took longer, whole and by stage.", half=True)

@@ -62,8 +62,11 @@ def fisher_exact(right_1: int, n_1: int, right_2: int, n_2: int) -> float:
     return float(min(1.0, np.exp(logs[logs <= seen + SAME]).sum()))
 
 
-def newcombe_difference(right_1: int, n_1: int, right_2: int, n_2: int) -> Interval:
-    """Return the difference of two shares with its 95 % interval from their Wilson intervals; nothing is known without data."""
+def newcombe_difference(right_1: float, n_1: int, right_2: float, n_2: int) -> Interval:
+    """Return the difference of two shares with its 95 % interval from their Wilson intervals; nothing is known without data.
+
+    `right` may be broken numbers: an object that was decided several times is partly right.
+    """
     if not n_1 or not n_2:
         return Interval(math.nan, -1.0, 1.0)
     share_1, share_2 = right_1 / n_1, right_2 / n_2

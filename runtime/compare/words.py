@@ -41,11 +41,11 @@ def difference_of(finding: Finding) -> str:
         return ""
     if finding.is_ratio:
         return _ratio(finding.difference, finding.low, finding.high)
-    scale, unit = (100, " points") if finding.unit == "share" else (1, "")
-    head = f"A − B = {scale * finding.difference:+.3g}{unit}"
+    scale, form, unit = (100, "+.2f", " points") if finding.unit == "share" else (1, "+.3g", "")
+    head = f"A − B = {scale * finding.difference:{form}}{unit}"
     if finding.low is None or finding.high is None:
         return head
-    return f"{head} ({scale * finding.low:+.3g} to {scale * finding.high:+.3g})"
+    return f"{head} ({scale * finding.low:{form}} to {scale * finding.high:{form}})"
 
 
 def _ratio(ratio: float, low: float | None, high: float | None) -> str:

@@ -172,10 +172,27 @@ def _places(chart: Chart, x: ArrayLike, y: ArrayLike, inner: tuple[int, int]) ->
     return np.stack([LEFT + inner[0] * chart.x.at(x), TOP + inner[1] * (1 - chart.y.at(y))], axis=-1)
 
 
+def extremes(values: np.ndarray, stretches: int) -> np.ndarray:
+    """Return the places of the least and the largest of `values` in each of `stretches` parts, in order, without doubles; NaN is neither.
+
+    >>> extremes(np.array([0.0, 1.0, 9.0, 1.0, 0.0, 0.0]), 2).tolist()
+    [0, 2, 3, 4]
+    """
+    parts = np.array_split(np.arange(len(values)), stretches)
+    low, high = np.where(np.isnan(values), np.inf, values), np.where(np.isnan(values), -np.inf, values)
+    places = [int(part[ends.argmin()]) for part in parts if len(part) for ends in (low[part], -high[part])]
+    return np.unique(places)
+
+
 def _thinned(curve: Curve) -> list[np.ndarray | None]:
-    arrays = [curve.x, curve.y, curve.low, curve.high]
-    step = max(1, -(-len(np.asarray(curve.x)) // POINTS_MAX))
-    return [None if one is None else np.asarray(one, np.float64)[::step] for one in arrays]
+    """The curve with at most POINTS_MAX points; outliers stay."""
+    arrays = [None if one is None else np.asarray(one, np.float64) for one in (curve.x, curve.y, curve.low, curve.high)]
+    y = arrays[1]
+    assert y is not None
+    if len(y) <= POINTS_MAX:
+        return arrays
+    kept = extremes(y, POINTS_MAX // 2)
+    return [None if one is None else one[kept] for one in arrays]
 
 
 def _curve(chart: Chart, curve: Curve, inner: tuple[int, int]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.flow.matching import abort_reason
 from pans.runtime.record import Recording
+from pans.runtime.record.recording import together
 from pans.runtime.report.words import flow_rows
 
 from .charts import Axis, Bars, Chart, seconds
 from .page import CONFUSION_MAX, Page
 
 BINS = 60
+EVENTS_AT_ONCE = 1 << 16  # late decisions and verdicts that are held
 I64 = NDArray[np.int64]
 
 
@@ -50,14 +52,15 @@ def add_passages(page: Page, recording: Recording, bundle: Bundle | None) -> Non
             f"{int(confusion.sum())} decisions about objects alone, without those that abstained; true class in rows."
         )
         page.confusion(confusion, bundle.classes, caption)
-    decisions = recording.decisions()
-    if len(decisions):
-        edges_s = _edges_s(decisions, int(recording.header["config"]["tick_hz"]))
+    if recording.n_decisions:
+        span = _span_of(recording)
+        edges_s = span.edges_s(int(recording.header["config"]["tick_hz"]))
         page.figure(
-            _stacked(edges_s, "decisions", _outcomes(decisions)), "Decisions by what became of them, over the run."
+            _stacked(edges_s, "decisions", _outcomes(recording, span)),
+            "Decisions by what became of them, over the run.",
         )
-        made = _spread(decisions, {name: numbers for name, numbers in pulses.items() if name != "asked"})
-        if made:
+        made = {name: _counted(span.bins(numbers)) for name, numbers in pulses.items() if name != "asked"}
+        if made := {name: counts for name, counts in made.items() if counts.any()}:
             caption = "Pulses over the run. A pulse without a refusal counts as made."
             page.figure(_stacked(edges_s, "pulses", made), caption)
 
@@ -78,7 +81,7 @@ def _stacked(edges_s: NDArray[np.float64], what: str, rows: Mapping[str, I64]) -
 
 def add_late(page: Page, recording: Recording) -> None:
     """Add who is to blame for late decisions and lost exposures, with the evidence in words; nothing where all was on time."""
-    late, lost, words = Counter[str](), Counter[str](), []
+    late, lost, first_case = Counter[str](), Counter[str](), dict[str, str]()
     for event in recording.events():
         if event.get("kind") != "blame":
             continue
@@ -87,24 +90,21 @@ def add_late(page: Page, recording: Recording) -> None:
             late[cause] += int(event.get("decisions", 1))
         else:
             lost[cause] += int(event.get("exposures", 1))
-        words.append((cause, str(event.get("why", ""))))
+        first_case.setdefault(cause, str(event.get("why", "")))
     if not late and not lost:
         return
     page.heading("Late and missing work, by cause")
     rows = [(cause, late[cause], lost[cause]) for cause, _ in (late + lost).most_common()]
     page.table(rows, ("cause", "late decisions", "lost exposures"))
-    if late:
-        decisions = recording.decisions()
-        by_cause = _late_numbers(recording)
-        if len(decisions):
-            edges_s = _edges_s(decisions, int(recording.header["config"]["tick_hz"]))
-            page.figure(
-                _stacked(edges_s, "late decisions", _spread(decisions, by_cause)),
-                "Late decisions over the run, by the cause that the evidence names.",
-            )
-    shown = dict(reversed(words))  # the first of each cause
+    if late and recording.n_decisions:
+        span = _span_of(recording)
+        edges_s = span.edges_s(int(recording.header["config"]["tick_hz"]))
+        page.figure(
+            _stacked(edges_s, "late decisions", _late_rows(recording, span)),
+            "Late decisions over the run, by the cause that the evidence names.",
+        )
     page.table(
-        [(cause, shown[cause]) for cause, _ in (late + lost).most_common() if shown.get(cause)],
+        [(cause, first_case[cause]) for cause, _ in (late + lost).most_common() if first_case.get(cause)],
         ("cause", "its first case"),
     )
 
@@ -116,8 +116,8 @@ def _pulses(recording: Recording, bundle: Bundle) -> dict[str, I64]:
         for name in recording.header["config"]["flow"]["settings"].get("gate_classes", ())
         if name in bundle.classes
     ]
-    decisions = recording.decisions()
-    asked = decisions["index"][np.isin(decisions["label"], gated)].astype(np.int64)
+    rows = (rows["index"][np.isin(rows["label"], gated)] for rows in together(recording.iter_decisions()))
+    asked = np.concatenate([np.zeros(0, np.int64), *rows]).astype(np.int64)
     failed: dict[str, list[int]] = {"gate_refused": [], "gate_expired": []}
     for event in recording.events():
         if event.get("kind") in failed and "decision" in event:
@@ -127,40 +127,87 @@ def _pulses(recording: Recording, bundle: Bundle) -> dict[str, I64]:
     return {"asked": asked, "done": made, "refused": refused, "expired": expired}
 
 
-def _outcomes(decisions: NDArray[np.void]) -> dict[str, I64]:
+def _outcomes(recording: Recording, span: Span) -> dict[str, I64]:
     """Decisions by bin and outcome: with a label, or why not."""
-    flags, which = np.unique(decisions["flags"], return_inverse=True)
-    names = np.array([abort_reason(int(flag)) or "with a label" for flag in flags])[which]
-    return _spread(
-        decisions, {str(name): decisions["index"][names == name] for name in sorted(set(names.tolist()), reverse=True)}
-    )
+    found: dict[str, I64] = {}
+    for rows in together(recording.iter_decisions()):
+        bins = span.bins(rows["index"].astype(np.int64))
+        for flag in np.unique(rows["flags"]).tolist():
+            name = abort_reason(flag) or "with a label"
+            found[name] = found.get(name, 0) + _counted(bins[rows["flags"] == flag])
+    return dict(sorted(found.items(), reverse=True))
 
 
-def _late_numbers(recording: Recording) -> dict[str, I64]:
-    """Numbers of the late decisions by cause: those between the first and the last of each verdict."""
-    late = np.array([int(event["decision"]) for event in recording.events() if event.get("kind") == "late"], np.int64)
-    numbers: dict[str, list[I64]] = {}
+def _late_rows(recording: Recording, span: Span) -> dict[str, I64]:
+    """Late decisions by bin and cause: those between the first and the last of each verdict, which comes behind them."""
+    rows: dict[str, I64] = {}
+    late = np.zeros(0, np.int64)
+    more, verdicts, n_verdicts = list[int](), dict[str, list[tuple[int, int]]](), 0
     for event in recording.events():
-        if event.get("kind") == "blame" and event.get("what") == "late":
-            first, last = int(event.get("first_decision", 0)), int(event.get("last_decision", -1))
-            numbers.setdefault(str(event["cause"]), []).append(late[(late >= first) & (late <= last)])
-    return {cause: np.concatenate(found) for cause, found in sorted(numbers.items())}
+        if event.get("kind") == "late":
+            more.append(int(event["decision"]))
+        elif event.get("kind") == "blame" and event.get("what") == "late":
+            ends = int(event.get("first_decision", 0)), int(event.get("last_decision", -1)) + 1
+            verdicts.setdefault(str(event["cause"]), []).append(ends)
+            n_verdicts += 1
+        if len(more) + n_verdicts >= EVENTS_AT_ONCE:
+            late = _count_late(np.append(late, more), verdicts, span, rows)[-EVENTS_AT_ONCE:]
+            more, verdicts, n_verdicts = [], {}, 0
+    _count_late(np.append(late, more), verdicts, span, rows)
+    return dict(sorted(rows.items()))
 
 
-def _edges_s(decisions: NDArray[np.void], tick_hz: int) -> NDArray[np.float64]:
-    seconds = (decisions["tick"] - decisions["tick"].min()).astype(np.float64) / tick_hz
-    return np.linspace(0.0, max(float(seconds.max()), 1e-6), BINS + 1)
+def _count_late(late: I64, verdicts: Mapping[str, list[tuple[int, int]]], span: Span, rows: dict[str, I64]) -> I64:
+    """Add the decisions of `late` that `verdicts` are about to `rows`; return those of which nothing has been said yet."""
+    late = np.sort(late.astype(np.int64))
+    bins, open_ones = span.bins(late), np.ones(len(late), np.bool_)
+    for cause, ends in verdicts.items():
+        begins, stops = np.searchsorted(late, np.array(ends, np.int64)).T
+        change = np.zeros(len(late) + 1, np.int64)
+        np.add.at(change, begins, 1)
+        np.add.at(change, np.maximum(begins, stops), -1)
+        times = np.cumsum(change)[:-1]
+        rows[cause] = rows.get(cause, 0) + _counted(bins, times)
+        open_ones &= times == 0
+    return late[open_ones]
 
 
-def _spread(decisions: NDArray[np.void], numbers: Mapping[str, Any]) -> dict[str, I64]:
-    """Count decisions, given by their numbers, in BINS equal stretches of device time."""
-    first = int(decisions["index"][0])
-    ticks = (decisions["tick"] - decisions["tick"].min()).astype(np.float64)
-    bins = np.minimum((ticks * BINS / max(float(ticks.max()), 1.0)).astype(np.int64), BINS - 1)
-    rows = {}
-    for name, found in numbers.items():
-        places = np.asarray(found, np.int64) - first
-        places = places[(places >= 0) & (places < len(bins))]
-        if len(places):
-            rows[name] = np.bincount(bins[places], minlength=BINS)
-    return rows
+class Span(NamedTuple):
+    """The device time of a run's decisions in BINS stretches: the numbers of decisions at which another stretch begins."""
+
+    first_tick: int
+    last_tick: int
+    numbers: I64  # the last one is behind all decisions
+    stretch: I64  # -1 behind all decisions
+
+    def bins(self, numbers: I64) -> I64:
+        """Return the stretch of each decision, -1 of one that there is not."""
+        at = np.searchsorted(self.numbers, numbers, "right") - 1
+        return np.where(at < 0, -1, self.stretch[at])
+
+    def edges_s(self, tick_hz: int) -> NDArray[np.float64]:
+        """Return the ends of the stretches."""
+        return np.linspace(0.0, max((self.last_tick - self.first_tick) / tick_hz, 1e-6), BINS + 1)
+
+
+def _span_of(recording: Recording) -> Span:
+    """Return the stretches of `recording`, which has decisions."""
+    first, last = 1 << 64, 0
+    for rows in together(recording.iter_decisions()):
+        first, last = min(first, int(rows["tick"].min())), max(last, int(rows["tick"].max()))
+    numbers, stretch, number = list[I64](), list[I64](), 0
+    for rows in together(recording.iter_decisions()):
+        bins = (rows["tick"] - np.uint64(first)).astype(np.float64) * BINS / max(last - first, 1)
+        bins = np.minimum(bins.astype(np.int64), BINS - 1)
+        changes = np.flatnonzero(np.diff(bins, prepend=stretch[-1][-1] if stretch and len(stretch[-1]) else -1))
+        number = int(rows["index"][0])
+        numbers.append(number + changes)
+        stretch.append(bins[changes])
+        number += len(rows)
+    return Span(first, last, np.append(np.concatenate(numbers), number), np.append(np.concatenate(stretch), -1))
+
+
+def _counted(bins: I64, times: I64 | None = None) -> I64:
+    """How many decisions are in each stretch, each counted so many times."""
+    known = bins >= 0
+    return np.bincount(bins[known], None if times is None else times[known], BINS).astype(np.int64)

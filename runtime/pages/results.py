@@ -5,14 +5,14 @@ Owns the sums per stretch of time, from the decision log; the figures of the who
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
-from pans.runtime.core.decision import NO_LABEL, DecisionFlag
+from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.intervals import wilson_interval
 
 from .charts import Axis, Chart, Curve, Mark, percent, seconds
@@ -21,6 +21,7 @@ from .page import CONFUSION_MAX, Page
 BINS = 60
 OBJECTS_PER_BIN = 20
 F64 = NDArray[np.float64]
+Blocks = Callable[[], Iterable[NDArray[np.void]]]  # gives the decisions of a run from the first on, block by block
 
 
 class AccuracyBins(NamedTuple):
@@ -33,42 +34,80 @@ class AccuracyBins(NamedTuple):
     objects: NDArray[np.int64]
 
 
-def accuracy_bins(decisions: NDArray[np.void], tick_hz: float) -> AccuracyBins:
-    """Cut the decisions with a known truth into stretches of equal number; the interval (Wilson) counts distinct objects."""
-    known = decisions[decisions["truth"] >= 0]
-    n_objects = len(np.unique(known["object"]))
-    bins = int(np.clip(n_objects // OBJECTS_PER_BIN, 1, BINS))
-    rows = []
-    for part in np.array_split(known, bins):
-        if not len(part):
-            continue
-        share = float((part["label"] == part["truth"]).mean())
-        objects = len(np.unique(part["object"]))
-        low, high = wilson_interval(round(share * objects), objects)
-        middle = (int(part["tick"][0]) + int(part["tick"][-1])) / 2 - int(decisions["tick"][0])
-        rows.append((max(middle, 0.0) / tick_hz, share, min(low, share), max(high, share), objects))
+class DecisionSums(NamedTuple):
+    """What one pass over the decisions adds up to."""
+
+    first_tick: int
+    known: int  # with a known truth
+    right: int
+    objects: int  # distinct ones with a known truth, or as many as matter
+    confusion: NDArray[np.int64]  # (classes, classes), truth in rows: those that have a label
+
+    @property
+    def accuracy(self) -> float:
+        """Share of right ones among those with a known truth."""
+        return self.right / self.known
+
+
+def sum_decisions(decisions: Blocks, n_classes: int) -> DecisionSums:
+    """Add up `decisions`, block by block."""
+    first_tick, known, right, objects = None, 0, 0, np.zeros(0, np.uint32)
+    confusion = np.zeros((n_classes, n_classes), np.int64)
+    for rows in decisions():
+        first_tick = int(rows["tick"][0]) if first_tick is None else first_tick
+        told = rows[rows["truth"] >= 0]
+        known, right = known + len(told), right + int((told["label"] == told["truth"]).sum())
+        if len(objects) < BINS * OBJECTS_PER_BIN:
+            objects = np.union1d(objects, told["object"])
+        fits = (told["flags"] & int(DecisionFlag.ABSTAINED)) == 0
+        fits &= (told["truth"] < n_classes) & (told["label"] < n_classes)
+        np.add.at(confusion, (told["truth"][fits], told["label"][fits]), 1)
+    return DecisionSums(first_tick or 0, known, right, len(objects), confusion)
+
+
+def accuracy_bins(decisions: Blocks, sums: DecisionSums, tick_hz: float) -> AccuracyBins:
+    """Cut the decisions with a known truth into stretches of equal number; the interval (Wilson) counts distinct objects.
+
+    Memory holds the objects of one stretch.
+    """
+    bins = int(np.clip(sums.objects // OBJECTS_PER_BIN, 1, BINS))
+    sizes = (sums.known // bins + (np.arange(bins) < sums.known % bins)).tolist()
+    rows: list[tuple[float, float, float, float, int]] = []
+    left, right, ticks, seen = sizes[0], 0, [0, 0], list[NDArray[np.uint32]]()
+    for block in decisions():
+        told = block[block["truth"] >= 0]
+        while len(told):
+            part, told = told[:left], told[left:]
+            ticks = [ticks[0] if seen else int(part["tick"][0]), int(part["tick"][-1])]
+            seen.append(np.unique(part["object"]))
+            right, left = right + int((part["label"] == part["truth"]).sum()), left - len(part)
+            if not left:
+                share, objects = right / sizes[len(rows)], len(np.unique(np.concatenate(seen)))
+                low, high = wilson_interval(round(share * objects), objects)
+                middle = max(sum(ticks) / 2 - sums.first_tick, 0.0)
+                rows.append((middle / tick_hz, share, min(low, share), max(high, share), objects))
+                left, right, seen = sizes[min(len(rows), bins - 1)], 0, []
     columns = np.array(rows, np.float64).reshape(-1, 5).T
     return AccuracyBins(columns[0], columns[1], columns[2], columns[3], columns[4].astype(np.int64))
 
 
-def add_results(page: Page, decisions: NDArray[np.void], bundle: Bundle | None, header: Mapping[str, Any]) -> None:
+def add_results(page: Page, decisions: Blocks, bundle: Bundle | None, header: Mapping[str, Any]) -> None:
     """Add accuracy over time, and truth against decision."""
     if bundle is None or bundle.n_classes < 2:
         return
-    if not (decisions["truth"] >= 0).any():
+    sums = sum_decisions(decisions, bundle.n_classes if bundle.n_classes <= CONFUSION_MAX else 0)
+    if not sums.known:
         page.text("The true classes are not in the decision log: accuracy is not known.", "note")
         return
-    bins = accuracy_bins(decisions, float(header["config"]["tick_hz"]))
+    bins = accuracy_bins(decisions, sums, float(header["config"]["tick_hz"]))
     if len(bins.seconds) > 1:
         page.heading("Accuracy over time")
-        known = decisions[decisions["truth"] >= 0]
-        mean = float((known["label"] == known["truth"]).mean())
         page.figure(
-            accuracy_chart(bins, mean, bundle.n_classes),
+            accuracy_chart(bins, sums.accuracy, bundle.n_classes),
             f"Share of right decisions in {len(bins.seconds)} stretches of the run with their 95 % intervals (Wilson, by distinct objects: "
             f"{int(bins.objects.min())} to {int(bins.objects.max())} in a stretch).",
         )
-    _add_confusion(page, decisions, bundle)
+    _add_confusion(page, sums.confusion, bundle)
 
 
 def accuracy_chart(bins: AccuracyBins, mean: float, n_classes: int) -> Chart:
@@ -85,16 +124,14 @@ def accuracy_chart(bins: AccuracyBins, mean: float, n_classes: int) -> Chart:
     )
 
 
-def _add_confusion(page: Page, decisions: NDArray[np.void], bundle: Bundle) -> None:
+def _add_confusion(page: Page, counts: NDArray[np.int64], bundle: Bundle) -> None:
     if bundle.n_classes > CONFUSION_MAX:
         page.text(f"{bundle.n_classes} classes are too many for a table of truth against decision.", "note")
         return
-    decided = decisions[(decisions["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
-    known = decided[(decided["truth"] >= 0) & (decided["truth"] < bundle.n_classes) & (decided["label"] != NO_LABEL)]
-    counts = np.zeros((bundle.n_classes, bundle.n_classes), np.int64)
-    np.add.at(counts, (known["truth"], known["label"]), 1)
     page.heading("Decisions by class")
-    caption = f"{len(known)} decisions with a known truth, without those that abstained; shades are shares of a row."
+    caption = (
+        f"{int(counts.sum())} decisions with a known truth, without those that abstained; shades are shares of a row."
+    )
     page.confusion(counts, bundle.classes, caption)
     worst = counts.copy()
     np.fill_diagonal(worst, 0)

@@ -13,6 +13,7 @@ from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import UsageError
 from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
+from pans.runtime.record.recording import together
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.report.verify import file_kind
 
@@ -31,7 +32,7 @@ _TITLES = {
     "accuracy_std_trials": "spread over trials (standard deviation)",
     "accuracy_stderr_objects": "spread over objects (standard error)",
     "objects": "objects",
-    "trials": "trials per object",
+    "trials": "trials each time that an object is shown",
     "decisions": "decisions",
     "abstained": "of them abstained",
     "clicks_mean": "clicks per decision",
@@ -78,7 +79,7 @@ def recording_page(recording: Recording) -> bytes:
     if is_flow(recording):
         add_passages(page, recording, bundle)
     else:
-        add_results(page, recording.decisions(), bundle, recording.header)
+        add_results(page, lambda: together(recording.iter_decisions()), bundle, recording.header)
     plan = recorded_plan(recording)
     rates = count_rates(recording, plan, 0 if bundle is None else bundle.n_classes)
     if bundle is not None and plan.automaton is None:

@@ -5,6 +5,8 @@ Owns the sums behind the drawings, from recorded clicks and decisions; the tree 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.decision import DecisionFlag
 from pans.runtime.record import Recording
+from pans.runtime.record.recording import together
 
 from .bundle import clicked_words, outcomes, state_picture
 from .charts import Axis, Bars, Chart, Curve, percent
@@ -27,14 +30,12 @@ _NOT_WALKED = int(DecisionFlag.GAP | DecisionFlag.WRONG_PATTERN | DecisionFlag.I
 
 def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Automaton, rates: Rates) -> None:
     """Add what a run's walks were like; `automaton` is the one that ran, of `bundle`'s patterns."""
-    decisions = recording.decisions()
-    whole = decisions[(decisions["flags"] & _NOT_WALKED) == 0]
+    walks = _sum_walks(recording, automaton)
     page.heading("Walks")
-    if not len(whole):
+    if not walks.n:
         page.text("No walk has come to its leaf.", "note")
         return
     nodes = _first_states(automaton)
-    exposures = np.bincount(whole["exposures"], minlength=automaton.n_slots + 1)[1:]
     page.figure(
         tree_drawing(bundle, automaton, nodes, rates),
         "The first steps of the walks, as the run went: each state's pattern (by its own brightest pixel), which share of the walks "
@@ -58,12 +59,55 @@ def add_walks(page: Page, recording: Recording, bundle: Bundle, automaton: Autom
         ("state", "walks", "clicked", *_after(automaton)),
     )
     page.figure(
-        _counted("exposures of a walk", exposures, 1),
-        f"Exposures and clicks of {len(whole)} whole walks: {whole['exposures'].mean():.2f} exposures of {automaton.n_slots} at most, "
-        f"{whole['clicks'].mean():.2f} clicks on average.",
+        _counted("exposures of a walk", walks.exposures[1:], 1),
+        f"Exposures and clicks of {walks.n} whole walks: {_mean(walks.exposures):.2f} exposures of {automaton.n_slots} at most, "
+        f"{_mean(walks.clicks):.2f} clicks on average.",
     )
-    page.figure(_counted("clicks of a walk", np.bincount(whole["clicks"]), 0), "Clicks of the same walks.")
-    _add_confidence(page, whole)
+    page.figure(_counted("clicks of a walk", walks.clicks, 0), "Clicks of the same walks.")
+    _add_confidence(page, walks)
+
+
+class WalkSums(NamedTuple):
+    """How many whole walks had each number of exposures and of clicks, and what they said of themselves."""
+
+    exposures: NDArray[np.int64]
+    clicks: NDArray[np.int64]
+    probability: float  # their sum
+    bins: NDArray[np.float64]  # (3, CONFIDENCE_BINS) of those with label and truth: how many, probabilities, right ones
+
+    @property
+    def n(self) -> int:
+        """Whole walks."""
+        return int(self.exposures.sum())
+
+
+def _sum_walks(recording: Recording, automaton: Automaton) -> WalkSums:
+    sums = WalkSums(
+        np.zeros(automaton.n_slots + 1, np.int64), np.zeros(1, np.int64), 0.0, np.zeros((3, CONFIDENCE_BINS))
+    )
+    for rows in together(recording.iter_decisions()):
+        whole = rows[(rows["flags"] & _NOT_WALKED) == 0]
+        known = whole[(whole["truth"] >= 0) & ((whole["flags"] & int(DecisionFlag.ABSTAINED)) == 0)]
+        place = np.minimum((known["probability"] * CONFIDENCE_BINS).astype(np.int64), CONFIDENCE_BINS - 1)
+        for row, weights in enumerate((None, known["probability"], known["label"] == known["truth"])):
+            sums.bins[row] += np.bincount(place, weights, CONFIDENCE_BINS)
+        sums = sums._replace(
+            exposures=_added(sums.exposures, whole["exposures"]),
+            clicks=_added(sums.clicks, whole["clicks"]),
+            probability=sums.probability + float(whole["probability"].sum(dtype=np.float64)),
+        )
+    return sums
+
+
+def _added(counts: NDArray[np.int64], values: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Return `counts` with how often each of `values` is there; longer where they are larger."""
+    more = np.bincount(values, minlength=len(counts))
+    more[: len(counts)] += counts
+    return more
+
+
+def _mean(counts: NDArray[np.int64]) -> float:
+    return float((np.arange(len(counts)) * counts).sum() / counts.sum())
 
 
 def _after(automaton: Automaton) -> tuple[str, ...]:
@@ -99,20 +143,19 @@ def _meanings(automaton: Automaton, nodes: NDArray[np.int64], bundle: Bundle, ra
     return rows
 
 
-def _add_confidence(page: Page, whole: NDArray[np.void]) -> None:
-    known = whole[(whole["truth"] >= 0) & ((whole["flags"] & int(DecisionFlag.ABSTAINED)) == 0)]
-    said = f"of the decisions, {whole['probability'].mean():.3f} on average"
-    if not len(known):
+def _add_confidence(page: Page, walks: WalkSums) -> None:
+    n, said = int(walks.bins[0].sum()), f"of the decisions, {walks.probability / walks.n:.3f} on average"
+    if not n:
         page.text(
             f"The probability {said}; the true classes are not in the decision log: how sure they should be is not known."
         )
         return
-    bins = _reliability(known["probability"], known["label"] == known["truth"])
+    bins = [(said / count, right / count, count / n) for count, said, right in walks.bins.T.tolist() if count]
     error = sum(share * abs(accuracy - probability) for probability, accuracy, share in bins)
     page.figure(
         _reliability_chart(bins),
         f"Share of right decisions against the probability that they stated ({said}). The difference, weighted by the decisions in each "
-        f"bin, is {error:.3f}; so few decisions give about {_chance_error(bins, len(known)):.3f} by chance alone.",
+        f"bin, is {error:.3f}; so few decisions give about {_chance_error(bins, n):.3f} by chance alone.",
     )
 
 
@@ -125,16 +168,6 @@ def _reliability_chart(bins: list[tuple[float, float, float]]) -> Chart:
         curves=[Curve([0.0, 1.0], [0.0, 1.0], "as sure as right", "b"), Curve(probability, accuracy, "decisions", "a")],
         height=260,
     )
-
-
-def _reliability(probability: NDArray[np.float32], right: NDArray[np.bool_]) -> list[tuple[float, float, float]]:
-    """Mean probability, share of right ones and share of all, of each bin that has any."""
-    place = np.minimum((probability * CONFIDENCE_BINS).astype(np.int64), CONFIDENCE_BINS - 1)
-    return [
-        (float(probability[here].mean()), float(right[here].mean()), float(here.mean()))
-        for here in (place == number for number in range(CONFIDENCE_BINS))
-        if here.any()
-    ]
 
 
 def _chance_error(bins: list[tuple[float, float, float]], n: int) -> float:

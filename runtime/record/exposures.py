@@ -7,6 +7,7 @@ run itself (`StreamTracker`); what was lost is simply not there. Memory does not
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -123,7 +124,7 @@ def _pieces(counts: NDArray[np.uint16]) -> Iterator[tuple[int, int]]:
     """Cut messages with so many exposures each into pieces of about EXPOSURES_AT_ONCE."""
     which = np.cumsum(counts, dtype=np.int64) // EXPOSURES_AT_ONCE
     cuts = [0, *(np.flatnonzero(np.diff(which)) + 1).tolist(), len(counts)]
-    yield from zip(cuts[:-1], cuts[1:])
+    yield from pairwise(cuts)
 
 
 def _heads(messages: Messages) -> _Heads:
@@ -153,9 +154,7 @@ def _gathered(buffer: NDArray[np.uint8], spans: I64, dtype: np.dtype[np.void]) -
     return buffer[places].view(dtype)[:, 0] if len(spans) else np.zeros(0, dtype)
 
 
-def _whole_blocks(
-    buffer: NDArray[np.uint8], spans: I64, fields: NDArray[np.void], length: I64
-) -> NDArray[np.bool_]:
+def _whole_blocks(buffer: NDArray[np.uint8], spans: I64, fields: NDArray[np.void], length: I64) -> NDArray[np.bool_]:
     """Which messages are blocks that hold what they say, as the decoders of `wire` judge them."""
     kind, count, width = fields["type"], fields["count"].astype(np.int64), fields["width"].astype(np.int64)
     counts = kind == MessageType.COUNTS

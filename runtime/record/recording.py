@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ from .format import (
 )
 from .log import LogReader
 
-MESSAGES_AT_ONCE = 1 << 14
+MESSAGES_AT_ONCE = ROWS_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,13 @@ class Recording:
 
     def clock_samples(self) -> NDArray[np.void]:
         """Return all clock samples, CLOCK_DTYPE (n,)."""
-        return self._rows(Kind.CLOCK, CLOCK_DTYPE)
+        parts = list(self.iter_clock_samples())
+        return np.concatenate(parts) if parts else np.zeros(0, CLOCK_DTYPE)
+
+    def iter_clock_samples(self) -> Iterator[NDArray[np.void]]:
+        """Yield the clock samples block by block, CLOCK_DTYPE (n,)."""
+        for block in self.iter_blocks(Kind.CLOCK):
+            yield np.frombuffer(_whole_rows(block, CLOCK_DTYPE, self.path), CLOCK_DTYPE)
 
     def events(self) -> Iterator[dict[str, Any]]:
         """Yield the events, in order."""
@@ -186,12 +192,19 @@ class Recording:
                 yield host_ns, payload[start : start + length]
                 position = start + length
 
-    def _rows(self, kind: Kind, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        parts = list(self._iter_rows(kind, dtype))
-        return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
 
-    def _iter_rows(self, kind: Kind, dtype: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
-        return (np.frombuffer(_whole_rows(block, dtype, self.path), dtype=dtype) for block in self.iter_blocks(kind))
+def together(some: Iterable[NDArray[np.void]]) -> Iterator[NDArray[np.void]]:
+    """Yield the rows of several blocks as one array of about ROWS_AT_ONCE: blocks of a slow stream have a few rows each."""
+    held: list[NDArray[np.void]] = []
+    n = 0
+    for rows in some:
+        held.append(rows)
+        n += len(rows)
+        if n >= ROWS_AT_ONCE:
+            yield np.concatenate(held)
+            held, n = [], 0
+    if n:
+        yield np.concatenate(held)
 
 
 def _past_block(path: Path, block: Block) -> DamagedFileError:

@@ -18,7 +18,7 @@ from pans.runtime.safe_text import markdown
 from pans.runtime.timing.page_faults import fault_words
 
 from .summary import Summary
-from .words import flow_rows, is_unresolved, walk_rows
+from .words import flow_rows, is_unresolved, objects_words, walk_rows
 
 
 def write_markdown(
@@ -59,7 +59,7 @@ def _figures(summary: Summary) -> list[str]:
         ("accuracy", _percent(summary.accuracy)),
         ("spread over trials (standard deviation)", _percent(summary.tally.accuracy_std_trials)),
         ("spread over objects (standard error)", _percent(summary.tally.accuracy_stderr_objects)),
-        ("objects × trials", f"{summary.tally.objects} × {summary.tally.trials}"),
+        ("objects", objects_words(summary.tally)),
         ("decisions (abstained)", f"{summary.tally.decisions} ({summary.tally.abstained})"),
         ("clicks per decision", _number(summary.clicks_mean)),
         ("photons per decision (expected photoelectrons)", _number(summary.photons_mean)),

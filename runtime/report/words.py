@@ -16,6 +16,7 @@ UNRESOLVED_US = 1000.0  # a clock that is known no better hides what a host take
 if TYPE_CHECKING:
     from pans.runtime.flow.matching import PassageFigures, Share
     from pans.runtime.live.flow_run import FlowFigures
+    from pans.runtime.live.tally import TallyFigures
 
     from .summary import Summary, WalkFigures
 
@@ -28,7 +29,7 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
     photons = "unknown" if summary.photons_mean is None else f"{summary.photons_mean:.2f}"
     tally = summary.tally
     lines = [
-        f"{banner}{summary.verdict}: {tally.decisions} decisions ({tally.objects} objects × {tally.trials} trials)",
+        f"{banner}{summary.verdict}: {tally.decisions} decisions ({objects_words(tally)})",
         f"  accuracy      {accuracy} at {clicks:.2f} clicks, {photons} photons, illumination {summary.illumination:.1f} each",
         f"  latency       {latency_words(summary)}; late {summary.late}, lost {summary.lost}",
         *([] if summary.flow is None else flow_words(summary.flow)),
@@ -38,6 +39,20 @@ def closing_words(summary: Summary, recording: str, report: str) -> str:
         f"  report        {one_line(report)}",
     ]
     return "\n".join(lines)
+
+
+def objects_words(tally: TallyFigures) -> str:
+    """Return on how many objects how often was decided; objects that come again and again are no trials.
+
+    >>> from pans.runtime.live.tally import TallyFigures
+    >>> objects_words(TallyFigures(0.8, None, None, objects=200, trials=1, decisions=500, abstained=0, clicks_mean=5, photons_mean=8))
+    '200 objects, 2.5 decisions on each on average'
+    """
+    if tally.objects * tally.trials == tally.decisions:
+        return f"{tally.objects} objects × {tally.trials} trials"
+    if not tally.objects:
+        return "true classes unknown"
+    return f"{tally.objects} objects, {tally.decisions / tally.objects:.1f} decisions on each on average"
 
 
 def latency_words(summary: Summary) -> str:

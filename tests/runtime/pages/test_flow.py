@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from commands import page_of, words_of
 
 from pans.runtime.cli import main
-from pans.runtime.pages.flow import _late_numbers, _pulses, _spread
+from pans.runtime.pages import flow
+from pans.runtime.pages.flow import BINS, _late_rows, _pulses, _span_of
 from pans.runtime.record import read_recording
 
 
@@ -58,8 +60,8 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
     class Told:
         header, path = recording.header, recording.path
 
-        def decisions(self) -> Any:
-            return recording.decisions()
+        def iter_decisions(self) -> Any:
+            return recording.iter_decisions()
 
         def events(self) -> Any:
             yield {"kind": "gate_refused", "decision": int(asked[0]), "text": "late"}
@@ -74,16 +76,47 @@ def test_pulses_and_late_decisions_are_counted_by_their_events(run: Path) -> Non
     assert pulses["asked"].tolist() == asked.tolist()
     assert (pulses["refused"].tolist(), pulses["expired"].tolist()) == ([asked[0]], [asked[2]])
     assert len(pulses["done"]) == len(asked) - 2
-    assert {cause: rows.tolist() for cause, rows in _late_numbers(told).items()} == {"link": [3, 4], "host": [9, 20]}
+    span, rows = _span_of(told), recording.decisions()
+    bins = _bins_of(rows["tick"])
+    found = _late_rows(told, span)
+    wanted = {"link": (3, 4), "host": (9, 20)}
+    assert {cause: counts.tolist() for cause, counts in found.items()} == {
+        cause: np.bincount(bins[list(numbers)], minlength=BINS).tolist() for cause, numbers in wanted.items()
+    }
 
 
-def test_spread_puts_every_decision_into_one_bin(run: Path) -> None:
+def _bins_of(tick: np.ndarray) -> np.ndarray:
+    return np.minimum((tick - tick.min()).astype(float) * BINS / float(np.ptp(tick)), BINS - 1).astype(int)
+
+
+def test_every_decision_is_in_the_stretch_of_its_tick(run: Path) -> None:
     decisions = read_recording(run).decisions()
-    rows = _spread(decisions, {"all": decisions["index"], "none": np.zeros(0, np.int64)})
-    assert list(rows) == ["all"]
-    assert rows["all"].sum() == len(decisions)
-    part = decisions[100:]  # a later part of a run: numbers go on
-    assert _spread(part, {"all": part["index"]})["all"].sum() == len(part)
+    decisions["tick"][200:] -= decisions["tick"][200] - decisions["tick"][50]  # a clock that began anew
+    for first in (0, 100):  # 100: a later part of a run, whose numbers go on
+        part = decisions[first:]
+        told: Any = SimpleNamespace(iter_decisions=lambda part=part: iter([part[:50], part[50:]]))
+        span, numbers = _span_of(told), part["index"].astype(np.int64)
+        assert span.bins(numbers).tolist() == _bins_of(part["tick"]).tolist()
+        assert span.bins(np.array([first - 1, numbers[-1] + 1])).tolist() == [-1, -1]
+
+
+def test_late_decisions_are_counted_once_however_many_events_are_held(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = read_recording(run)
+    events = [{"kind": "late", "decision": number} for number in range(300)]
+    for first in range(0, 300, 3):  # behind the third of its decisions
+        blame = {"kind": "blame", "what": "late", "first_decision": first, "last_decision": first + 1}
+        events.insert(4 * first // 3 + 3, blame | {"cause": "link" if first % 2 else "host"})
+    told: Any = SimpleNamespace(iter_decisions=recording.iter_decisions, events=lambda: iter(events))
+    span = _span_of(told)
+    whole = _late_rows(told, span)
+    assert sum(int(counts.sum()) for counts in whole.values()) == 200
+    for held in (8, 20, 64):
+        monkeypatch.setattr(flow, "EVENTS_AT_ONCE", held)
+        assert {cause: counts.tolist() for cause, counts in _late_rows(told, span).items()} == {
+            cause: counts.tolist() for cause, counts in whole.items()
+        }
 
 
 def test_late_decisions_stand_on_the_page_with_their_causes(

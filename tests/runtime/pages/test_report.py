@@ -21,8 +21,8 @@ from pans.runtime.pages.events import sentence_of
 from pans.runtime.pages.page import Page, flat
 from pans.runtime.pages.pixels import heat_png, png
 from pans.runtime.pages.rates import count_rates
-from pans.runtime.pages.results import accuracy_bins
-from pans.runtime.pages.timing import survival
+from pans.runtime.pages.results import accuracy_bins, sum_decisions
+from pans.runtime.pages.timing import EXACT_MAX, Durations
 from pans.runtime.pages.verdict import advice_on
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
@@ -72,7 +72,11 @@ def test_stretches_of_the_accuracy_hold_every_decision_once() -> None:
     rows["object"], rows["tick"] = np.arange(300) // 3, 1000 + 10 * np.arange(300)
     rows["truth"] = np.where(np.arange(300) < 30, -1, 1)
     rows["label"] = np.where(np.arange(300) < 166, 0, 1)
-    bins = accuracy_bins(rows, 100.0)
+    blocks = [rows[:7], rows[7:120], rows[120:]]
+    sums = sum_decisions(lambda: blocks, 2)
+    bins = accuracy_bins(lambda: blocks, sums, 100.0)
+    assert (sums.known, sums.right, sums.objects) == (270, 134, 90)
+    assert sums.confusion.tolist() == [[0, 0], [136, 134]]
     assert bins.objects.tolist() == [23, 24, 23, 23]
     assert bins.accuracy[[0, 1, 3]].tolist() == [0.0, 0.0, 1.0]
     assert bins.low[3] == wilson_interval(23, 23)[0]
@@ -96,11 +100,28 @@ def test_what_a_click_means_is_counted_by_true_class(demo: Path) -> None:
 
 def test_the_latency_curve_is_the_share_of_longer_ones() -> None:
     values = np.random.default_rng(1).lognormal(4, 1, 5000)
-    times, share = survival(values)
+    found = Durations()
+    for part in np.split(values, 5):
+        found.add(part)
+    times, share = found.survival()
     assert share[-1] == 1 / 5000
     assert times[-1] == values.max()
     for at, part in zip(times[::40], share[::40]):
         assert part == pytest.approx((values >= at).mean())
+
+
+def test_the_curve_of_very_many_keeps_the_longest_ones_and_no_others() -> None:
+    values = np.random.default_rng(1).lognormal(4, 1, 3 * EXACT_MAX)
+    found = Durations()
+    for part in np.split(values, 96):
+        found.add(part)
+    times, share = found.survival()
+    np.testing.assert_array_equal(times[-100:], np.sort(values)[-np.round(share[-100:] * len(values)).astype(int)])
+    ordered = np.sort(values)[::-1]
+    wanted = ordered[np.round(share * len(values)).astype(int) - 1]
+    assert (np.abs(times / wanted - 1) < 0.033)[wanted > 1].all()
+    assert found.quantiles(0.5)[0] == pytest.approx(np.quantile(values, 0.5), rel=0.033)
+    assert sum(map(len, found._kept)) <= EXACT_MAX
 
 
 def test_events_become_sentences_and_foreign_ones_stay_whole() -> None:
