@@ -87,6 +87,25 @@ def test_summaries_are_compared_without_pairs(runs: Path, tmp_path: Path, capsys
         assert found["findings"][0][key] == whole["findings"][0][key]
 
 
+def test_a_difference_is_that_of_the_figures_beside_it(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Shares of objects that were decided several times are no whole numbers of objects: 78.8 and 75.75 % of 200."""
+    summary = dict(read_recording(runs / "a" / "run.pansrec").summary)
+    for name, accuracy, abstained in (("a", 0.788, 3), ("b", 0.7575, 0)):
+        told = {"accuracy": accuracy, "objects": 200, "decisions": 1000, "trials": 5, "abstained": abstained}
+        (tmp_path / f"{name}.json").write_text(json.dumps(summary | told))
+    words = ["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "A 78.80 %, B 75.75 %; A − B = +3.05 points (" in said
+    assert "A 0.30 %, B 0.00 %; A − B = +0.30 points (" in said
+    for row in json_of(capsys, *words)["findings"]:
+        assert row["difference_is"] in ("a - b", "a / b")
+        if row["difference_is"] == "a - b" and row["difference"] is not None:
+            assert row["difference"] == pytest.approx(row["first"] - row["second"])
+
+
 def test_dark_counts_are_compared_by_their_rates(runs: Path) -> None:
     first, second = read_side(runs / "a"), read_side(runs / "b")
     dark = {"clicks": 40, "exposures": 1000, "low": 0, "high": 1, "expected": 0.01}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +18,18 @@ from pans.runtime.bundle.model import load_bundle, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.intervals import wilson_interval
-from pans.runtime.pages.charts import Axis
+from pans.runtime.pages.charts import POINTS_MAX, Axis, Curve, _thinned
 from pans.runtime.pages.events import sentence_of
 from pans.runtime.pages.page import Page, flat
 from pans.runtime.pages.pixels import heat_png, png
 from pans.runtime.pages.rates import count_rates
 from pans.runtime.pages.results import accuracy_bins, sum_decisions
-from pans.runtime.pages.timing import EXACT_MAX, Durations
+from pans.runtime.pages.timing import CLOCK_MAX, EXACT_MAX, Durations, _probes
 from pans.runtime.pages.verdict import advice_on
 from pans.runtime.record import read_recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.sent_plan import recorded_plan
+from pans.runtime.timing.clock import CLOCK_DTYPE
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +160,36 @@ def test_every_fault_has_advice() -> None:
     assert all(advice)
     assert len(set(advice)) == len(faults)
     assert advice_on("something new") == ""
+
+
+def test_a_curve_of_many_points_keeps_its_outliers() -> None:
+    y = np.zeros(20_000)
+    y[[7, 12_345]] = 50.0, -30.0
+    y[:5] = np.nan
+    x, found, low, _ = _thinned(Curve(np.arange(20_000), y, low=y - 1))
+    assert x is not None
+    assert found is not None
+    assert low is not None
+    assert len(found) <= POINTS_MAX
+    assert (np.nanmax(found), np.nanmin(found)) == (50.0, -30.0)
+    assert x[[found.argmax(), found.argmin()]].tolist() == [7, 12_345]
+    assert (low == found - 1).all()
+    assert (np.diff(x) > 0).all()
+
+
+def test_probes_of_a_long_run_are_bounded_and_keep_the_worst() -> None:
+    n = 5 * CLOCK_MAX
+    samples = np.zeros(n, CLOCK_DTYPE)
+    samples["tick"], samples["host_ns"] = 1000 * np.arange(n), 1_000_000 * np.arange(n)
+    samples["host_ns"][n // 3] += 700_000
+    blocks = np.split(samples, 40)
+    told: Any = SimpleNamespace(header={"config": {"tick_hz": 1_000_000}}, iter_clock_samples=lambda: iter(blocks))
+    kept, count = _probes(told)
+    assert count == n
+    assert len(kept) <= 2 * CLOCK_MAX + n // 40
+    assert samples[n // 3] in kept
+    assert (np.diff(kept["tick"].astype(np.int64)) > 0).all()
+    assert (kept[[0, -1]] == samples[[0, -1]]).all()
 
 
 def test_ticks_are_round_inside_and_few() -> None:

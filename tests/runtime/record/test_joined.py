@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pans.runtime.cli import main
+from pans.runtime.container import open_regular
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.record import read_recording
+from pans.runtime.pages import page_of
+from pans.runtime.record import read_recording, recording
 from pans.runtime.record.exposures import click_list
 from pans.runtime.record.parts import JoinedRecording, open_recording
 from pans.runtime.record.sent_plan import recorded_plan
@@ -49,6 +53,33 @@ def test_parts_are_one_recording(folder: Path) -> None:
     assert clicks.exposures == wanted.exposures
     assert joined.bundle().classes == one.bundle().classes
     assert open_recording(folder / "parts/r.parts.json").n_decisions == 150
+
+
+def test_a_page_reads_each_part_as_often_however_many_there_are(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first part, which has the bundle, a few times more."""
+    reads: Counter[str] = Counter()
+
+    def opened(path: Path) -> Any:
+        reads[Path(path).name] += 1
+        return open_regular(path)
+
+    monkeypatch.setattr(recording, "open_regular", opened)
+    parts = sorted((folder / "parts").glob("*.pansrec"))
+    found = []
+    for n in (2, len(parts)):
+        (tmp_path / str(n)).mkdir()
+        for path in parts[:n]:
+            (tmp_path / str(n) / path.name).write_bytes(path.read_bytes())
+        page_of(tmp_path / str(n))
+        found.append(dict(reads))
+        reads.clear()
+    few, many = found
+    assert len(many) > len(few) == 2
+    assert all(many[name] == few[name] for name in few)
+    assert {many[path.name] for path in parts[1:]} == {few[parts[1].name]}
+    assert few[parts[1].name] < 25
 
 
 def test_a_part_that_is_missing_is_told(folder: Path, tmp_path: Path) -> None:

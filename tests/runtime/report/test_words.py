@@ -57,3 +57,15 @@ def test_the_page_has_no_zero_that_was_not_measured(summary: Summary, tmp_path: 
     assert "| **exposure end to decision** | not resolved | not resolved | 3000 | 3000 |" in rows
     assert "| link | not resolved | not resolved | 3000 | 3000 |" in rows
     assert "| decode | 0 | 0 | 3000 | 3000 |" in rows  # of the host's own clock
+
+
+def test_objects_that_come_again_are_no_trials(summary: Summary, tmp_path: Path) -> None:
+    tally = replace(summary.tally, objects=200, trials=5, decisions=1000)
+    said = closing_words(replace(summary, tally=tally), "r", "s")
+    assert "1000 decisions (200 objects × 5 trials)" in said
+    again = replace(summary, tally=replace(tally, trials=1, decisions=88_334))
+    assert "88334 decisions (200 objects, 441.7 decisions on each on average)" in closing_words(again, "r", "s")
+    write_markdown(tmp_path / "s.md", again, {}, np.zeros((3, 3), np.int64), ("a", "b", "c"))
+    assert "| objects | 200 objects, 441.7 decisions on each on average |" in (tmp_path / "s.md").read_text()
+    unknown = replace(summary, tally=replace(tally, objects=0, trials=0))
+    assert "1000 decisions (true classes unknown)" in closing_words(unknown, "r", "s")
