@@ -5,8 +5,10 @@ Owns the order; layout and charts are pages'.
 
 from __future__ import annotations
 
+from functools import partial
+
 from pans.runtime.pages.page import Page
-from pans.runtime.pages.results import accuracy_bins, accuracy_chart, sum_decisions
+from pans.runtime.pages.results import Blocks, accuracy_bins, accuracy_chart, sum_decisions
 from pans.runtime.pages.timing import NO_TIME_US, latency_chart, stages_of
 from pans.runtime.record.recording import together
 
@@ -78,8 +80,9 @@ def _add_accuracy(page: Page, comparison: Comparison) -> None:
                 page.side()
             assert side.decisions is not None
             rows = side.decisions
-            sums = sum_decisions(lambda rows=rows: [rows], 0)
-            bins = accuracy_bins(lambda rows=rows: [rows], sums, float(side.header["config"]["tick_hz"]))
+            blocks: Blocks = partial(list, [rows])
+            sums = sum_decisions(blocks, 0)
+            bins = accuracy_bins(blocks, sums, float(side.header["config"]["tick_hz"]))
             classes = int(max(rows["truth"].max() + 1, 2))
             page.figure(
                 accuracy_chart(bins, sums.accuracy, classes),

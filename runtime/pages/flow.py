@@ -195,15 +195,15 @@ def _span_of(recording: Recording) -> Span:
     first, last = 1 << 64, 0
     for rows in together(recording.iter_decisions()):
         first, last = min(first, int(rows["tick"].min())), max(last, int(rows["tick"].max()))
-    numbers, stretch, number = list[I64](), list[I64](), 0
+    numbers, stretch, number, before = list[I64](), list[I64](), 0, -1
     for rows in together(recording.iter_decisions()):
-        bins = (rows["tick"] - np.uint64(first)).astype(np.float64) * BINS / max(last - first, 1)
-        bins = np.minimum(bins.astype(np.int64), BINS - 1)
-        changes = np.flatnonzero(np.diff(bins, prepend=stretch[-1][-1] if stretch and len(stretch[-1]) else -1))
+        places = (rows["tick"] - np.uint64(first)).astype(np.float64) * BINS / max(last - first, 1)
+        bins = np.minimum(places.astype(np.int64), BINS - 1)
+        changes = np.flatnonzero(np.diff(bins, prepend=before))
         number = int(rows["index"][0])
         numbers.append(number + changes)
         stretch.append(bins[changes])
-        number += len(rows)
+        number, before = number + len(rows), int(bins[-1])
     return Span(first, last, np.append(np.concatenate(numbers), number), np.append(np.concatenate(stretch), -1))
 
 

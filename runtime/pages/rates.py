@@ -100,7 +100,7 @@ def _add(rates: Rates, item: Exposures, which: NDArray[np.int64], plan: Plan, tr
     """Add clicks and exposures of `item`, in the bins `which` and of the classes `truth` (-1: unknown)."""
     dark, (bins, n) = is_dark(item.pattern), rates.clicks.shape
     parallel = plan.mode == "parallel"
-    clicks = item.clicks[:, :n] if parallel else item.clicks.any(axis=1)[:, None]  # in any of the channels
+    clicks = item.clicks[:, :n] if parallel else np.asarray(item.clicks.any(axis=1))[:, None]  # in any of the channels
     rates.dark_clicks[:] += np.bincount(which[dark], clicks[dark].sum(axis=1), bins)
     rates.dark_exposures[:] += np.bincount(which[dark], minlength=bins) * (n if parallel else 1)
     lit, at, truth = clicks[~dark], which[~dark], truth[~dark]
