@@ -80,6 +80,12 @@ class WalkSums(NamedTuple):
         """Whole walks."""
         return int(self.exposures.sum())
 
+    @property
+    def reliability(self) -> list[tuple[float, float, float]]:
+        """Mean probability, share of right ones and share of all, of each bin that has any."""
+        n = self.bins[0].sum()
+        return [(said / count, right / count, count / n) for count, said, right in self.bins.T.tolist() if count]
+
 
 def _sum_walks(recording: Recording, automaton: Automaton) -> WalkSums:
     sums = WalkSums(
@@ -150,7 +156,7 @@ def _add_confidence(page: Page, walks: WalkSums) -> None:
             f"The probability {said}; the true classes are not in the decision log: how sure they should be is not known."
         )
         return
-    bins = [(said / count, right / count, count / n) for count, said, right in walks.bins.T.tolist() if count]
+    bins = walks.reliability
     error = sum(share * abs(accuracy - probability) for probability, accuracy, share in bins)
     page.figure(
         _reliability_chart(bins),

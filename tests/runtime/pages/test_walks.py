@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from automata import automaton_bundle, random_automaton
 from commands import json_of, page_of, words_of
 
 from pans.runtime.bundle.model import write_bundle
+from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
 from pans.runtime.pages.rates import count_rates
-from pans.runtime.pages.walks import _first_states, _reliability, _tree_of
+from pans.runtime.pages.walks import _first_states, _sum_walks, _tree_of
 from pans.runtime.record import Recording, read_recording
 from pans.runtime.record.sent_plan import recorded_plan
 from pans.runtime.wire.messages import DARK_PATTERN, MessageType, decode_clicks, unpack_body
@@ -70,9 +73,18 @@ def test_the_page_has_the_walks(recording: Recording, tmp_path: Path) -> None:
 
 
 def test_reliability_is_that_of_the_decisions() -> None:
-    probability = np.array([0.05, 0.32, 0.38, 0.38, 1.0], np.float32)
-    right = np.array([False, True, False, True, True])
-    bins = _reliability(probability, right)
+    rows = np.zeros(8, DECISION_DTYPE)
+    rows["probability"] = [0.05, 0.32, 0.38, 0.38, 1.0, 0.5, 0.5, 0.5]
+    rows["label"][:5] = [1, 2, 1, 2, 2]
+    rows["truth"] = 2
+    rows["truth"][5] = -1
+    rows["flags"][6:] = int(DecisionFlag.ABSTAINED), int(DecisionFlag.ABSTAINED | DecisionFlag.GAP)
+    rows["exposures"], rows["clicks"] = [3, 4, 4, 4, 4, 4, 4, 2], [0, 1, 2, 3, 9, 1, 1, 0]
+    told: Any = SimpleNamespace(iter_decisions=lambda: iter([rows[:2], rows[2:]]))
+    walks = _sum_walks(told, random_automaton(4, slots=6, width=5))
+    assert walks.exposures.tolist() == [0, 0, 0, 1, 6, 0, 0]  # the last one came to no leaf
+    assert walks.clicks.tolist() == [1, 3, 1, 1, 0, 0, 0, 0, 0, 1]
+    bins = walks.reliability
     assert [round(share, 3) for _, _, share in bins] == [0.2, 0.6, 0.2]
     assert [accuracy for _, accuracy, _ in bins] == pytest.approx([0, 2 / 3, 1])
     assert bins[1][0] == pytest.approx(0.36)
