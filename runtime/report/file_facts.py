@@ -23,6 +23,7 @@ from pans.runtime.instrument.calibration import load_calibration, now_utc
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.record import Recording
 from pans.runtime.record.parts import open_recording
+from pans.runtime.record.recording import together
 from pans.runtime.registration.file import load_registration
 
 from .handshakes import handshakes
@@ -114,9 +115,12 @@ def _sensor_facts(analyser: Analyser) -> dict[str, Any]:
 
 
 def _recording_facts(recording: Recording) -> dict[str, Any]:
-    decisions = recording.decisions()
-    decided = decisions[(decisions["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
-    known = decided[decided["truth"] >= 0]
+    decided = clicks = known = right = 0
+    for rows in together(recording.iter_decisions()):
+        rows = rows[(rows["flags"] & int(DecisionFlag.ABSTAINED)) == 0]
+        decided, clicks = decided + len(rows), clicks + int(rows["clicks"].sum(dtype=np.int64))
+        rows = rows[rows["truth"] >= 0]
+        known, right = known + len(rows), right + int((rows["label"] == rows["truth"]).sum())
     header = dict(recording.header)
     profile = header.pop("profile", None)
     if isinstance(profile, dict):
@@ -129,10 +133,10 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "simulated": recording.simulated,
         "blocks": {kind.name.lower(): count for kind, count in recording.kinds.items()},
         "decisions": recording.n_decisions,
-        "abstained": len(decisions) - len(decided),
+        "abstained": recording.n_decisions - decided,
         "decisions_sha256": recording.decisions_sha256,
-        "clicks_mean": float(decided["clicks"].mean()) if len(decided) else None,
-        "accuracy": float(np.mean(known["label"] == known["truth"])) if len(known) else None,
+        "clicks_mean": clicks / decided if decided else None,
+        "accuracy": right / known if known else None,
         "messages": sum(1 for _ in recording.messages()),
         "answers": sum(1 for _ in recording.answers()),
         "handshakes": handshakes(recording),
