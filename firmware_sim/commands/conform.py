@@ -1,6 +1,6 @@
 """`pans conform`: every rule of the protocol tried on a device over its real link, with a verdict for each.
 
-Owns the command's options and its page of text; the rules are pans.firmware_sim.conform's.
+The options and the page of text; the rules are in pans.firmware_sim.conform.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, emit, say
+from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, Command, emit, say
 from pans.runtime.commands.run import profile_of
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PIXELS = 784  # of a picture of 28 x 28, as the shipped scenes have them
 MAX_PIXELS = 1 << 22
+VERDICTS = ("kept", "broken", "not tried", "gone")
 SHOWN_PIECES = 24
 SHOWN_BYTES = 64
 
@@ -37,6 +38,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rule", action="append", default=[], metavar="NUMBER", help="try this rule only; may be given again"
     )
+    parser.add_argument(
+        "--long", action="store_true", help="also the rules that take minutes: past 65 536 messages, drops and commands"
+    )
     parser.add_argument("--bytes", action="store_true", help="show what was sent and received for every rule")
 
 
@@ -51,42 +55,48 @@ def _run(args: argparse.Namespace) -> int:
     profile = load_profile(args.profile or profile_of(args.url))
     link = open_link(args.url)
     try:
-        findings = conform(link, profile, pixels=args.pixels, only=tuple(args.rule), tell=_tell)
+        findings = conform(link, profile, pixels=args.pixels, only=tuple(args.rule), long=args.long, tell=_tell)
     finally:
         link.close()
-    broken = [one.number for one in findings if one.verdict == "broken"]
-    emit(args, _payload(args.url, findings, broken), _page(findings, args.bytes))
-    return EXIT_ALERT if broken else EXIT_FINE
+    found = {word: [one.number for one in findings if one.verdict == word] for word in VERDICTS}
+    emit(args, _payload(args.url, findings, found), _page(findings, found, args.bytes))
+    if found["gone"]:
+        return EXIT_DEVICE
+    return EXIT_ALERT if found["broken"] else EXIT_FINE
 
 
 def _tell(finding: Finding) -> None:
     if finding.verdict == "broken":
         say(f"rule {finding.number} is broken: {finding.why}")
+    elif finding.verdict == "gone":
+        say(f"the device went away in rule {finding.number}: {finding.why}")
 
 
-def _payload(url: str, findings: list[Finding], broken: list[str]) -> dict[str, Any]:
-    counts = {word: sum(one.verdict == word for one in findings) for word in ("kept", "broken", "not tried")}
+def _payload(url: str, findings: list[Finding], found: dict[str, list[str]]) -> dict[str, Any]:
     return {
         "device": url,
-        "verdict": "FAIL" if broken else "PASS",
-        "kept": counts["kept"],
-        "broken": broken,
-        "not_tried": counts["not tried"],
+        "verdict": "FAIL" if found["broken"] or found["gone"] else "PASS",
+        "kept": len(found["kept"]),
+        "broken": found["broken"],
+        "gone": found["gone"][0] if found["gone"] else None,
+        "not_tried": len(found["not tried"]),
         "rules": [one.as_json() for one in findings],
     }
 
 
-def _page(findings: list[Finding], with_bytes: bool) -> str:
+def _page(findings: list[Finding], found: dict[str, list[str]], with_bytes: bool) -> str:
     lines = []
     for one in findings:
         lines.append(f"{one.number:>5}  {one.verdict:<9}  {one.words}")
         if one.why:
             lines.append(f"{'':18}{one.why}")
-        if with_bytes or one.verdict == "broken":
+        if with_bytes or one.verdict in ("broken", "gone"):
             lines += [f"{'':18}{piece}" for piece in _pieces(one)]
-    kept, broken = (sum(one.verdict == word for one in findings) for word in ("kept", "broken"))
-    rest = len(findings) - kept - broken
-    return "\n".join([*lines, f"{kept} rules kept, {broken} broken, {rest} not tried"])
+    kept, broken, rest = (len(found[word]) for word in ("kept", "broken", "not tried"))
+    lines.append(f"{kept} rules kept, {broken} broken, {rest} not tried")
+    if found["gone"]:
+        lines.append(f"the device went away in rule {found['gone'][0]}")
+    return "\n".join(lines)
 
 
 def _pieces(finding: Finding) -> list[str]:

@@ -18,7 +18,7 @@ from pans.runtime.wire.messages import DeviceState, Frame, MalformedMessage, Mes
 from pans.runtime.wire.session import STREAM_TYPES
 
 from .plans import Layout, layout_for
-from .rules import Broken, need
+from .rules import Broken, Silent, need
 
 PATIENCE_S = 2.0  # for an answer: a loaded machine is no broken rule
 QUIET_S = 0.3  # in which an answer that must not come would have come
@@ -117,6 +117,16 @@ class Bench:
         if len(self.pieces) > 2 * KEPT_PIECES:
             del self.pieces[KEPT_PIECES : KEPT_PIECES + KEPT_PIECES // 2]
 
+    @property
+    def bytes_heard(self) -> int:
+        """Bytes that have come since the link was opened."""
+        return self._decoder.counters.bytes_in
+
+    @property
+    def damaged(self) -> int:
+        """Frames that came whole but with a wrong CRC, since the link was opened."""
+        return self._decoder.counters.crc_errors
+
     # -- messages ------------------------------------------------------------------------------------------------------
 
     def wait(
@@ -128,14 +138,20 @@ class Bench:
     ) -> Any:
         """Return the first message of `kind` that is the one, and forget it; Broken when none comes."""
 
+        seen = 0  # of the inbox, which only grows while we wait: a fast stream is looked through once
+
         def place() -> int | None:
-            found = (k for k, heard in enumerate(self.inbox) if heard.kind == kind and which(heard.message))
-            return next(found, None)
+            nonlocal seen
+            for k in range(seen, len(self.inbox)):
+                if self.inbox[k].kind == kind and which(self.inbox[k].message):
+                    return k
+            seen = len(self.inbox)
+            return None
 
         self.listen(within_s, lambda: place() is not None)
         at = place()
         if at is None:
-            raise Broken(f"no {kind.name}{' ' + what if what else ''} within {within_s:g} s")
+            raise Silent(f"no {kind.name}{' ' + what if what else ''} within {within_s:g} s")
         return self.inbox.pop(at).message
 
     def silent(self, kind: MessageType, why: str) -> None:
@@ -164,10 +180,10 @@ class Bench:
             try:
                 self.facts = self.wait(MessageType.WELCOME, within_s=PATIENCE_S / 2).facts
                 break
-            except Broken:
+            except Silent:
                 continue
         else:
-            raise Broken(f"no WELCOME to five HELLOs in {2.5 * PATIENCE_S:g} s")
+            raise Silent(f"no WELCOME to five HELLOs in {2.5 * PATIENCE_S:g} s")
         if reset:
             self.done(Opcode.RESET)
         self.listen(0.0)

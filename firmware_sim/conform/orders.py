@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pans.runtime.wire.commands import (
+    MAX_PIXELS_PER_CHUNK,
     Arm,
     Gate,
     PatternChunk,
@@ -19,18 +20,20 @@ from pans.runtime.wire.commands import (
     pack_pattern,
     pack_plan,
 )
-from pans.runtime.wire.messages import AckStatus, DeviceState, Opcode
+from pans.runtime.wire.messages import AckStatus, DeviceState, MessageType, Opcode, encode_command
 
 from .bench import Bench
 from .rules import NotTried, need, rule
 
 UNKNOWN_OPCODE = 0xEE
+COMMANDS = 260  # past the first byte of their number
+MANY_COMMANDS, AT_ONCE = 65_800, 8  # past 16 bits of their number; as many unacknowledged as a host may have
 MALFORMED, RANGE, STATE, LATE = AckStatus.MALFORMED, AckStatus.OUT_OF_RANGE, AckStatus.WRONG_STATE, AckStatus.TOO_LATE
 
 
 @rule("4.1", "The command after the last one is carried out and acknowledged.")
 def next_command(bench: Bench) -> None:
-    for _ in range(3):
+    for _ in range(COMMANDS):
         bench.done(Opcode.STOP)
 
 
@@ -61,6 +64,14 @@ def refused_mask(bench: Bench) -> None:
     ack = bench.command(Opcode.STOP, number=bench.last_id)
     need(ack.refused_id == first + 2, f"refused id {ack.refused_id}, expected {first + 2}")
     need(ack.refused_mask & 0xF == 0b1010, f"refused mask {ack.refused_mask:#b}, expected it to end in 1010")
+    for _ in range(32):
+        bench.last_id += 1
+        ack = bench.command(Opcode.STOP, number=bench.last_id)
+        wanted = sum(1 << bench.last_id - number for number in (first, first + 2) if bench.last_id - number < 32)
+        need(
+            ack.refused_mask == wanted,
+            f"refused mask {ack.refused_mask:#b} at command {bench.last_id}, expected {wanted:#b}",
+        )
 
 
 @rule("4.5", "An unknown opcode is refused with 1.")
@@ -133,7 +144,7 @@ def plan_ranges(bench: Bench) -> None:
         bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(slots=slots)), f"a slot with {field} {value}")
 
 
-@rule("4.9", "ARM without a complete plan is refused with 4.")
+@rule("4.9", "ARM without a complete plan, or with a pattern of it missing or incomplete, is refused with 4.")
 def arm_without_plan(bench: Bench) -> None:
     bench.open()
     body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
@@ -144,6 +155,17 @@ def arm_without_plan(bench: Bench) -> None:
     bench.done(Opcode.LOAD_PLAN, pack_plan(slots._replace(slots=slots.slots[:1])))
     body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
     bench.refused(STATE, Opcode.ARM, body, "ARM after the first of several pieces of a plan")
+    for number in range(layout.n_patterns):
+        for kept in sorted({0, min(layout.pixels // 2, MAX_PIXELS_PER_CHUNK)}):
+            bench.open()
+            for opcode, part in layout.commands():
+                if opcode != Opcode.LOAD_PATTERN or int.from_bytes(part[:2], "little") != number:
+                    bench.done(opcode, part)
+            if kept:
+                levels = np.zeros(kept, np.uint16)
+                bench.done(Opcode.LOAD_PATTERN, pack_pattern(PatternChunk(number, 0, layout.pixels, levels)))
+            body = pack_arm(Arm(bench.ping().tx_tick + bench.facts["tick_hz"], 1, 1000))
+            bench.refused(STATE, Opcode.ARM, body, f"ARM with {kept} of {layout.pixels} pixels of pattern {number}")
 
 
 @rule(
@@ -212,3 +234,14 @@ def pattern_pieces(bench: Bench) -> None:
     bench.done(Opcode.LOAD_PATTERN, piece(2, 2))
     bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
     bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(4, 1), "a piece behind a gap, after first pixel 0")
+
+
+@rule("4.21", "Command ids go on past 65 536.", long=True)
+def many_commands(bench: Bench) -> None:
+    while bench.last_id < MANY_COMMANDS:
+        ids = range(bench.last_id + 1, bench.last_id + 1 + AT_ONCE)
+        bench.last_id = ids[-1]
+        bench.inbox.clear()
+        bench.send(b"".join(encode_command(number, Opcode.STOP, b"", bench.session) for number in ids))
+        bench.wait(MessageType.ACK, lambda ack: ack.last_id == bench.last_id, what=f"of command {bench.last_id}")
+    bench.done(Opcode.STOP)

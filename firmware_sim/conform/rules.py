@@ -16,28 +16,36 @@ class Broken(Exception):
     """The device did not keep the rule; the text says what it did."""
 
 
+class Silent(Broken):
+    """An answer did not come in time."""
+
+
 class NotTried(Exception):
     """The rule cannot be tried on this device, or not over this link; the text says why."""
 
 
 class Rule(NamedTuple):
-    """One rule of the protocol. `check` returns when it is kept; it is None for what no link can show, and `why` says so."""
+    """One rule of the protocol. `check` returns when it is kept; it is None for what no link can show, and `why` says so.
+
+    A `long` rule takes minutes of device time and is tried only when asked for.
+    """
 
     number: str
     words: str
     check: Check | None
     why: str = ""
+    long: bool = False
 
 
 RULES: dict[str, Rule] = {}
 
 
-def rule(number: str, words: str) -> Callable[[Check], Check]:
+def rule(number: str, words: str, *, long: bool = False) -> Callable[[Check], Check]:
     """Register the function below as the check of rule `number`, "section.place"."""
 
     def register(check: Check) -> Check:
         assert number not in RULES, number
-        RULES[number] = Rule(number, words, check)
+        RULES[number] = Rule(number, words, check, long=long)
         return check
 
     return register

@@ -8,13 +8,27 @@ from __future__ import annotations
 from typing import Any
 
 from pans.runtime.wire.commands import Arm, pack_arm
-from pans.runtime.wire.messages import AckStatus, ClickBlock, DeviceState, FrameBlock, Mark, Opcode, StateReason
+from pans.runtime.wire.messages import (
+    AckStatus,
+    ClickBlock,
+    DeviceState,
+    FrameBlock,
+    Mark,
+    MessageType,
+    Opcode,
+    StateReason,
+)
 
 from .bench import LEASE_MS, PATIENCE_S, STEP_S, Bench
 from .plans import Layout
 from .rules import NotTried, beyond_the_link, need, rule
 
 CYCLES = 12
+MESSAGES = 100  # cycles of three exposures: past the first byte of their numbers
+LONG = 65_800  # exposures: past 16 bits of their numbers
+LONG_RATE_HZ = 4000  # a host in Python takes so many blocks
+LONG_S = 900.0  # that a check is willing to wait for so many
+AHEAD = 4096  # messages that the window is ahead of the latest one, as a host grants them
 LEASE_SLACK_S = 0.05  # of a device that looks at its lease between other things
 MOST_TO_FILL = 3000  # messages that a check is willing to wait for
 
@@ -104,9 +118,11 @@ def renewal(bench: Bench) -> None:
         "SAFE although the lease was renewed",
     )
     bench.grant(lease_ms=300)
+    after, hz = bench.ping().rx_tick, bench.facts["tick_hz"]
     bench.listen(0.15)
     bench.grant()
-    bench.wait_safe(0.15 + LEASE_SLACK_S + 0.2)
+    late = (bench.wait_safe(PATIENCE_S).tick - after) / hz - 0.3
+    need(late <= LEASE_SLACK_S, f"SAFE {late * 1000:.0f} ms after the lease, which a GRANT with 0 must not renew")
 
 
 @rule("4.18", "SAFE outlives the session and takes no ARM; RESET leaves it, and uploads are kept.")
@@ -143,10 +159,13 @@ beyond_the_link(
 
 @rule("5.1", "The stream's sequence starts at 0 with each ARM and counts up by 1.")
 def sequence(bench: Bench) -> None:
-    for _ in range(2):
-        _, _, stream, _ = run_once(bench)
+    for cycles in (CYCLES, MESSAGES):
+        layout = bench.layout(block_exposures=1)
+        _, stream, _ = bench.run(layout, cycles)
         found = [one.seq for one in stream]
-        need(found == list(range(len(found))), f"sequence {found[:12]}...")
+        need(len(found) >= cycles * layout.n_slots, f"{len(found)} messages of {cycles * layout.n_slots} exposures")
+        wrong = next((k for k, seq in enumerate(found) if seq != k), None)
+        need(wrong is None, f"sequence {found[wrong or 0]} in message {wrong}")
 
 
 @rule(
@@ -154,26 +173,31 @@ def sequence(bench: Bench) -> None:
     "A block holds consecutive exposures of one cycle and one object, evenly spaced, and no more than the plan's blocks have.",
 )
 def block_rules(bench: Bench) -> None:
-    layout, _, stream, _ = run_once(bench)
-    following = 0
-    for block in blocks_of(stream):
-        count = exposures_of(block)
-        first_cycle, last_cycle = (
-            block.exposure_index // layout.n_slots,
-            (block.exposure_index + count - 1) // layout.n_slots,
-        )
-        need(
-            block.exposure_index == following,
-            f"a block begins with exposure {block.exposure_index}, expected {following}",
-        )
-        need(count <= layout.block_exposures, f"a block of {count} exposures, the plan's have {layout.block_exposures}")
-        need(first_cycle == last_cycle, f"a block with exposures of cycles {first_cycle} and {last_cycle}")
-        need(
-            block.period_ticks == layout.period_ticks,
-            f"{block.period_ticks} ticks between exposures, the plan has {layout.period_ticks}",
-        )
-        following += count
-    need(following == CYCLES * layout.n_slots, f"{following} exposures, the run has {CYCLES * layout.n_slots}")
+    spacing = bench.layout().period_ticks
+    # As planned; with an uneven spacing within a cycle; and with cycles that follow each other evenly.
+    for changes in ({}, {"block_exposures": 3, "pause_ticks": spacing // 2}, {"block_exposures": 4, "seamless": True}):
+        layout, _, stream, _ = run_once(bench, **changes)
+        following = 0
+        for block in blocks_of(stream):
+            count = exposures_of(block)
+            need(
+                block.exposure_index == following,
+                f"a block begins with exposure {block.exposure_index}, expected {following}",
+            )
+            need(
+                count <= layout.block_exposures,
+                f"a block of {count} exposures, the plan's have {layout.block_exposures}",
+            )
+            cycles = {(following + k) // layout.n_slots for k in range(count)}
+            need(len(cycles) == 1, f"a block with exposures of cycles {min(cycles)} and {max(cycles)}")
+            gaps = {layout.begins(following + k + 1) - layout.begins(following + k) for k in range(count - 1)}
+            need(gaps <= {layout.period_ticks}, f"a block with exposures {sorted(gaps)} ticks apart")
+            need(
+                block.period_ticks == layout.period_ticks,
+                f"{block.period_ticks} ticks between exposures, the plan has {layout.period_ticks}",
+            )
+            following += count
+        need(following == CYCLES * layout.n_slots, f"{following} exposures, the run has {CYCLES * layout.n_slots}")
 
 
 @rule("5.3", "Blocks are CLICKS or FRAMES, as the mode says, and name the pattern that was shown.")
@@ -195,18 +219,40 @@ def shown(bench: Bench) -> None:
 
 @rule(
     "5.4",
-    "An exposure begins at the start tick plus the plan's offset or later, by less than half the spacing, and is no later than its STATUS.",
+    "An exposure begins at the start tick plus the plan's offset or later, by less than half the spacing and as much however long it is, "
+    "and is no later than its STATUS.",
 )
 def timing(bench: Bench) -> None:
-    layout, start, stream, closing = run_once(bench)
-    for block in blocks_of(stream):
-        late = block.tick - start - layout.begins(block.exposure_index)
-        need(late >= 0, f"exposure {block.exposure_index} began {-late} ticks before its time")
-        need(
-            late < layout.period_ticks / 2,
-            f"exposure {block.exposure_index} began {late} ticks late, of a spacing of {layout.period_ticks}",
-        )
-        need(block.tick <= closing.tick, f"a block of tick {block.tick}, and STATUS of tick {closing.tick} after it")
+    least, ticks = [], []
+    for longer in (0.0, 0.5):
+        layout, start, stream, closing = run_once(bench, longer=longer)
+        for block in blocks_of(stream):
+            on_time(layout, start, block)
+            need(
+                block.tick <= closing.tick, f"a block of tick {block.tick}, and STATUS of tick {closing.tick} after it"
+            )
+        least.append(min(lateness(layout, start, block) for block in blocks_of(stream)))
+        ticks.append(layout.exposure_ticks)
+    # The least lateness of many exposures is free of jitter. A tick of the end or the middle moves with the length of the exposure.
+    need(
+        least[1] - least[0] <= max(2, (ticks[1] - ticks[0]) / 4),
+        f"exposures of {ticks[0]} ticks are stamped {least[0]} ticks late, those of {ticks[1]} ticks {least[1]}: not at their begin",
+    )
+
+
+def lateness(layout: Layout, start: int, block: Any) -> int:
+    """Ticks from when a block's first exposure is due to its stamp."""
+    return int(block.tick) - start - layout.begins(block.exposure_index)
+
+
+def on_time(layout: Layout, start: int, block: Any) -> None:
+    """Hold a block's tick against the plan."""
+    late = lateness(layout, start, block)
+    need(late >= 0, f"exposure {block.exposure_index} began {-late} ticks before its time")
+    need(
+        late < layout.period_ticks / 2,
+        f"exposure {block.exposure_index} began {late} ticks late, of a spacing of {layout.period_ticks}",
+    )
 
 
 @rule("5.5", "The object of a block is the number of the visit since ARM, or unknown.")
@@ -231,6 +277,7 @@ def objects(bench: Bench) -> None:
     "No stream message leaves before its sequence is below the limit of the latest GRANT; the limit is 0 in a new session.",
 )
 def window(bench: Bench) -> None:
+    bench.grant()
     bench.open()
     layout = bench.layout(block_exposures=1)
     bench.upload(layout)
@@ -255,25 +302,39 @@ def books(bench: Bench) -> None:
     if not 0 < held <= MOST_TO_FILL:
         raise NotTried(f"a buffer of {held} messages: this check fills buffers of 1 to {MOST_TO_FILL}")
     layout = bench.layout(block_exposures=1, cycles_per_object=1 << 20)
-    cycles = -(-(held + 40) // layout.n_slots) + 10
     bench.upload(layout)
     bench.grant(limit=10)
-    bench.arm(cycles, lease_ms=60_000)
-    bench.until_state(DeviceState.RUNNING)
-    bench.listen(layout.seconds(cycles) / 2)
+    bench.arm(0, lease_ms=60_000)
+    full_s = layout.seconds(-(-(held + 40) // layout.n_slots))
+    # Only when drops have begun does the window open: the blocks behind it must count them.
+    bench.wait(
+        MessageType.STATUS,
+        lambda status: status.drops > 0,
+        full_s + 3 * PATIENCE_S,
+        "that counts drops of a full buffer",
+    )
     bench.grant(limit=20)
-    closing = bench.wait_idle(layout.seconds(cycles) + PATIENCE_S)
+    bench.listen(layout.seconds(CYCLES))
     bench.grant()
     bench.listen(0.3 + held * 1e-3)
-    blocks = blocks_of(bench.stream())
-    before = 0
+    bench.done(Opcode.STOP)
+    closing = bench.until_state(DeviceState.IDLE)
+    bench.listen(0.3)
+    agree(bench.stream(), closing)
+    _, _, again = bench.run(layout, CYCLES)
+    need(again.drops == 0, f"{again.drops} drops in a run without any: they are counted since ARM")
+
+
+def agree(stream: list[Any], closing: Any) -> None:
+    """Hold the drops of each block and of the last STATUS against the exposures' numbers."""
+    blocks, before = blocks_of(stream), 0
     for block in blocks:
         need(
             block.exposure_index == before + block.drops,
             f"exposure {block.exposure_index} after {before} in blocks and {block.drops} drops",
         )
         before += exposures_of(block)
-    need(closing.drops > 0, "nothing was dropped although the buffer must have been full")
+    need(bool(blocks) and blocks[-1].drops > 0, "no block came after the drops that STATUS counted")
     need(
         before + closing.drops == closing.next_exposure,
         f"{before} exposures in blocks, {closing.drops} drops, {closing.next_exposure} in STATUS",
@@ -282,14 +343,21 @@ def books(bench: Bench) -> None:
 
 @rule("5.8", "STOP sends the exposures that have ended in a shorter block, and counts them.")
 def broken_off(bench: Bench) -> None:
-    layout = bench.layout(block_exposures=3)
-    bench.start(layout)
-    bench.listen(4.3 * layout.cycle_ticks / layout.tick_hz)
-    bench.done(Opcode.STOP)
-    status = bench.until_state(DeviceState.IDLE)
-    bench.listen(STEP_S)
-    counted = sum(exposures_of(block) for block in blocks_of(bench.stream()))
-    need(counted == status.next_exposure, f"{counted} exposures in blocks, next exposure {status.next_exposure}")
+    layout = bench.layout(block_exposures=3, longer=4.0)  # an exposure is under way most of the time
+    for stretch in (4.2, 4.3, 4.5, 4.7, 4.8):
+        bench.start(layout)
+        bench.listen(stretch * layout.cycle_ticks / layout.tick_hz)
+        bench.done(Opcode.STOP)
+        status = bench.until_state(DeviceState.IDLE)
+        bench.listen(STEP_S)
+        blocks = blocks_of(bench.stream())
+        counted = sum(map(exposures_of, blocks))
+        need(counted == status.next_exposure, f"{counted} exposures in blocks, next exposure {status.next_exposure}")
+        for block in blocks:
+            ends = block.tick + (exposures_of(block) - 1) * layout.period_ticks + layout.exposure_ticks
+            need(
+                ends <= status.tick, f"a block counts an exposure that ends at tick {ends}, after STOP at {status.tick}"
+            )
 
 
 @rule("5.9", "Bits beyond the last exposure or channel are 0.")
@@ -314,3 +382,78 @@ def closing_repeated(bench: Bench) -> None:
         (again.next_exposure, again.drops) == (closing.next_exposure, closing.drops),
         "two STATUS after the end say different numbers",
     )
+
+
+def long_run(bench: Bench) -> Layout:
+    """Short cycles, fast: numbers of exposures, cycles, objects and messages grow alike. NotTried where that takes too long."""
+    layout = bench.layout(rate_hz=LONG_RATE_HZ)
+    if layout.seconds(LONG) > LONG_S:
+        raise NotTried(f"{LONG} exposures take {layout.seconds(LONG):.0f} s")
+    return layout
+
+
+@rule(
+    "5.11",
+    "Past 65 536 exposures the numbers of messages, exposures and objects go on, and the ticks stay with the plan.",
+    long=True,
+)
+def long_stream(bench: Bench) -> None:
+    layout = long_run(bench)
+    bench.upload(layout)
+    bench.grant(AHEAD)
+    start = bench.arm(0)
+    seen, seq = 0, 0
+    end_ns = bench.link.now_ns() + round((2 * layout.seconds(LONG) + PATIENCE_S) * 1e9)
+    while seen < LONG:
+        need(bench.link.now_ns() < end_ns, f"only {seen} of {LONG} exposures came in twice their time")
+        bench.grant(seq + AHEAD, LEASE_MS)
+        bench.listen(0.1)
+        stream = bench.stream()
+        bench.inbox.clear()
+        for message in stream:
+            need(message.seq == seq, f"sequence {message.seq} after {seq - 1}")
+            seq += 1
+        for block in blocks_of(stream):
+            need(
+                block.exposure_index == seen + block.drops,
+                f"exposure {block.exposure_index} after {seen} in blocks and {block.drops} drops",
+            )
+            need(
+                block.object_index in (block.exposure_index, 0xFFFFFFFF),
+                f"object {block.object_index} in exposure {block.exposure_index} of one cycle per object",
+            )
+            on_time(layout, start, block)
+            seen += exposures_of(block)
+    bench.done(Opcode.STOP)
+    closing = bench.until_state(DeviceState.IDLE)
+    bench.listen(0.3)
+    seen += sum(map(exposures_of, blocks_of(bench.stream())))
+    need(
+        seen + closing.drops == closing.next_exposure,
+        f"{seen} exposures in blocks, {closing.drops} drops, {closing.next_exposure} in STATUS",
+    )
+
+
+@rule("5.12", "More than 65 536 drops are counted, and the stream goes on behind them.", long=True)
+def many_drops(bench: Bench) -> None:
+    layout = long_run(bench)
+    held = int(bench.facts.get("buffer_messages", 0))
+    if not 0 < held <= MOST_TO_FILL:
+        raise NotTried(f"a buffer of {held} messages: this check fills buffers of 1 to {MOST_TO_FILL}")
+    bench.upload(layout)
+    bench.arm(0)
+    seconds = layout.seconds(LONG + held)
+    end_ns = bench.link.now_ns() + round((seconds + 3 * PATIENCE_S) * 1e9)
+    drops = 0
+    while drops < LONG and bench.link.now_ns() < end_ns:
+        bench.grant(0, LEASE_MS)
+        status = bench.wait(MessageType.STATUS)
+        need(status.drops >= drops, f"{status.drops} drops in STATUS after {drops}")
+        drops = status.drops
+    need(drops >= LONG, f"{drops} drops in STATUS after {seconds:.0f} s with a shut window")
+    bench.grant(lease_ms=LEASE_MS)
+    bench.listen(0.3 + held * 1e-3)
+    bench.done(Opcode.STOP)
+    closing = bench.until_state(DeviceState.IDLE)
+    bench.listen(0.3)
+    agree(bench.stream(), closing)

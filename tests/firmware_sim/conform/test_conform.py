@@ -1,4 +1,4 @@
-"""The conformance kit: both devices keep every rule, planted faults are found by the rules that they break, the document says them."""
+"""The conformance kit: both devices keep every rule, devices that go away leave their findings, the document says the rules."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 from c_device import needs_compiler
+from mutants import Mutant, build_quickly, engine, sources_with, tried
 from tree import ROOT
 
 from pans.firmware_sim.conform import RULES, Finding, conform
-from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
-from pans.firmware_sim.engine import SteppedEngine, build, engine_library
+from pans.firmware_sim.device.clock import DeviceClock
+from pans.firmware_sim.engine import CEngine, engine_library, engine_program
 from pans.firmware_sim.ports.serve import SimOptions, build_instrument
 from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
 from pans.runtime.cli import main
@@ -20,58 +21,18 @@ from pans.runtime.errors import LinkError
 from pans.runtime.instrument.profile import load_profile
 
 BEYOND = {"2.8", "4.20"}  # no link can show them
-SOUND = ("1.1", "2.1", "4.1", "5.2", "6.1")  # rules that none of the faults touches
-# Faults in copies of the C sources: file, what stands there, what takes its place; and the rules that must find each.
-FAULTS = {
-    "the lease lasts a fifth longer": (
-        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks + ticks / 5;", {"4.16"},
-    ),
-    "a repeated command is carried out": (
-        "device.c", "if (id == d->ack.last + 1) {", "if (id == d->ack.last + 1 || id == d->ack.last) {", {"4.2"},
-    ),
-    "drops are not counted": ("stream.c", "s->drops += exposures;", "(void)exposures;", {"5.7"}),
-    "the CRC is not looked at": (
-        "frame.c",
-        "return pans_crc32(crc_start(decoder->body[0]), decoder->body, count) == get32(decoder->body + count);",
-        "return true;",
-        {"1.2", "1.3"},
-    ),
-    "the lease lasts a fifth less": (
-        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks - ticks / 5;", {"4.16"},
-    ),
-    "drops are counted twice": ("stream.c", "s->drops += exposures;", "s->drops += 2 * exposures;", {"5.7"}),
-    "the window is ignored": (
-        "stream.c",
-        "return s->held != 0 && ahead != 0 && ahead < 0x80000000u;",
-        "(void)ahead; return s->held != 0;",
-        {"5.6"},
-    ),
-    "departure before arrival": (
-        "answers.c",
-        "put64(body + HEADER_BYTES + 20, d->tick);",
-        "put64(body + HEADER_BYTES + 20, d->tick - 5);",
-        {"6.3"},
-    ),
-    "exposures too early": (
-        "run.c", ".next_tick = start + d->plan.start[0],", ".next_tick = start + d->plan.start[0] - 50,", {"5.4"},
-    ),
-    "a walk that ignores its click": (
-        "walk.c",
-        "d->automaton.row[d->run.node].next[click];",
-        "d->automaton.row[d->run.node].next[click & 0];",
-        {"11.6"},
-    ),
-}  # fmt: skip
-
-
-def tried(name: str, device: SteppedDevice, clock: DeviceClock, *only: str) -> dict[str, Finding]:
-    link = VirtualLink(device, clock, "conform")
-    return {one.number: one for one in conform(link, load_profile(name), pixels=16, only=only)}
-
-
-def engine(name: str, library: Path | None = None, scene: str = "uniform") -> tuple[SteppedEngine, DeviceClock]:
-    clock = DeviceClock(load_profile(name).clock.tick_hz)
-    return SteppedEngine(SimOptions(name, scene), clock.tick_at(START_NS), library=library), clock
+LONG = {number for number, rule in RULES.items() if rule.long}
+SOON_S = 60.0  # of the link's clock: a device that crashed, fell silent or sends damaged frames keeps nobody longer
+RECEIVED = "    d->counters.frames++;\n"
+DEAF_AFTER_GATE = Mutant(
+    "device.c",
+    RECEIVED,
+    "    static bool deaf;\n    deaf = deaf || (body[0] == COMMAND && payload[4] == GATE);\n"
+    "    if (deaf)\n        return;\n" + RECEIVED,
+    {"4.12"},
+)
+CRASHES_AT_GATE = Mutant("device.c", "    case GATE:\n", "    case GATE:\n        __builtin_trap();\n", {"4.12"})
+OTHER_CRC = Mutant("frame.c", "? 0 : PANS_SCHEMA;", "? 0 : PANS_SCHEMA ^ 1;", {"1.2"})
 
 
 @pytest.mark.parametrize("name", ["ideal", "dmd-four-snspd", "dmd-qcmos", "oled-qcmos", "wdm-snspd"])
@@ -81,7 +42,7 @@ def test_the_simulator_keeps_every_rule(name: str) -> None:
     assert set(found) == set(RULES)
     assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
     kept = {number for number, one in found.items() if one.verdict == "kept"}
-    assert {number for number in RULES if number[:2] not in ("11", "13", "14")} - kept == BEYOND
+    assert {number for number in RULES if number[:2] not in ("11", "13", "14")} - kept == BEYOND | LONG
     assert found["1.3"].pieces
     assert {"14.3", "14.4"} <= kept or name != "dmd-four-snspd"
 
@@ -93,45 +54,81 @@ def test_the_reference_instrument_keeps_every_rule(name: str) -> None:
     assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
     assert {
         number for number, one in found.items() if one.verdict == "not tried" and number[:2] not in ("11", "13", "14")
-    } == BEYOND
+    } == BEYOND | LONG
+
+
+@pytest.mark.parametrize(
+    "name", ["ideal", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dmd-spad", "dmd-qcmos"))]
+)
+def test_the_simulator_keeps_the_long_rules(name: str) -> None:
+    device, clock = build_instrument(SimOptions(name, "uniform"), START_NS)
+    found = tried(name, device, clock, long=True)
+    assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
+    assert all(found[number].verdict == "kept" for number in LONG)
 
 
 @needs_compiler
-@pytest.mark.parametrize("fault", list(FAULTS)[:4])
-def test_a_planted_fault_is_found_by_the_rule_that_it_breaks(
-    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["ideal", pytest.param("dmd-spad", marks=pytest.mark.slow)])
+def test_the_reference_instrument_keeps_the_long_rules(name: str) -> None:
+    found = tried(name, *engine(name), long=True)
+    assert {number: one.why for number, one in found.items() if one.verdict == "broken"} == {}
+    assert all(found[number].verdict == "kept" for number in LONG)
+
+
+def mutated(mutant: Mutant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Finding], float]:
+    """Findings of all rules on this mutant, and how many seconds the link's clock went on."""
+    build_quickly(monkeypatch, tmp_path / "cache")
+    device, clock = engine("ideal", engine_library(sources_with(mutant, tmp_path / "sources")))
+    link = VirtualLink(device, clock, "conform")
+    findings = conform(link, load_profile("ideal"), pixels=16)
+    return findings, (link.now_ns() - START_NS) * 1e-9
+
+
+@needs_compiler
+def test_a_device_that_falls_silent_ends_the_test_with_its_findings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rules = FAULTS[fault][3]
-    assert broken_by(fault, tmp_path, monkeypatch, *rules, *SOUND) == rules
+    findings, seconds = mutated(DEAF_AFTER_GATE, tmp_path, monkeypatch)
+    verdicts = {one.number: one.verdict for one in findings}
+    assert seconds < SOON_S
+    assert [number for number, verdict in verdicts.items() if verdict == "gone"] == ["4.12"]
+    assert verdicts["1.1"] == verdicts["4.11"] == "kept"
+    assert verdicts["4.13"] == "broken"  # the device was asked three times more
+    assert {one.why for one in findings if one.number[0] == "5" and one.number not in LONG} == {
+        "the device went away in rule 4.12"
+    }
 
 
 @needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_planted_fault_breaks_few_other_rules(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rules, broken = FAULTS[fault][3], broken_by(fault, tmp_path, monkeypatch)
-    assert rules <= broken
-    assert len(broken - rules) <= 3, f"also {broken - rules}"
+def test_frames_with_another_crc_are_counted_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    findings, seconds = mutated(OTHER_CRC, tmp_path, monkeypatch)
+    assert seconds < SOON_S
+    first = next(one for one in findings if one.number == "1.2")
+    assert first.verdict == "broken"
+    assert re.search(r"[1-9][0-9]* frames? arrived with a wrong CRC: check the CRC's start value", first.why)
+    assert findings[-1].verdict == "not tried"
 
 
-def broken_by(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *only: str) -> set[str]:
-    """The rules that a copy of the C core with this fault breaks."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(build, "FLAGS", ("-std=c99", "-O0"))
-    name, sound, planted, _ = FAULTS[fault]
-    folder = tmp_path / "sources"
-    for path in build.FOLDER.rglob("*.[ch]"):
-        copy = folder / path.relative_to(build.FOLDER)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        text = path.read_text()
-        if path.name == name:
-            assert text.count(sound) == 1, f"{name} no longer says {sound!r}"
-            text = text.replace(sound, planted)
-        copy.write_text(text)
-    found = tried("ideal", *engine("ideal", engine_library(folder)), *only)
-    broken = {number for number, one in found.items() if one.verdict == "broken"}
-    assert all(found[number].why and found[number].pieces for number in broken)
-    return broken
+@needs_compiler
+def test_a_device_that_crashes_leaves_the_findings_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build_quickly(monkeypatch, tmp_path / "cache")
+    program = engine_program(sources_with(CRASHES_AT_GATE, tmp_path / "sources"))
+    rules = [word for number in ("4.1", "4.12", "5.1") for word in ("--rule", number)]
+    for json_words in (["--json"], []):
+        device = CEngine(SimOptions("ideal", "uniform"), "tcp:127.0.0.1:0", program=program)
+        try:
+            assert main(["conform", device.url, "--profile", "ideal", "--pixels", "16", *rules, *json_words]) == 3
+        finally:
+            device.close()
+        out = capsys.readouterr().out
+        if json_words:
+            found = json.loads(out)
+            assert (found["verdict"], found["kept"], found["broken"], found["gone"]) == ("FAIL", 1, [], "4.12")
+            assert [one["verdict"] for one in found["rules"]] == ["kept", "gone", "not tried"]
+        else:
+            assert "the device went away in rule 4.12" in out
 
 
 def test_a_device_that_says_nothing_is_no_device() -> None:

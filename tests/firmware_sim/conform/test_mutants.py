@@ -1,0 +1,338 @@
+"""Single faults planted in the C core: each is found by the rules that it breaks, or listed as one that no link can show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from c_device import needs_compiler
+from mutants import Mutant, build_quickly, engine, sources_with, tried
+
+from pans.firmware_sim.conform import RULES
+from pans.firmware_sim.engine import engine_library
+
+SOUND = ("1.1", "2.1", "4.1", "6.1")  # rules that no fault of the quick set touches
+SLOW_LINE = 100_000  # bytes per second: a fifth of what the fastest stream of rule 6.6 brings
+
+MUTANTS = {
+    # -- frames
+    "a CRC that is not looked at": Mutant(
+        "frame.c",
+        "return pans_crc32(crc_start(decoder->body[0]), decoder->body, count) == get32(decoder->body + count);",
+        "return true;",
+        {"1.2", "1.3"},
+    ),
+    "a frame cut off leaves its group behind": Mutant(
+        "frame.c", "decoder->code = decoder->left = 0;", "decoder->code = 0;", {"1.5"}
+    ),
+    "after a frame that is too long all are skipped": Mutant(
+        "frame.c", "        decoder->skipping = false;\n", "", {"1.6"}
+    ),
+    "a full group gets a zero behind it": Mutant(
+        "frame.c", "if (decoder->code != 0 && decoder->code != 0xFF)", "if (decoder->code != 0)", {"1.9"}
+    ),
+    "a longer PING is taken": Mutant(
+        "device.c", "body[0] == PING && count == 12", "body[0] == PING && count >= 12", {"1.12"}
+    ),
+    # -- sessions
+    "a repeated HELLO starts afresh": Mutant(
+        "device.c", "if (session == d->session && same) {", "if (session == 0 && same) {", {"2.2"}
+    ),
+    "a new session keeps the plan": Mutant("device.c", "    d->plan.complete = d->plan.adaptive = false;\n", "", {"2.3"}),
+    "a new session keeps the patterns": Mutant("device.c", "    forget_patterns(d);\n", "", {"4.9"}),
+    "a new session keeps the command ids": Mutant("device.c", "    d->ack = (struct ack){0};\n", "", {"2.3"}),
+    "frames of another session are taken": Mutant(
+        "device.c", "else if (d->session == 0 || session != d->session)", "else if (d->session == 0)", {"2.4"}
+    ),
+    "another schema gets a session": Mutant(
+        "device.c", "d->session = same ? session : 0;", "d->session = session;", {"2.5"}
+    ),
+    "STATUS every other second": Mutant(
+        "answers.c", "d->status_tick = d->tick + d->limits.tick_hz;", "d->status_tick = d->tick + 2 * d->limits.tick_hz;",
+        {"2.7"},
+    ),
+    "another tick_hz than the profile's": Mutant(
+        "answers.c", 'add_value(map, "tick_hz", l->tick_hz);', 'add_value(map, "tick_hz", l->tick_hz + 1);', {"3.2"}
+    ),
+    "one level": Mutant("answers.c", 'add_value(map, "levels", l->levels);', 'add_value(map, "levels", 1);', {"3.1"}),
+    "automata of another schema": Mutant("internal.h", "0xD00A27FFu", "0xD00A27FEu", {"3.3"}),
+    # -- commands
+    "a repeated command is carried out": Mutant(
+        "device.c", "if (id == d->ack.last + 1) {", "if (id == d->ack.last + 1 || id == d->ack.last) {", {"4.2"}
+    ),
+    "a command behind a gap is carried out": Mutant(
+        "device.c", "if (id == d->ack.last + 1) {", "if (id > d->ack.last) {", {"4.3"}
+    ),
+    "the mask of refusals stands still": Mutant("device.c", "        d->ack.mask <<= 1;\n", "", {"4.4"}),
+    "a mask of 16 refusals": Mutant("device.c", "d->ack.mask <<= 1;", "d->ack.mask = d->ack.mask << 1 & 0xFFFF;", {"4.4"}),
+    "command ids of 8 bits": Mutant("device.c", "uint32_t id = get32(payload);", "uint32_t id = payload[0];", {"4.1"}),
+    "command ids of 16 bits": Mutant(
+        "device.c", "uint32_t id = get32(payload);", "uint32_t id = get16(payload);", {"4.21"}
+    ),
+    "an unknown opcode is out of range": Mutant("device.c", 'PANS_UNKNOWN, "opcode"', 'PANS_RANGE, "opcode"', {"4.5"}),
+    "STOP with a body is carried out": Mutant("device.c", "    if (count != 0)\n", "    if (count > 1000)\n", {"4.6"}),
+    "a level too many": Mutant("patterns.c", "if (level >= d->limits.levels)", "if (level > d->limits.levels)", {"4.7"}),
+    "a pattern too many in a slot": Mutant(
+        "plan.c", "if (pattern >= head->plan.n_patterns)", "if (pattern > head->plan.n_patterns)", {"4.8"}
+    ),
+    "a slot at the end of the cycle": Mutant(
+        "plan.c", "if (get64(slot) >= head->plan.cycle_ticks)", "if (get64(slot) > head->plan.cycle_ticks)", {"4.8"}
+    ),
+    "ARM without its patterns": Mutant(
+        "run.c", "    if (status == PANS_DONE)\n        status = prepare(d);\n",
+        "    if (status == PANS_WRONG_STATE && d->plan.complete)\n        status = PANS_DONE;\n"
+        "    else if (status == PANS_DONE)\n        status = prepare(d);\n", {"4.9"},
+    ),
+    "ARM with a start that has passed": Mutant(
+        "run.c", "if (start <= d->tick)", "if (start + d->limits.tick_hz <= d->tick)", {"4.10"}
+    ),
+    "ARM without a lease": Mutant(
+        "run.c", "if (lease_ms == 0 || lease_ms > MAX_LEASE_MS)", "if (lease_ms > MAX_LEASE_MS)", {"4.10"}
+    ),
+    "ARM while ARMED": Mutant("device.c", "bool needs_idle = opcode <= ARM", "bool needs_idle = opcode < ARM", {"4.11"}),
+    "a gate that comes too late is taken": Mutant("gate.c", "    if (tick <= d->tick)\n", "    if (tick == 0)\n", {"4.12"}),
+    "a gate of 0 ticks": Mutant("gate.c", "if (ticks == 0 || tick >= LAST_TICK)", "if (tick >= LAST_TICK)", {"4.12"}),
+    "a piece of a pattern behind a gap": Mutant(
+        "patterns.c", "piece->first != known->filled || piece->whole", "piece->whole", {"4.13"}
+    ),
+    # -- states and lease
+    "a completed run is called stopped": Mutant(
+        "device.c", "run_end(d, PANS_IDLE, COMPLETED);", "run_end(d, PANS_IDLE, STOPPED);", {"4.14"}
+    ),
+    "a lease after the run": Mutant(
+        "answers.c", "d->run.active ? d->run.lease_tick - d->tick : 0;",
+        "d->run.lease_tick > d->tick ? d->run.lease_tick - d->tick : 0;", {"4.14"},
+    ),
+    "STOP without a reason": Mutant(
+        "device.c", "    run_end(d, PANS_IDLE, STOPPED);\n    if (opcode == RESET",
+        "    run_end(d, PANS_IDLE, NO_REASON);\n    if (opcode == RESET", {"4.15"},
+    ),
+    "the lease lasts a fifth longer": Mutant(
+        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks + ticks / 5;", {"4.16"}
+    ),
+    "the lease lasts a fifth less": Mutant(
+        "run.c", "d->tick + (ticks == 0 ? 1 : ticks);", "d->tick + ticks - ticks / 5;", {"4.16"}
+    ),
+    "a GRANT with 0 renews the lease": Mutant(
+        "device.c", "if (lease_ms != 0 && d->run.active)\n        renew_lease(d, lease_ms);",
+        "if (d->run.active)\n        renew_lease(d, lease_ms == 0 ? 300 : lease_ms);", {"4.17"},
+    ),
+    "no lease is renewed in a run": Mutant(
+        "device.c", "if (lease_ms != 0 && d->run.active)", "if (lease_ms != 0 && d->state == PANS_ARMED)", {"4.17"}
+    ),
+    "a new session leaves SAFE": Mutant(
+        "device.c", "    forget_session(d);\n    send_welcome", "    forget_session(d);\n    d->state = PANS_IDLE;\n    send_welcome",
+        {"4.18"},
+    ),
+    # -- the stream
+    "a number is skipped at 256": Mutant(
+        "stream.c", "    s->sequence++;\n", "    s->sequence += s->sequence == 255 ? 2 : 1;\n", {"5.1"}
+    ),
+    "a sequence of 16 bits": Mutant(
+        "stream.c", "put32(body + HEADER_BYTES, s->sequence);", "put32(body + HEADER_BYTES, (uint16_t)s->sequence);", {"5.11"}
+    ),
+    "exposure numbers of 16 bits": Mutant(
+        "stream.c", "b->exposure = exposure;", "b->exposure = (uint16_t)exposure;", {"5.11"}
+    ),
+    "objects of 16 bits": Mutant(
+        "run.c", "(uint32_t)(run->cycle / p->cycles_per_object % NO_OBJECT)",
+        "(uint16_t)(run->cycle / p->cycles_per_object)", {"5.11"},
+    ),
+    "a limit of 16 bits": Mutant(
+        "device.c", "d->stream.limit = get32(payload);", "d->stream.limit = get16(payload);", {"5.1"}
+    ),
+    "drops of 16 bits": Mutant(
+        "stream.c", "s->drops += exposures;", "s->drops = (uint16_t)(s->drops + exposures);", {"5.12"}
+    ),
+    "a tick of drift per cycle": Mutant(
+        "run.c", "run->cycle_tick += p->cycle_ticks;", "run->cycle_tick += p->cycle_ticks + 1;", {"5.11"}
+    ),
+    "blocks go on after a pause": Mutant(
+        "run.c", " || gap_after(p, run->slot) != p->period_ticks)", ")", {"5.2"}
+    ),
+    "blocks go on into the next cycle": Mutant("run.c", "if (last || d->stream.block", "if (d->stream.block", {"5.2"}),
+    "no spacing in a block of one": Mutant(
+        "stream.c", "put32(at + 24, d->plan.period_ticks);", "put32(at + 24, n == 1 ? 0 : d->plan.period_ticks);", {"5.2"}
+    ),
+    "the pattern of the first slot in each stamp": Mutant(
+        "stream.c", "2u * b->count, d->run.stamp);", "2u * b->count, d->plan.pattern[0]);", {"5.3"}
+    ),
+    "a tick of the exposure's end": Mutant(
+        "stream.c", "b->tick = d->run.began_at;", "b->tick = d->run.began_at + d->plan.exposure_ticks;", {"5.4"}
+    ),
+    "a tick of the exposure's middle": Mutant(
+        "stream.c", "b->tick = d->run.began_at;", "b->tick = d->run.began_at + d->plan.exposure_ticks / 2;", {"5.4"}
+    ),
+    "exposures too early": Mutant(
+        "run.c", ".next_tick = start + d->plan.start[0],", ".next_tick = start + d->plan.start[0] - 50,", {"5.4"}
+    ),
+    "an object per cycle": Mutant(
+        "run.c", "(uint32_t)(run->cycle / p->cycles_per_object % NO_OBJECT)", "(uint32_t)run->cycle", {"5.5"}
+    ),
+    "the window is ignored": Mutant(
+        "stream.c", "return s->held != 0 && ahead != 0 && ahead < 0x80000000u;", "(void)ahead; return s->held != 0;", {"5.6"}
+    ),
+    "a new session keeps the window": Mutant("device.c", "    d->stream.limit = 0;\n", "", {"5.6"}),
+    "drops are not counted": Mutant("stream.c", "s->drops += exposures;", "(void)exposures;", {"5.7"}),
+    "drops are counted twice": Mutant("stream.c", "s->drops += exposures;", "s->drops += 2 * exposures;", {"5.7"}),
+    "no drops in blocks": Mutant("stream.c", "put32(at + 4, d->stream.drops);", "put32(at + 4, 0);", {"5.7"}),
+    "ARM keeps the drops": Mutant(
+        "stream.c", "s->sequence = s->held = s->drops = 0;", "s->sequence = s->held = 0;", {"5.7"}
+    ),
+    "STOP counts the exposure under way": Mutant(
+        "run.c", "    stream_close_block(d);\n    d->run.active", "    if (d->run.exposing)\n        finish(d);\n"
+        "    stream_close_block(d);\n    d->run.active", {"5.8"},
+    ),
+    "STATUS counts the exposure under way at STOP": Mutant(
+        "answers.c", "d->run.active ? d->run.begun : d->run.ended", "d->run.begun", {"5.8"}
+    ),
+    "STOP forgets the block under way": Mutant(
+        "run.c", "    stream_close_block(d);\n    d->run.active", "    d->stream.block.count = 0;\n    d->run.active", {"5.8"}
+    ),
+    "bits of an earlier block": Mutant("stream.c", "(b->count % 8 == 0 ? 0 : *bits) | click", "*bits | click", {"5.9"}),
+    "each STATUS counts on": Mutant("answers.c", "d->run.begun : d->run.ended", "d->run.begun : d->run.ended++", {"5.10"}),
+    # -- probes
+    "nanoseconds of 32 bits": Mutant(
+        "answers.c", "put64(body + HEADER_BYTES + 4, d->pong[0].host_ns);",
+        "put64(body + HEADER_BYTES + 4, (uint32_t)d->pong[0].host_ns);", {"6.1"},
+    ),
+    "a PING is answered twice": Mutant(
+        "device.c", "        take_ping(d, payload);\n", "        take_ping(d, payload), take_ping(d, payload);\n", {"6.2"}
+    ),
+    "departure before arrival": Mutant(
+        "answers.c", "put64(body + HEADER_BYTES + 20, d->tick);", "put64(body + HEADER_BYTES + 20, d->tick - 5);", {"6.3"}
+    ),
+    "a PING held that came at once": Mutant(
+        "answers.c", "get64(payload + 4), d->tick};", "get64(payload + 4), d->tick - d->limits.tick_hz / 10};", {"6.3"}
+    ),
+    "answers starved by the stream": Mutant(
+        "device.c", "if (stream && !(answers && d->stream_was_last)) {", "if (stream) {", {"6.6"}, SLOW_LINE
+    ),
+    "probes starved by the stream": Mutant(
+        "device.c", "    if (d->n_pongs != 0) {", "    if (d->n_pongs != 0 && !stream_may_send(d)) {", {"6.6"}, SLOW_LINE
+    ),
+    # -- automata
+    "masks with a byte too many": Mutant(
+        "patterns.c", "count - 16 != masks * row", "count - 16 < masks * row", {"11.2"}
+    ),
+    "adaptive slots beside fixed ones": Mutant(
+        "plan.c", "if (adaptive != 0 && fixed != 0)", "if (adaptive == UINT32_MAX && fixed != 0)", {"11.3"}
+    ),
+    "a dwell of 0": Mutant(
+        "walk.c", "if (dwell == 0 || dwell > here->dwell_steps)", "if (dwell > here->dwell_steps)", {"11.4"}
+    ),
+    "walks longer than a cycle": Mutant(
+        "walk.c", "if (longest <= d->plan.adaptive_slots && closest", "if (closest", {"11.4"}
+    ),
+    "ARM with half an automaton": Mutant(
+        "run.c", "if (d->automaton.begun && !d->automaton.complete)", "if (d->automaton.n_states == 0xFFFF)", {"11.5"}
+    ),
+    "a walk that goes on into the next cycle": Mutant("run.c", "        run->node = 0;\n", "", {"11.6"}),
+    "a walk that ignores its click": Mutant(
+        "walk.c", "d->automaton.row[d->run.node].next[click];", "d->automaton.row[d->run.node].next[click & 0];", {"11.6"}
+    ),
+    "states of 8 bits": Mutant("walk.c", "*stamp = named->state;", "*stamp = (uint8_t)named->state;", {"11.7"}),
+    "the first SHOW stays": Mutant(
+        "walk.c", "    *place = show;\n", "    if (place->state == 0)\n        *place = show;\n", {"11.7"}
+    ),
+    "SHOW of an exposure that has begun": Mutant(
+        "walk.c", "if (show->exposure < d->run.begun)", "if (show->exposure + UINT32_MAX < d->run.begun)", {"11.8"}
+    ),
+}  # fmt: skip
+
+# What no rule can find, and why.
+EQUIVALENT = {
+    "refusals are not counted": (
+        Mutant("device.c", "            d->counters.refused++;\n", "", set()), "counters of the core are not on the wire",
+    ),
+    "repetitions are not counted": (
+        Mutant("device.c", "        d->counters.repeated++;\n", "        ;\n", set()), "counters of the core are not on the wire",
+    ),
+    "another word in a refusal": (
+        Mutant("answers.c", '", allowed "', '", most "', set()), "texts of refusals are for people",
+    ),
+    "MARK with other photons": (
+        Mutant("stream.c", "float photons = 0;", "float photons = 1;", set()),
+        "the hardware sets the value where it knows it; where it does not, no message goes out",
+    ),
+    "gates stay open after STOP": (
+        Mutant("run.c", "    if (reason != COMPLETED)\n        gates_close(d);\n", "", set()),
+        "outside the link, as rule 4.20 says: a gate needs an oscilloscope",
+    ),
+    "the light stays on after a run": (
+        Mutant("run.c", "    d->hw.dark(d->hw.self);\n", "", set()),
+        "outside the link, as rule 4.20 says: light needs a detector",
+    ),
+    "the core does not ask for patterns at ARM": (
+        Mutant("run.c", "    return require_patterns(d);\n", "    return PANS_DONE;\n", set()),
+        "the light behind the core refuses a plan without its patterns too, with the same status",
+    ),
+    "the core takes half a pattern at ARM": (
+        Mutant(
+            "patterns.c", "d->patterns[i].whole == 0 || d->patterns[i].filled != d->patterns[i].whole",
+            "d->patterns[i].whole == 0", set(),
+        ),
+        "the light behind the core refuses half a pattern too, with the same status",
+    ),
+    "an order of pulses": (
+        Mutant("gate.c", "*pulse = g->at[--g->count];", "*pulse = g->at[g->count - 1]; g->count--;", set()),
+        "the same statement in other words",
+    ),
+}  # fmt: skip
+
+QUICK = (
+    "a number is skipped at 256", "no drops in blocks", "STOP counts the exposure under way", "ARM without its patterns",
+    "a tick of the exposure's end", "a sequence of 16 bits", "drops of 16 bits",
+    "a tick of drift per cycle", "answers starved by the stream", "the lease lasts a fifth longer",
+    "a repeated command is carried out",
+)  # fmt: skip
+
+
+def broken_by(
+    mutant: Mutant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *only: str, long: bool = False
+) -> set[str]:
+    """The rules that a copy of the C core with this fault breaks."""
+    build_quickly(monkeypatch, tmp_path / "cache")
+    library = engine_library(sources_with(mutant, tmp_path / "sources"))
+    found = tried("ideal", *engine("ideal", library, line_bytes_s=mutant.line_bytes_s), *only, long=long)
+    broken = {number for number, one in found.items() if one.verdict in ("broken", "gone")}
+    assert all(found[number].why and found[number].pieces for number in broken)
+    return broken
+
+
+def test_the_faults_are_many_and_name_rules() -> None:
+    assert len(MUTANTS) >= 40
+    assert all(mutant.rules and mutant.rules <= RULES.keys() for mutant in MUTANTS.values())
+    assert {*QUICK} <= MUTANTS.keys()
+
+
+@needs_compiler
+@pytest.mark.parametrize("fault", QUICK)
+def test_a_planted_fault_is_found_by_the_rule_that_it_breaks(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rules = MUTANTS[fault].rules
+    assert broken_by(MUTANTS[fault], tmp_path, monkeypatch, *rules, *SOUND) == rules
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", MUTANTS)
+def test_each_planted_fault_is_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = MUTANTS[fault].rules
+    long = any(RULES[number].long for number in rules)
+    broken = broken_by(MUTANTS[fault], tmp_path, monkeypatch, long=long)
+    assert rules <= broken, f"broken are {sorted(broken)}"
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", EQUIVALENT)
+def test_what_no_link_can_show_is_not_found(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert broken_by(EQUIVALENT[fault][0], tmp_path, monkeypatch, long=True) == set()
+
+
+@needs_compiler
+def test_a_line_that_the_stream_fills_is_no_fault() -> None:
+    found = tried("ideal", *engine("ideal", line_bytes_s=SLOW_LINE))
+    assert {number: one.why for number, one in found.items() if one.verdict in ("broken", "gone")} == {}

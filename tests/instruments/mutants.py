@@ -1,0 +1,97 @@
+"""Copies of the C core with one fault each, and a conformance test of one: for the tests of `pans conform`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from pans.firmware_sim.conform import Finding, conform
+from pans.firmware_sim.device.clock import DeviceClock, SteppedDevice
+from pans.firmware_sim.engine import SteppedEngine, build
+from pans.firmware_sim.ports.serve import SimOptions
+from pans.firmware_sim.ports.virtual import START_NS, VirtualLink
+from pans.runtime.instrument.profile import load_profile
+
+PIECE = 64  # bytes that a slow line takes at once
+
+
+class Mutant(NamedTuple):
+    """A fault: file of the core, what stands there once, what takes its place, and the rules that must find it."""
+
+    file: str
+    sound: str
+    planted: str
+    rules: set[str]
+    line_bytes_s: int = 0  # of the line to the host; 0: it takes everything at once
+
+
+def sources_with(mutant: Mutant, folder: Path) -> Path:
+    """Copy the C sources with the fault in them; fails when the text that it replaces does not stand there exactly once."""
+    for path in build.FOLDER.rglob("*.[ch]"):
+        copy = folder / path.relative_to(build.FOLDER)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_text(path.read_text())
+    text = (folder / mutant.file).read_text()
+    assert text.count(mutant.sound) == 1, f"{mutant.file} says {text.count(mutant.sound)} times {mutant.sound!r}"
+    (folder / mutant.file).write_text(text.replace(mutant.sound, mutant.planted))
+    return folder
+
+
+def build_quickly(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
+    """Compile without optimisation, and keep the result out of the user's cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setattr(build, "FLAGS", ("-std=c99", "-O0"))
+
+
+def engine(
+    name: str, library: Path | None = None, scene: str = "uniform", line_bytes_s: int = 0
+) -> tuple[SteppedDevice, DeviceClock]:
+    """The C core in this process."""
+    clock = DeviceClock(load_profile(name).clock.tick_hz)
+    kind = SteppedEngine if line_bytes_s == 0 else SlowLine
+    device = kind(SimOptions(name, scene), clock.tick_at(START_NS), library=library)
+    if isinstance(device, SlowLine):
+        device.ticks_per_byte = clock.tick_hz / line_bytes_s
+    return device, clock
+
+
+def tried(name: str, device: SteppedDevice, clock: DeviceClock, *only: str, long: bool = False) -> dict[str, Finding]:
+    """Try the rules in virtual time."""
+    link = VirtualLink(device, clock, "conform")
+    return {one.number: one for one in conform(link, load_profile(name), pixels=16, only=only, long=long)}
+
+
+class SlowLine(SteppedEngine):
+    """The C core behind a line of so many bytes per second; what the line does not take yet waits in the device."""
+
+    ticks_per_byte = 1.0
+    _free_tick = 0  # when the line takes the next piece
+
+    def step(self, tick: int, data: bytes) -> bytes:
+        """As SteppedEngine.step, but no more than the line takes by then."""
+        sent = self._drain(tick)
+        self._library.instrument_step(self._handle, tick, data, len(data))
+        self._tick = tick
+        self._raise()
+        return sent + self._drain(tick)
+
+    def next_event_tick(self) -> int | None:
+        """When the line is free again, else when the device does something by itself."""
+        return self._free_tick if self._free_tick > self._tick else super().next_event_tick()
+
+    def _drain(self, tick: int) -> bytes:
+        sent = b""
+        while self._free_tick <= tick:
+            at = max(self._free_tick, self._tick)
+            count = self._library.instrument_output(self._handle, at, self._out, PIECE)
+            self._tick = at
+            sent += self._out.raw[:count]
+            if count:
+                self._free_tick = at + max(1, round(count * self.ticks_per_byte))
+            elif (due := super().next_event_tick()) is not None and due <= tick:
+                self._free_tick = due
+            else:
+                break
+        return sent
