@@ -138,6 +138,10 @@ def plan_ranges(bench: Bench) -> None:
         wrong.append({"n_slots": bench.facts["slot_memory"] + 1})
     for fields in wrong:
         bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(**fields)), f"LOAD_PLAN with {fields}")
+    # All slots moved until the last one begins at the end of the cycle: their spacing is still right.
+    moved = good.slots.copy()
+    moved["offset_ticks"] += np.uint64(good.cycle_ticks) - moved["offset_ticks"][-1]
+    bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(good._replace(slots=moved)), "a slot at the end of the cycle")
     for field, value in (("offset_ticks", good.cycle_ticks), ("pattern", good.n_patterns)):
         slots = good.slots.copy()
         slots[field][-1] = value
@@ -234,6 +238,7 @@ def pattern_pieces(bench: Bench) -> None:
     bench.done(Opcode.LOAD_PATTERN, piece(2, 2))
     bench.done(Opcode.LOAD_PATTERN, piece(0, 2))
     bench.refused(RANGE, Opcode.LOAD_PATTERN, piece(4, 1), "a piece behind a gap, after first pixel 0")
+    bench.done(Opcode.LOAD_PATTERN, piece(2, whole - 2))
 
 
 @rule("4.21", "Command ids go on past 65 536.", long=True)

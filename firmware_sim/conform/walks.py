@@ -101,7 +101,7 @@ def states_need_a_plan(bench: Bench) -> None:
     bench.upload(bench.layout())
     bench.refused(STATE, Opcode.LOAD_STATES, pack_states(four_states(steps)), "LOAD_STATES with fixed patterns")
     mixed = bench.layout(adaptive=SLOTS).chunk()
-    mixed.slots["pattern"][-1] = 0
+    mixed.slots["pattern"][-1] = mixed.slots["shot"][-1] = 0
     bench.refused(RANGE, Opcode.LOAD_PLAN, pack_plan(mixed), "adaptive slots beside a fixed pattern")
 
 

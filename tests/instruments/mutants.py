@@ -25,6 +25,7 @@ class Mutant(NamedTuple):
     planted: str
     rules: set[str]
     line_bytes_s: int = 0  # of the line to the host; 0: it takes everything at once
+    profile: str = "ideal"
 
 
 def sources_with(mutant: Mutant, folder: Path) -> Path:

@@ -71,7 +71,9 @@ MUTANTS = {
     ),
     "an unknown opcode is out of range": Mutant("device.c", 'PANS_UNKNOWN, "opcode"', 'PANS_RANGE, "opcode"', {"4.5"}),
     "STOP with a body is carried out": Mutant("device.c", "    if (count != 0)\n", "    if (count > 1000)\n", {"4.6"}),
-    "a level too many": Mutant("patterns.c", "if (level >= d->limits.levels)", "if (level > d->limits.levels)", {"4.7"}),
+    "a level too many is malformed": Mutant(
+        "patterns.c", 'PANS_RANGE, "level"', 'PANS_MALFORMED, "level"', {"4.7"}, profile="dmd-spad"
+    ),
     "a pattern too many in a slot": Mutant(
         "plan.c", "if (pattern >= head->plan.n_patterns)", "if (pattern > head->plan.n_patterns)", {"4.8"}
     ),
@@ -92,8 +94,8 @@ MUTANTS = {
     "ARM while ARMED": Mutant("device.c", "bool needs_idle = opcode <= ARM", "bool needs_idle = opcode < ARM", {"4.11"}),
     "a gate that comes too late is taken": Mutant("gate.c", "    if (tick <= d->tick)\n", "    if (tick == 0)\n", {"4.12"}),
     "a gate of 0 ticks": Mutant("gate.c", "if (ticks == 0 || tick >= LAST_TICK)", "if (tick >= LAST_TICK)", {"4.12"}),
-    "a piece of a pattern behind a gap": Mutant(
-        "patterns.c", "piece->first != known->filled || piece->whole", "piece->whole", {"4.13"}
+    "first pixel 0 goes on with a pattern": Mutant(
+        "patterns.c", "*pattern = (struct pattern){piece->whole, 0};", "pattern->whole = piece->whole;", {"4.13"}
     ),
     # -- states and lease
     "a completed run is called stopped": Mutant(
@@ -294,7 +296,7 @@ def broken_by(
     """The rules that a copy of the C core with this fault breaks."""
     build_quickly(monkeypatch, tmp_path / "cache")
     library = engine_library(sources_with(mutant, tmp_path / "sources"))
-    found = tried("ideal", *engine("ideal", library, line_bytes_s=mutant.line_bytes_s), *only, long=long)
+    found = tried(mutant.profile, *engine(mutant.profile, library, line_bytes_s=mutant.line_bytes_s), *only, long=long)
     broken = {number for number, one in found.items() if one.verdict in ("broken", "gone")}
     assert all(found[number].why and found[number].pieces for number in broken)
     return broken
