@@ -83,6 +83,8 @@ def _name_last_sign(findings: list[Finding], first: int) -> None:
     at = first - 1 if first > 0 and findings[first - 1].verdict == BROKEN else first
     why = f"{findings[at].why}; the device opens no session any more ({MOST_SILENT} rules tried)"
     findings[at] = findings[at]._replace(verdict=GONE, why=why)
+    if first > 0:  # of a device that never opened a session each try says something about the device
+        findings[at + 1 :] = [one._replace(verdict=NOT_TRIED) for one in findings[at + 1 :]]
 
 
 def _tried(bench: Bench, rule: Rule) -> tuple[Finding, bool]:

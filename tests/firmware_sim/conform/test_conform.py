@@ -93,7 +93,9 @@ def test_a_device_that_falls_silent_ends_the_test_with_its_findings(
     assert seconds < SOON_S
     assert [number for number, verdict in verdicts.items() if verdict == "gone"] == ["4.12"]
     assert verdicts["1.1"] == verdicts["4.11"] == "kept"
-    assert verdicts["4.13"] == "broken"  # the device was asked three times more
+    assert (
+        verdicts["4.13"] == verdicts["4.14"] == verdicts["4.15"] == "not tried"
+    )  # the device was asked three times more
     assert {one.why for one in findings if one.number[0] == "5" and one.number not in LONG} == {
         "the device went away in rule 4.12"
     }
