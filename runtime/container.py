@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import struct
 import zlib
@@ -152,13 +153,56 @@ def read_file(path: str | Path, max_bytes: int = FILE_MAX_BYTES) -> bytes:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > max_bytes:
-                raise DamagedFileError(f"{path}: {size} bytes, allowed at most {max_bytes}")
+                what, taker = other_kind(file.read(KIND_BYTES))
+                found = f", it is {what}" if what else ""
+                raise DamagedFileError(f"{path}: {size} bytes{found}, allowed at most {max_bytes}", remedy=taker)
             data = file.read(max_bytes + 1)  # the file may grow meanwhile
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy="check the disk") from error
     if len(data) > max_bytes:
         raise DamagedFileError(f"{path}: more than {max_bytes} bytes")
     return data
+
+
+# ---- a file of another kind ----
+
+_KINDS = {  # by its first bytes: what a file is, and what takes it
+    "bundle": (rb"PANSBNDL", "a bundle", "`pans run BUNDLE` and `pans evaluate BUNDLE` take it"),
+    "recording": (rb"PANSRECD", "a recording", "`pans replay`, `pans report`, `pans verify` and `pans info` take it"),
+    "scene": (
+        rb"PK\x03\x04",
+        "a .npz archive",
+        "labelled images are a scene (--device 'sim:PROFILE?scene=FILE') or a task of `pans train`",
+    ),
+    "array": (rb"\x93NUMPY", "a .npy array", "`pans bundle` takes patterns and tables"),
+    "picture": (
+        rb"\x89PNG|\xff\xd8\xff|II\*\0|MM\0\*",
+        "a picture",
+        "put pictures into class folders for `pans train FOLDER`",
+    ),
+    "calibration": (rb'\s*\{[^\0]*"format":\s*"pans-calibration"', "a calibration", "give it with --calibration"),
+    "registration": (rb'\s*\{[^\0]*"format":\s*"pans-registration"', "a registration", "give it with --registration"),
+    "profile": (rb"[^\0]*^\[(?:projector|detector)\]", "a hardware profile", "give it with --profile"),
+    "TOML": (
+        rb"(?:[ \t]*(?:#[^\n\0]*)?\r?\n)*[ \t]*(?:\[[\w.\" -]+\]|[\w.\"-]+\s*=\s*\S)",
+        "TOML text",
+        "a hardware profile goes to --profile, options of a run to --config, a flow to --flow",
+    ),
+}
+KIND_BYTES = 1 << 16  # the sections of a profile stand within its first bytes
+
+
+def other_kind(data: bytes, *allowed: str) -> tuple[str, str]:
+    """Return what a file that should be one of the `allowed` kinds is instead, and what takes it; ("", "") where it is not plain.
+
+    >>> other_kind(b"PANSRECD", "bundle")[0]
+    'a recording'
+    """
+    start = data[:KIND_BYTES]
+    for kind, (pattern, words, taker) in _KINDS.items():
+        if re.match(pattern, start, re.MULTILINE):
+            return ("", "") if kind in allowed else (words, taker)
+    return "", ""
 
 
 # ---- chained blocks: an append-only file in which every byte is covered, readable up to where it was cut ----
@@ -195,7 +239,9 @@ def file_prologue(magic: bytes, version: int) -> tuple[bytes, int]:
 def check_prologue(data: bytes, magic: bytes, versions: Collection[int], where: str) -> tuple[int, int]:
     """Return the version and the checksum that seeds the first block; DamagedFileError for a foreign, cut, altered or newer file."""
     if data[: len(magic)] != magic[: len(data)]:
-        raise DamagedFileError(f"{where}: it starts with {data[:8]!a}, expected {magic!a}")
+        what, taker = other_kind(data)
+        found = f"it is {what}" if what else f"it starts with {data[:8]!a}, expected {magic!a}"
+        raise DamagedFileError(f"{where}: not a recording: {found}", remedy=taker)
     if len(data) < FILE_PROLOGUE.size:
         raise DamagedFileError(f"{where}: cut after {len(data)} bytes, nothing of it can be read")
     _, found, crc = FILE_PROLOGUE.unpack_from(data)

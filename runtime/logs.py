@@ -36,6 +36,7 @@ QUEUE_LINES = 10_000
 KIND_MOST, KIND_EVERY_S = 20, 60.0  # events of one kind in that time; a fault that repeats must not fill the disk
 LINE_MAX = 8000
 FIRST_LINE_MAX_BYTES = 1 << 16
+_OTHER_NAME = "choose another name for --log-file"
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 
@@ -221,6 +222,8 @@ class _FileHandler(logging.handlers.RotatingFileHandler):
 
     def __init__(self, path: Path, lines: logging.Formatter, rotate_mb: float | None) -> None:
         self.lost = 0
+        if path.is_dir():  # `/` and `.` have no name beside which old ones could stand
+            raise UsageError(f"{path}: is a folder, expected the name of a file", remedy=_OTHER_NAME)
         for old in (path, *(path.with_name(f"{path.name}.{number}") for number in range(1, KEPT + 1))):
             _check_log(old)
         most = round((ROTATE_MB if rotate_mb is None else rotate_mb) * MIB)
@@ -228,9 +231,7 @@ class _FileHandler(logging.handlers.RotatingFileHandler):
             super().__init__(path, maxBytes=most, backupCount=KEPT, encoding="utf-8", errors="backslashreplace")
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise UsageError(
-                f"{path}: cannot be written to: {reason}", remedy="choose another name for --log-file"
-            ) from error
+            raise UsageError(f"{path}: cannot be written to: {reason}", remedy=_OTHER_NAME) from error
         self.setFormatter(lines)
 
     def handleError(self, record: logging.LogRecord) -> None:
@@ -241,16 +242,15 @@ def _check_log(path: Path) -> None:
     """Refuse to append to, or to rotate away, what is no log of ours."""
     if not os.path.lexists(path):
         return
-    remedy = "choose another name for --log-file"
     if not path.is_file():
-        raise UsageError(f"{path}: is not a regular file", remedy=remedy)
+        raise UsageError(f"{path}: is not a regular file", remedy=_OTHER_NAME)
     try:
         with open(path, "rb") as file:
             line = file.readline(FIRST_LINE_MAX_BYTES)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy=remedy) from error
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}", remedy=_OTHER_NAME) from error
     if line and not is_log_line(line):
-        raise UsageError(f"{path}: exists, and is not a log of pans", remedy=remedy)
+        raise UsageError(f"{path}: exists, and is not a log of pans", remedy=_OTHER_NAME)
 
 
 def is_log_line(line: bytes) -> bool:

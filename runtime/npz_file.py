@@ -22,13 +22,14 @@ from .container import open_regular
 _UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
-def read_arrays(path: str | Path, wanted: Sequence[str], max_bytes: int) -> dict[str, NDArray[Any]]:
-    """Return those of the `wanted` arrays that the file holds, after their sizes were found sane in its directory and in their headers."""
+def read_arrays(path: str | Path, wanted: Sequence[str] | None, max_bytes: int) -> dict[str, NDArray[Any]]:
+    """Return those of the `wanted` arrays (None: all) that the file holds, after their sizes were checked in directory and headers."""
     with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 sizes = {info.filename: info.file_size for info in archive.infolist()}
-                present = [name for name in wanted if f"{name}.npy" in sizes]
+                stored = [name.removesuffix(".npy") for name in sizes if name.endswith(".npy")]
+                present = [name for name in stored if wanted is None or name in wanted]
                 total = sum(sizes[f"{name}.npy"] for name in present)
                 if total > max_bytes:
                     raise ValueError(f"holds {total} bytes of arrays, allowed are {max_bytes}")
@@ -43,11 +44,22 @@ def read_arrays(path: str | Path, wanted: Sequence[str], max_bytes: int) -> dict
 
 
 def _check_header(name: str, member: IO[bytes], size: int) -> None:
-    version = np.lib.format.read_magic(member)
+    shape, _, dtype = npy_header(name, member)
+    claimed = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or claimed > size:
+        raise ValueError(f"{name} claims {claimed} bytes as {dtype} {shape}, the file holds {size}")
+
+
+def npy_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, column-major order and dtype of the .npy array that `file` begins with; ValueError for whatever cannot be."""
+    version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"{name} is stored in npy version {version}, allowed are 1.0 and 2.0")
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(member)
-    claimed = math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or min(shape, default=0) < 0 or claimed > size:
-        raise ValueError(f"{name} claims {claimed} bytes as {dtype} {shape}, the file holds {size}")
+    try:
+        shape, fortran, dtype = read_header(file)
+    except Exception as error:  # numpy hands the text to Python's parser and tokenizer, with the errors of both
+        raise ValueError(f"{name} has a header that cannot be read: {error}") from error
+    if any(isinstance(size, bool) or size < 0 for size in shape):
+        raise ValueError(f"{name} has the shape {shape}, allowed: whole numbers from 0")
+    return shape, fortran, dtype

@@ -69,6 +69,10 @@ def __getattr__(name: str) -> object:
         ) from error
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 def load_bundle(path: str | Path) -> Bundle:
     """Return the bundle at `path` (.pans), or a shipped one by its name; UsageError or DamagedFileError if it cannot be read.
 
@@ -97,7 +101,17 @@ def decide(bundle: Bundle, clicks: ArrayLike, *, shots: int = 1, backend: str = 
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.decide.verdict import checked_counts, verdicts_of
 
-    found = np.asarray(clicks)
+    try:
+        found = np.asarray(clicks)
+    except ValueError as error:
+        raise UsageError(f"clicks are no array: {error}", remedy="give the same number of counts per object") from error
+    if found.size and found.dtype.kind not in "iub":
+        raise UsageError(
+            f"clicks are {found.dtype} {found.shape}, allowed: integers, words (n,) or counts (n, {bundle.n_features}) from 0 to "
+            f"{shots * bundle.largest}",
+            remedy="give whole numbers of clicks; means times shots are counts",
+        )
+    found = found.astype(np.int64) if found.dtype.kind != "u" else found
     if found.ndim == 1:
         if bundle.largest > 1:
             raise UsageError(f"words of clicks, but {bundle.name} takes photon numbers", remedy="give counts (n, d_f)")

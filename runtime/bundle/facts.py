@@ -6,6 +6,7 @@ allowed, for the caller to say where.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -139,15 +140,30 @@ class Bundle:
             raise ValueError(f"{self.name} has no automaton")
         return self.light_of(self.automaton)
 
+    def __repr__(self) -> str:
+        """Return the facts in a line; the hash is that of the file."""
+        from .format import bundle_bytes  # which needs this module
+
+        rows, columns = self.image_shape
+        outputs = f"{self.n_classes} classes" if self.picture_shape is None else "a picture"
+        return (
+            f"<Bundle {self.name!r}: {self.task}, {self.n_patterns} patterns of {rows} x {columns} pixels, {outputs}, "
+            f"{' and '.join(self._parts()) or 'no back end'}, SHA-256 {hashlib.sha256(bundle_bytes(self)).hexdigest()[:12]}>"
+        )
+
+    def _parts(self) -> list[str]:
+        """Return what decides, in words."""
+        parts = {"table": self.table, "head": self.head_onnx, "automaton": self.automaton, "int8 head": self.int8_head}
+        return [name for name, part in parts.items() if part is not None]
+
     def _repr_html_(self) -> str:
         """Return what a notebook shows: facts and the first patterns."""
-        parts = {"table": self.table, "head": self.head_onnx, "automaton": self.automaton, "int8 head": self.int8_head}
         rows = {
             "task": self.task,
             "classes": self.classes,
             "encoder": self.encoder,
             "patterns": f"{self.n_patterns} of {self.image_shape[0]} x {self.image_shape[1]}, {self.levels} levels",
-            "decides by": tuple(name for name, part in parts.items() if part is not None),
+            "decides by": tuple(self._parts()),
             "illumination per shot (photons)": self.illumination(),
             **{f"expected {name}": value for name, value in (self.expected or {}).items()},
         }

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import FILE_MAX_BYTES, MIB, canonical_json, parse_json_object
+from pans.runtime.container import FILE_MAX_BYTES, KIND_BYTES, MIB, canonical_json, other_kind, parse_json_object
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.ranges import Range, demand
 
@@ -200,7 +200,9 @@ def _check_prologue(source: _Source) -> tuple[int, int, bytes]:
     demand(size <= FILE_MAX_BYTES, f"{size} bytes, allowed at most {FILE_MAX_BYTES}")
     start = source.read(0, min(size, _PROLOGUE.size))
     if start[: len(MAGIC)] != MAGIC[: len(start)]:
-        raise ValueError(f"not a PANS bundle: it starts with {start[:8]!a}, expected {MAGIC!a}")
+        what, taker = other_kind(source.read(0, min(size, KIND_BYTES)))
+        found = f"it is {what}" if what else f"it starts with {start[:8]!a}, expected {MAGIC!a}"
+        raise DamagedFileError(f"not a PANS bundle: {found}", remedy=taker)
     smallest = _PROLOGUE.size + 2 + _DIGEST_BYTES
     demand(size >= smallest, f"truncated: {size} bytes, a bundle has at least {smallest}")
     _, version, header_length = _PROLOGUE.unpack_from(start)

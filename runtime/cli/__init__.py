@@ -16,6 +16,7 @@ from .command import (
     Command,
     add_force,
     add_new_bundle,
+    new_file,
 )
 from .main import main
 from .talk import emit, note, say, warn
@@ -33,6 +34,7 @@ __all__ = [
     "add_new_bundle",
     "emit",
     "main",
+    "new_file",
     "note",
     "say",
     "warn",

@@ -30,7 +30,15 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
+def new_file(text: str) -> Path:
+    """Return the path of a file to write, for argparse: `/`, `.` and nothing name none, and have no name that others could be made of."""
+    path = Path(text)
+    if not path.name or path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is a folder, expected the name of a file")
+    return path
+
+
 def add_new_bundle(parser: argparse.ArgumentParser, metavar: str = "OUT.pans") -> None:
     """Add `-o` and `--force` of a command whose work is a bundle."""
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar=metavar, help="the bundle to write")
+    parser.add_argument("-o", "--out", type=new_file, required=True, metavar=metavar, help="the bundle to write")
     add_force(parser)

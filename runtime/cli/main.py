@@ -40,8 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     begin(words)
     try:
         code = _run(words)
-    except KeyboardInterrupt:
-        return fail(PansError("interrupted"), EXIT_INTERRUPTED)
+    except KeyboardInterrupt as interrupt:
+        return fail(_interrupted(interrupt), EXIT_INTERRUPTED)
     except BrokenPipeError:
         _silence()  # the reader of our output went away: nothing more can be said to it
         return EXIT_FINE
@@ -83,6 +83,9 @@ def _logged(command: Command, args: argparse.Namespace, words: Sequence[str]) ->
     try:
         with reading_bar():
             code = command.run(args)
+    except KeyboardInterrupt as interrupt:
+        LOGGER.warning("ends: %s", _interrupted(interrupt).message)
+        raise
     except BaseException as error:
         LOGGER.error("ends by an error: %s: %s", type(error).__name__, error)
         raise
@@ -131,6 +134,11 @@ def _known(error: Exception) -> PansError | None:
         package = error.name.partition(".")[0]
         return missing_extra("this", package, EXTRAS[package]) if package in EXTRAS else None
     return None
+
+
+def _interrupted(interrupt: KeyboardInterrupt) -> PansError:
+    """Return what ended the command, in words: a signal's handler says which signal it was."""
+    return PansError(str(interrupt) or "interrupted")
 
 
 def _internal(error: Exception) -> PansError:

@@ -221,8 +221,10 @@ def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
     try:
         ready = _prepare(job, started_ns)
         load_ahead()
-    except BaseException:
-        _close_quietly(opening)
+    except BaseException as error:
+        besides = _closed_quietly(opening)
+        if besides and isinstance(error, PansError):
+            error.message += f"\nbesides, the device could not be opened: {besides}"
         raise
     for warning in ready.dark.warnings:
         warn(warning)
@@ -379,11 +381,13 @@ def process_start_ns() -> int:
         return now_ns
 
 
-def _close_quietly(opening: _Background[Any]) -> None:
+def _closed_quietly(opening: _Background[Any]) -> str:
+    """Close the link that is being opened; return why it could not be, "" where it could."""
     try:
         opening.result().close()
     except Exception as error:
-        say(f"pans: besides, the device could not be opened: {error}")
+        return str(error)
+    return ""
 
 
 def _exit_code(summary: Summary) -> int:

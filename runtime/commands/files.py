@@ -341,19 +341,18 @@ def _load_array(path: Path) -> NDArray[Any]:
     import numpy as np
 
     from pans.runtime.container import read_file
+    from pans.runtime.npz_file import npy_header
 
     data = read_file(path)
     stream = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(stream)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
-        shape, fortran, dtype = read(stream)
+        shape, fortran, dtype = npy_header("it", stream)
         if dtype.kind != "f":
             raise ValueError(f"dtype {dtype}, allowed: floats")
         wanted = math.prod(shape) * dtype.itemsize
         if len(data) - stream.tell() != wanted:
             raise ValueError(f"{len(data) - stream.tell()} bytes of data, its shape {shape} needs {wanted}")
-    except (ValueError, KeyError, EOFError) as error:
+    except ValueError as error:
         raise DamagedFileError(
             f"{path}: not a readable .npy array: {error}", remedy="write it with numpy.save"
         ) from error

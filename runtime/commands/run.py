@@ -19,6 +19,7 @@ from pans.runtime.cli import EXIT_FINE, Command, add_force, emit
 from pans.runtime.decide.names import backend_names
 from pans.runtime.errors import UsageError, as_usage_error
 from pans.runtime.instrument.profile import load_profile
+from pans.runtime.link.base import checked_scheme
 from pans.runtime.live.config import AUTO, TURNS
 from pans.runtime.operate.option_file import add_option_file, prepare_options, write_options
 from pans.runtime.run_folder import RUNS
@@ -224,6 +225,7 @@ def profile_of(device: str) -> str:
     """A `sim:PROFILE?...` URL names its profile; a real instrument's must be given."""
     if device.startswith("sim:"):
         return device[4:].partition("?")[0]
+    checked_scheme(device)
     raise UsageError(f"no profile for {device}", remedy="give the instrument's hardware profile with --profile")
 
 

@@ -29,6 +29,8 @@ STATE_MAX_BYTES = 1 << 16
 
 def check_run_files(job: Job) -> None:
     """Check every output of `job` before anything is opened; UsageError if one exists, is an input, or cannot be written."""
+    if job.record is not None and job.record.is_dir():  # `/` has no name that the page's could be made of
+        raise UsageError(f"{job.record}: is a folder, expected the name of a file", remedy="choose another name")
     inputs = input_files(job)
     outputs = [path for path in (job.recording, job.page, job.trace) if path is not None]
     if job.recording is not None and job.continuous.limits is not None:

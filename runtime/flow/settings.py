@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pans.runtime import SHIPPED
-from pans.runtime.container import read_file
+from pans.runtime.container import other_kind, read_file
 from pans.runtime.core.plan import Plan
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.instrument.checked_toml import position_of, read_toml
@@ -97,7 +97,13 @@ def read_flow(name: str) -> FlowSettings:
     """Read settings from a TOML file, or from the shipped `cells` or `tape`; ConfigError with file:line:col for what is wrong."""
     path = SHIPPED / f"flow-{name}.toml" if name in KINDS else Path(name)
     try:
-        text = read_file(path, MAX_FILE_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
+        data = read_file(path, MAX_FILE_BYTES)
+        what, taker = other_kind(data, "TOML")
+        if what:
+            raise ConfigError(f"{path}: not the settings of a flow: it is {what}", remedy=taker)
+        text = data.decode("utf-8-sig").replace("\r\n", "\n")
+    except ConfigError:
+        raise
     except (PansError, UnicodeDecodeError) as error:
         reason = error.message if isinstance(error, PansError) else error
         raise ConfigError(

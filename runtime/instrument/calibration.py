@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.container import canonical_json, parse_json_object, read_file
+from pans.runtime.container import canonical_json, other_kind, parse_json_object, read_file
 from pans.runtime.errors import ConfigError, DamagedFileError
 from pans.runtime.outputs import write_file
 from pans.runtime.ranges import Range, number_text
@@ -141,6 +141,9 @@ def sealed(values: Mapping[str, Any], format_name: str, version: int) -> bytes:
 
 def unsealed(data: bytes, where: str, format_name: str, version: int) -> dict[str, Any]:
     """Return what the bytes of a file hold; DamagedFileError for another format, or where the checksum does not fit."""
+    what, taker = other_kind(data, format_name.removeprefix("pans-"))
+    if what:
+        raise DamagedFileError(f"{where}: not a {format_name.removeprefix('pans-')}: it is {what}", remedy=taker)
     values = parse_json_object(data, where)
     if values.get("format") != format_name or values.get("version") != version:
         found = f"{ascii(values.get('format'))[:40]} {ascii(values.get('version'))[:20]}"

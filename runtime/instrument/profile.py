@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.container import other_kind
 from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.html_card import html_card
 from pans.runtime.imaging import IDENTITY, Imaging, Tolerance, checked_flat
@@ -305,6 +306,9 @@ def _read_flat(path: Path) -> NDArray[np.float64]:
 def _decoded(data: bytes, where: str) -> str:
     if len(data) > MAX_PROFILE_BYTES:
         raise _too_large(where)
+    what, taker = other_kind(data, "profile", "TOML")
+    if what:
+        raise ConfigError(f"{where}: not a hardware profile: it is {what}", remedy=taker)
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")  # the same hash and positions whichever system saved it
     except UnicodeDecodeError as error:

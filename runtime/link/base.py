@@ -6,6 +6,7 @@ by entry point, see docs/how-to/own-device.md); reader.py reads from any of them
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
@@ -49,20 +50,38 @@ def open_link(url: str) -> Link:
 
     Raises UsageError for a URL that makes no sense and LinkError for a device that cannot be reached.
     """
-    scheme, colon, rest = url.partition(":")
-    if not colon or not rest:
-        raise UsageError(
-            f"{url!r} is no device URL", remedy="write scheme:target, for example sim:ideal or serial:/dev/ttyACM0"
-        )
+    scheme, points = checked_scheme(url)
+    rest = url.partition(":")[2]
     if scheme == "serial":
         return SerialLink(rest.removeprefix("//"))
     if scheme == "usb":
         return UsbLink(rest)
-    points = {point.name: point for point in entry_points(group="pans.devices")}
-    if scheme not in points:
-        known = ", ".join(sorted({"serial", "usb", *points}))
-        raise UsageError(f"unknown device scheme {scheme!r} in {url!r}", remedy=f"known: {known}")
     return _checked_link(points[scheme], url)
+
+
+def checked_scheme(url: str) -> tuple[str, dict[str, EntryPoint]]:
+    """Return the scheme of `url` and the schemes of other packages; UsageError, with the URL that was probably meant, for no device URL."""
+    scheme, _, rest = url.partition(":")
+    points = {point.name: point for point in entry_points(group="pans.devices")}
+    known = sorted({"serial", "usb", *points})
+    if rest and scheme in known:
+        return scheme, points
+    for pattern, meant in _MEANT:
+        if found := pattern.fullmatch(url):
+            raise UsageError(f"{url!r} is no device URL", remedy=f"did you mean {found.expand(meant)}?")
+    if rest:
+        raise UsageError(f"unknown device scheme {scheme!r} in {url!r}", remedy=f"known: {', '.join(known)}")
+    raise UsageError(
+        f"{url!r} is no device URL", remedy="write scheme:target, for example sim:ideal or serial:/dev/ttyACM0"
+    )
+
+
+_MEANT = (  # what looks like a device, and the URL of it
+    (re.compile(r"(?i)com\d+|/dev/.+"), r"serial:\g<0>"),
+    (re.compile(r"(?:tcp:|socket:)?(?://)?([\w.-]+:\d{1,5})"), r"serial:socket://\1"),
+    (re.compile(r"(?:replay:)?(.+\.pansrec)"), r"`pans replay \1`"),
+    (re.compile(r"([\w./-]+\.toml)"), r"sim:\1"),
+)
 
 
 def _checked_link(point: EntryPoint, url: str) -> Link:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime import __version__
-from pans.runtime.container import read_file
+from pans.runtime.container import other_kind, read_file
 from pans.runtime.errors import ConfigError, PansError, UsageError
 from pans.runtime.instrument.checked_toml import position_of, read_toml
 from pans.runtime.outputs import check_outputs, write_file
@@ -89,9 +89,16 @@ def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
 def _read(path: Path, options: Mapping[str, argparse.Action]) -> tuple[dict[str, Any], Any]:
     """Return the keys of the file with their values, and a call that says where a key stands."""
     try:
-        text = read_file(path, FILE_MAX_BYTES).decode()
+        data = read_file(path, FILE_MAX_BYTES)
+        what, taker = other_kind(data, "TOML")
+        if what:
+            remedy = f"{taker}; `pans run ... --write-config FILE` writes a file of options"
+            raise ConfigError(f"{path}: not a file of options: it is {what}", remedy=remedy)
+        text = data.decode()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}:1:1: not UTF-8: {error.reason} at byte {error.start}") from error
+    except ConfigError:
+        raise
     except PansError as error:
         raise type(error)(error.message, remedy="name a TOML file that --write-config has written") from error
     given, positions = read_toml(text, str(path))

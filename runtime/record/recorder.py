@@ -267,7 +267,13 @@ class Recorder:
         end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
         self._write_block(Kind.END, canonical_json(end))
         self.sync()
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            raise RecordingError(
+                f"{self.path}: the disk failed when the recording was closed: {error.strerror or error}",
+                remedy="check the disk, and the file with `pans verify`",
+            ) from error
         return digest
 
     def begin(self) -> None:
@@ -357,7 +363,8 @@ class Recorder:
         """Close at the last whole block: a torn one in the middle would make everything behind it unreadable."""
         with suppress(OSError):  # otherwise the reader stops at the torn block by itself
             self._file.truncate(self._end)
-        self._file.close()
+        with suppress(OSError):  # the first error says what is wrong
+            self._file.close()
         reason = error.strerror or str(error)
         return RecordingError(
             f"{self.path}: the recording stops after {self._end} bytes: {reason}",

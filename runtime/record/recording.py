@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.model import Bundle, read_bundle
 from pans.runtime.container import (
     FILE_PROLOGUE,
+    KIND_BYTES,
     MIB,
     Block,
     check_prologue,
@@ -242,7 +243,10 @@ def _checked_event(event: dict[str, Any], where: str) -> dict[str, Any]:
 
 def _start(file: Any, where: str) -> tuple[int, int]:
     """Read the prologue: the format version and the checksum that seeds the first block."""
-    return check_prologue(file.read(FILE_PROLOGUE.size), MAGIC, READABLE_VERSIONS, where)
+    start = file.read(FILE_PROLOGUE.size)
+    if not start.startswith(MAGIC):
+        start += file.read(KIND_BYTES)  # to say what it is
+    return check_prologue(start, MAGIC, READABLE_VERSIONS, where)
 
 
 def _blocks(file: Any, version: int, chain: int, where: str) -> Iterator[Block]:

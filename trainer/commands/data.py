@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, say
+from pans.runtime.cli import EXIT_FINE, Command, add_force, emit, new_file, say
 from pans.runtime.errors import PansError, UsageError
 from pans.runtime.outputs import check_outputs, write_file
 from pans.trainer.tasks.generators import GENERATORS
@@ -28,7 +28,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
         "action", choices=("list", "fetch", "scene"), help="what is there, fetch what is not, or write a scene"
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="public sets (default: all), or the scene's one task")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE.npz", help="the scene to write")
+    parser.add_argument("-o", "--out", type=new_file, metavar="FILE.npz", help="the scene to write")
     parser.add_argument("--objects", type=int, metavar="N", help="the first N objects of the part (default: all)")
     parser.add_argument("--part", choices=PARTS, default="test", help="which objects (default: held out, test)")
     parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of drawn tasks (default 0)")

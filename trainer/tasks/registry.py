@@ -11,7 +11,6 @@ any stretch of them holds all classes in their shares: folders are read class by
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
@@ -25,6 +24,7 @@ from pans.runtime.bundle.optics import Light, Optics
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.guests import load_guest
 from pans.runtime.images import read_class_folder, to_8_bits
+from pans.runtime.npz_file import read_arrays
 
 from .generators import GENERATORS
 from .public_sets import PUBLIC_SETS, check_pinned, data_folder, file_sha256, read_idx
@@ -227,13 +227,8 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     if path.stat().st_size > FILE_MAX_BYTES:
         raise UsageError(f"{path}: {path.stat().st_size} bytes, allowed at most {FILE_MAX_BYTES}")
     try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(item.file_size for item in archive.infolist())
-        if unpacked > IMAGES_MAX_BYTES:
-            raise UsageError(f"{path}: unpacks to {unpacked} bytes, allowed at most {IMAGES_MAX_BYTES}")
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        return read_arrays(path, None, IMAGES_MAX_BYTES)
+    except ValueError as error:
         raise DamagedFileError(f"{path}: cannot be read: {error}") from error
 
 
