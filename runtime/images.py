@@ -21,7 +21,14 @@ from .npz_file import read_arrays
 
 FULL_SCALE_16 = 65535
 LABELLED_MAX_BYTES = 1024 * MIB
-FAULTS_SHOWN = 20  # of a folder; the rest is counted
+FAULTS_SHOWN = 5  # of each kind in a folder; the rest is counted
+DAMAGED, STRANGE, SIZE, PLACE = (
+    "cannot be read",
+    "hold what is not taken",
+    "have another size",
+    "are in the wrong place",
+)
+KINDS_OF_FAULT = (DAMAGED, STRANGE, SIZE, PLACE)  # in the order in which they are told: damaged files are the fewest
 PILLOW_REMEDY = "pip install pillow"
 LITTER = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx"))
 PICTURE_SUFFIXES = frozenset((".png", ".tif", ".tiff", ".pgm", ".jpg", ".jpeg", ".bmp"))
@@ -49,7 +56,8 @@ def read_class_folder(folder: Path, pixels_max: int) -> LabelledPictures:
     beside = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in PICTURE_SUFFIXES]
     if classes:
         remedy = "move it into its class's folder"
-        found.faults += [UsageError(f"{one}: a picture beside the class folders", remedy=remedy) for one in beside]
+        for one in beside:
+            found.fault(PLACE, UsageError(f"{one}: a picture beside the class folders", remedy=remedy))
     for label, name in enumerate(classes):
         found.take_class(folder / name, label)
     if not found.images and not found.faults:
@@ -65,22 +73,25 @@ class _Found:
     def __init__(self, pixels_max: int) -> None:
         self.images: list[NDArray[np.uint8]] = []
         self.labels: list[int] = []
-        self.faults: list[PansError] = []
+        self.faults: dict[str, list[PansError]] = {}  # by kind
         self.digest = hashlib.sha256()
         self._pixels_left = pixels_max
         self._first = ""  # the picture whose size all others must have
+
+    def fault(self, kind: str, error: PansError) -> None:
+        """Keep one fault."""
+        self.faults.setdefault(kind, []).append(error)
 
     def take_class(self, folder: Path, label: int) -> None:
         """Read the pictures of one class."""
         inside = _entries(folder)
         remedy = "one folder per class, the pictures directly inside: flatten it, or name the folder above the classes"
         nested = [entry for entry in inside if entry.is_dir()]
-        self.faults += [
-            UsageError(f"{one}: a folder within the class folder {folder.name!r}", remedy=remedy) for one in nested
-        ]
+        for one in nested:
+            self.fault(PLACE, UsageError(f"{one}: a folder within the class folder {folder.name!r}", remedy=remedy))
         if not inside:
             remedy = "remove it, or put the class's pictures in"
-            self.faults.append(UsageError(f"{folder}: a class folder without pictures", remedy=remedy))
+            self.fault(PLACE, UsageError(f"{folder}: a class folder without pictures", remedy=remedy))
         for path in inside:
             if not path.is_dir():
                 self._take(path, label)
@@ -91,13 +102,13 @@ class _Found:
         except PansError as error:
             if error.remedy == PILLOW_REMEDY:  # it holds for all of them
                 raise
-            self.faults.append(error)
+            self.fault(DAMAGED if isinstance(error, DamagedFileError) else STRANGE, error)
             return
         self._pixels_left -= image.size
         if self.images and image.shape != self.images[0].shape:
             size, first = (f"{one.shape[1]} x {one.shape[0]}" for one in (image, self.images[0]))
             words = f"{path}: {size} pixels, the first image ({self._first}) has {first}"
-            self.faults.append(UsageError(words, remedy="all images of a task have one size: resize them"))
+            self.fault(SIZE, UsageError(words, remedy="all images of a task have one size: resize them"))
             return
         self._first = self._first or path.name
         self.digest.update(image.tobytes())
@@ -105,14 +116,20 @@ class _Found:
         self.labels.append(label)
 
 
-def _all_of(folder: Path, faults: list[PansError]) -> PansError:
-    """Return one error that lists the faults, the first FAULTS_SHOWN of them in full."""
-    if len(faults) == 1:
-        return faults[0]
-    remedies = "; ".join(dict.fromkeys(fault.remedy for fault in faults if fault.remedy))
-    more = len(faults) - FAULTS_SHOWN
-    shown = [fault.message for fault in faults[:FAULTS_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
-    return UsageError("\n".join([f"{folder}: {len(faults)} faults", *shown]), remedy=remedies)
+def _all_of(folder: Path, faults: dict[str, list[PansError]]) -> PansError:
+    """Return one error: a table of the kinds of fault with their counts, then some faults of each kind."""
+    of_kind = {kind: faults[kind] for kind in KINDS_OF_FAULT if kind in faults}
+    every = [fault for found in of_kind.values() for fault in found]
+    if len(every) == 1:
+        return every[0]
+    lines = [f"{folder}: {len(every)} faults"]
+    if len(of_kind) > 1:
+        lines += [f"{len(found):>7}  {kind}" for kind, found in of_kind.items()]
+    for kind, found in of_kind.items():
+        lines += [f"{kind}:", *(f"  {fault.message}" for fault in found[:FAULTS_SHOWN])]
+        lines += [f"  and {len(found) - FAULTS_SHOWN} more"] if len(found) > FAULTS_SHOWN else []
+    remedies = "; ".join(dict.fromkeys(fault.remedy for fault in every if fault.remedy))
+    return UsageError("\n".join(lines), remedy=remedies)
 
 
 def _entries(folder: Path) -> list[Path]:

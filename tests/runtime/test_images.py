@@ -95,3 +95,22 @@ def test_all_faults_of_a_folder_are_listed_at_once(tmp_path):
     ):
         assert any(name in line and fault in line for line in lines[1:]), name
     assert caught.value.remedy.count(";") == 4  # five remedies
+
+
+def test_damaged_files_come_first_among_many_faults(tmp_path):
+    """Two damaged files, last by name, among 30 of another size: a table of both kinds, the damaged ones first, each named."""
+    (tmp_path / "cats").mkdir()
+    for number in range(31):
+        side = 4 if number == 0 else 5
+        Image.fromarray(np.zeros((side, side), np.uint8)).save(tmp_path / f"cats/{number:02}.png")
+    for name in ("y.png", "z.png"):
+        (tmp_path / "cats" / name).write_bytes(b"\x89PNG cut")
+    with pytest.raises(UsageError) as caught:
+        read_class_folder(tmp_path, 10_000)
+    lines = caught.value.message.split("\n")
+    assert lines[0] == f"{tmp_path}: 32 faults"
+    assert [line.split(maxsplit=1) for line in lines[1:3]] == [["2", "cannot be read"], ["30", "have another size"]]
+    assert "y.png" in lines[4]
+    assert "z.png" in lines[5]
+    assert lines[-1] == "  and 25 more"
+    assert len(lines) < 20
