@@ -237,6 +237,12 @@ class _FileHandler(logging.handlers.RotatingFileHandler):
     def handleError(self, record: logging.LogRecord) -> None:
         self.lost += 1
 
+    def close(self) -> None:
+        try:
+            super().close()
+        except OSError:  # the disk failed with the last lines
+            self.lost += 1
+
 
 def _check_log(path: Path) -> None:
     """Refuse to append to, or to rotate away, what is no log of ours."""

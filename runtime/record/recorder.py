@@ -117,11 +117,13 @@ class Recorder:
             return self._drop_unplaced()
         try:
             self.flush()
+            self._close_file()
         except PansError:
             if error[1] is None:
                 raise
         finally:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()  # where `flush` failed
             self._drop_unplaced()
 
     @property
@@ -267,6 +269,11 @@ class Recorder:
         end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
         self._write_block(Kind.END, canonical_json(end))
         self.sync()
+        self._close_file()
+        return digest
+
+    def _close_file(self) -> None:
+        """Close the file; RecordingError, which names it, where the disk fails only then."""
         try:
             self._file.close()
         except OSError as error:
@@ -274,7 +281,6 @@ class Recorder:
                 f"{self.path}: the disk failed when the recording was closed: {error.strerror or error}",
                 remedy="check the disk, and the file with `pans verify`",
             ) from error
-        return digest
 
     def begin(self) -> None:
         """Take the place of what is replaced, if that has not been done; RecordingError if it cannot be."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from automata import automaton_bundle, diamond, random_automaton
 
 import pans
+from pans.runtime import SHIPPED
 from pans.runtime.errors import UsageError
 
 DEVICE = "sim:oled-qcmos?scene=fashion200&seed=1&pace=fast"
@@ -65,3 +68,30 @@ def test_without_the_train_extra_evaluate_says_what_to_install() -> None:
     code = "import sys; sys.modules['pans.trainer.evaluate'] = None; import pans; pans.evaluate"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "pip install 'pans-runtime[train]'" in done.stderr
+
+
+@pytest.mark.parametrize("clicks", [[0.5], [1.0], ["a"], [None], "abc", {}, [[1, 2], [3]], [[0.5] * 10], [2**70]])
+def test_clicks_that_are_no_whole_numbers_are_refused(clicks: Any) -> None:
+    with pytest.raises(UsageError, match=r"^clicks are"):
+        pans.decide(pans.load_bundle("fashion10"), clicks)
+
+
+def test_no_clicks_and_true_or_false_are_clicks_too() -> None:
+    bundle = pans.load_bundle("fashion10")
+    assert len(pans.decide(bundle, []).labels) == 0
+    truths = np.array([[True, False] * 5])
+    assert pans.decide(bundle, truths).labels == pans.decide(bundle, truths.astype(int)).labels
+
+
+def test_every_public_name_is_listed_before_it_is_used() -> None:
+    code = "import pans; print(sorted({*pans.__all__} - {*dir(pans)}), all(hasattr(pans, name) for name in dir(pans)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[] True\n"
+
+
+def test_a_bundle_is_shown_in_one_line_with_the_hash_of_its_file(tmp_path: Path) -> None:
+    for name in ("fashion10", "fashion-adaptive"):
+        shown = repr(pans.load_bundle(name))
+        assert hashlib.sha256((SHIPPED / f"{name}.pans").read_bytes()).hexdigest()[:12] in shown
+        assert len(shown) < 300
+    assert "fashion10" in repr(pans.load_bundle("fashion10"))
+    assert "10 patterns of 28 x 28 pixels, 10 classes, table and head" in repr(pans.load_bundle("fashion10"))

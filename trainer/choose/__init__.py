@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .recipe import Recipe, choose_encoder, choose_training, warnings_of
+    from .recipe import Recipe, choose_encoder, choose_training, class_warnings, warnings_of
     from .variations import Choice, choose_variation
 
-__all__ = ["Choice", "Recipe", "choose_encoder", "choose_training", "choose_variation", "warnings_of"]
+__all__ = ["Choice", "Recipe", "choose_encoder", "choose_training", "choose_variation", "class_warnings", "warnings_of"]
 
 __getattr__ = lazy_names(
     __name__,
@@ -19,6 +19,7 @@ __getattr__ = lazy_names(
         "Recipe": ".recipe",
         "choose_encoder": ".recipe",
         "choose_training": ".recipe",
+        "class_warnings": ".recipe",
         "warnings_of": ".recipe",
         "Choice": ".variations",
         "choose_variation": ".variations",

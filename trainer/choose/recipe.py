@@ -80,20 +80,7 @@ def _varied_words(n: int, objects: int, variation: Variation) -> str:
 
 def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | None) -> Iterator[str]:
     """Yield what the user should know before the training: too few images, unequal classes, a budget out of reach."""
-    counts = np.bincount(task.train.labels, minlength=len(task.classes))
-    fewest, most = int(counts.argmin()), int(counts.argmax())
-    if counts[fewest] < FEW_PER_CLASS:
-        yield (
-            f"class {task.classes[fewest]!r} has {counts[fewest]} training images, wanted are {FEW_PER_CLASS} or more: the accuracy on "
-            "new images is uncertain"
-        )
-    elif counts[most] > UNEQUAL * counts[fewest]:
-        yield (
-            f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: the "
-            "sensor prefers the larger class, so give classes the shares that they have in use"
-        )
-    n_test = len(task.test)
-    yield from _test_words(n_test)
+    yield from class_warnings(task)
     dark = click_law(profile, profile.exposure.min_us).dark_per_exposure * (recipe.exposures or recipe.features)
     budget = recipe.photons if clicks is None else clicks
     if dark > budget / 2:
@@ -101,6 +88,23 @@ def warnings_of(task: Task, profile: Profile, recipe: Recipe, clicks: float | No
             f"dark counts alone bring about {dark:.2g} clicks per decision on {profile.name}, the budget is {budget:g}: ask for "
             "more light, or for fewer exposures"
         )
+
+
+def class_warnings(task: Task) -> Iterator[str]:
+    """Yield what is wrong with the sizes of the classes: too few images of one, very unequal ones, few held-out images."""
+    counts = np.bincount(task.train.labels, minlength=len(task.classes))
+    fewest, most = int(counts.argmin()), int(counts.argmax())
+    if counts[fewest] < FEW_PER_CLASS:
+        yield (
+            f"class {task.classes[fewest]!r} has {counts[fewest]} training images, wanted are {FEW_PER_CLASS} or more: the accuracy on "
+            "new images is uncertain"
+        )
+    if counts[most] > UNEQUAL * counts[fewest]:
+        yield (
+            f"class {task.classes[most]!r} has {counts[most]} training images, {task.classes[fewest]!r} has {counts[fewest]}: the "
+            "sensor prefers the larger class, so give classes the shares that they have in use"
+        )
+    yield from _test_words(len(task.test))
 
 
 def _test_words(n_test: int) -> Iterator[str]:

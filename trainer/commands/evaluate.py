@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.bundle.automaton import CONFIDENCE_RANGE
 from pans.runtime.bundle.optics import amplification
-from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note
+from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, Command, add_force, emit, note, warn
 from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
+from pans.runtime.safe_text import one_line
 
 from .arguments import add_data_dir, needing, usage_errors
 from .evaluate_dose import add_dose, bleaching_given, evaluate_dose, is_dosed
 from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
 
+RECALLS_SHOWN = 10
+LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
 MADE = 1e-3  # of the light: beyond what W in float32 is off by
 
 if TYPE_CHECKING:
@@ -147,6 +150,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         "afterpulses": afterpulses_in(bundle, held_out, args.shots, measured.trials),
         **_facts(held_out, digest, started),
     }
+    warn_of_majority(payload.get("by_class"), measured.photons_mean)
     if args.pictures:
         payload["pictures"] = _draw(args, bundle, held_out, conditions)
     differences = more.get("expected_differences") or []
@@ -249,6 +253,7 @@ def words_of(
     figures: dict[str, Any] = asdict(measured)
     if "exposures_mean" in figures:
         return _walk_words(figures, more)
+    classes = "".join(f"\n{line}" for line in class_words(figures.get("by_class")))
     light = f"  clicks {measured.clicks_mean:.3f}   photons {measured.photons_mean:.2f}   illumination {measured.illumination:.1f}"
     if "reaching_photons" in more:
         light += f"\n  {_reaching_words(more)}"
@@ -263,7 +268,33 @@ def words_of(
     return (
         f"SIMULATED accuracy {100 * figures['accuracy_mean']:.2f} %  ({measured.objects} objects, {how}, K = {measured.shots})\n"
         f"  spread over trials      {100 * figures['accuracy_std']:.2f} points\n"
-        f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}"
+        f"  error from the objects  {100 * figures['accuracy_se_objects']:.2f} points\n{light}{classes}"
+    )
+
+
+def class_words(found: Mapping[str, Any] | None) -> list[str]:
+    """Return how the decisions fall among the classes, in lines; `found` is accuracy.ByClass as a dict."""
+    if found is None:
+        return []
+    recall = sorted(found["recall"].items(), key=lambda one: (one[1] is None, one[1]))  # the worst first
+    shown = ", ".join(f"{one_line(name, 40)} {_percent(share)} %" for name, share in recall[:RECALLS_SHOWN])
+    more = f", and {len(recall) - RECALLS_SHOWN} higher" if len(recall) > RECALLS_SHOWN else ""
+    return [
+        f"  the largest class alone {_percent(found['majority_share'])} %  ({one_line(found['majority_class'], 40)!r}); "
+        f"beyond it {_points(found['above_majority'])} ± {100 * found['above_majority_se']:.2f} points",
+        f"  balanced accuracy       {_percent(found['balanced_accuracy'])} %; recall {shown}{more}",
+    ]
+
+
+def warn_of_majority(found: Mapping[str, Any] | None, photons: float) -> None:
+    """Warn where the sensor tells no more than always naming the largest class."""
+    if found is None or found["better_than_majority"]:
+        return
+    dark = "" if photons >= LEAST_PHOTONS else ": it sends no light"
+    warn(
+        f"on held-out objects the sensor is not better than always naming the largest class, {one_line(found['majority_class'], 40)!r} "
+        f"({_points(found['above_majority'])} ± {100 * found['above_majority_se']:.2f} points, wanted more than two standard "
+        f"errors){dark}. Try more light (--photons), more --epochs, or as many objects of each class"
     )
 
 
@@ -282,6 +313,7 @@ def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:
         f"  error from the objects  {_percent(figures['accuracy_se_objects'])} points",
         f"  calibration error       {_percent(figures['expected_calibration_error'])} points",
         _light_words(figures),
+        *class_words(figures["by_class"]),
     ]
     if figures["abstained"]:
         lines.append(f"  abstained {100 * figures['abstained']:.2f} %; the accuracy is that of what was decided")
@@ -289,6 +321,10 @@ def _walk_words(figures: Mapping[str, Any], more: Mapping[str, Any]) -> str:
         if name.startswith("first_") and first is not None:
             lines.append(f"  the first {first['objects']}: {_percent(first['accuracy_mean'])} %\n{_light_words(first)}")
     return "\n".join(lines)
+
+
+def _points(difference: float) -> str:
+    return f"{round(100 * difference, 2) + 0.0:+.2f}"  # no minus before a zero
 
 
 def _percent(share: float | None) -> str:

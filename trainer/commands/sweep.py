@@ -22,6 +22,7 @@ from pans.runtime.outputs import check_outputs, file_identity
 from pans.trainer.options import DEFAULT_ALPHA, ESTIMATOR_NAMES, EXACT_FEATURES_MAX, Options, check_options
 
 from .arguments import add_data_dir, add_threads, interruptible, needing, torch_with
+from .train_arguments import SEED
 
 TRIALS_MAX = 1_000_000
 JOURNAL_LINE_MAX_BYTES = 1 << 20
@@ -44,7 +45,7 @@ def _configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--estimator", choices=ESTIMATOR_NAMES, help="default: exact up to 12 patterns, else local")
     parser.add_argument("--epochs", type=int, default=30, metavar="E", help="of a trial (default 30)")
     parser.add_argument("--hidden", type=int, default=128, metavar="H", help="hidden units of the head (default 128)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the trainings (default 0)")
+    parser.add_argument("--seed", type=SEED.option, default=0, metavar="N", help="of the trainings (default 0)")
     add_threads(parser, "")
     add_data_dir(parser)
 

@@ -28,9 +28,9 @@ from pans.trainer.options import (
 
 from .arguments import interruptible, needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
-from .evaluate import passive_light, words_of
+from .evaluate import passive_light, warn_of_majority, words_of
 from .train_arguments import AS_GIVEN, AUTOMATON, DEFAULT_PROFILE, OF_AUTOMATA, configure_train
-from .train_own import Chosen, choose, finish, is_own, set_encoder
+from .train_own import as_given, choose, finish, is_own, set_encoder
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
@@ -67,7 +67,7 @@ def _train(args: argparse.Namespace) -> int:
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
-    chosen = choose(args, task, profile) if own else Chosen(task, {})
+    chosen = choose(args, task, profile) if own else as_given(args, task)
     options = _options(args, task, profile)
     check_order(args.order, options)
     check_options(options, profile)
@@ -96,6 +96,7 @@ def _train(args: argparse.Namespace) -> int:
         shown = trained.quantised.patterns() if trained.quantised else None
         for path in history.write(args.history, shown, task.image_shape, force=args.force):
             say(f"wrote {path}")
+    warn_of_majority(answer.get("by_class"), answer["photons_mean"])
     seconds = watch.seconds()
     payload = {"bundle": str(args.out), **answer, "seconds": seconds, "simulated": True}
     if own and task.target == "class":

@@ -10,9 +10,12 @@ from dataclasses import fields
 from pathlib import Path
 
 from pans.runtime.cli import add_new_bundle
+from pans.runtime.ranges import Range
 from pans.trainer.options import BUDGETS, ENCODERS, ESTIMATOR_NAMES, HEADS, Options
 
 from .arguments import add_data_dir, add_order_and_bleach, add_threads
+
+SEED = Range(0, (1 << 63) - 1, whole=True)
 
 DEFAULT_PROFILE = "oled-qcmos"
 AUTOMATON = "automaton"
@@ -85,13 +88,16 @@ def configure_train(parser: argparse.ArgumentParser) -> None:
     for name, metavar, words in NUMBERS:
         flag, default = "--" + name.replace("_", "-"), defaults.get(name)
         kind = float if default is None else type(default)
-        parser.add_argument(flag, type=kind, metavar=metavar, help=words)
+        read = SEED.option if name == "seed" else kind
+        parser.add_argument(flag, type=read, metavar=metavar, help=words)
     parser.add_argument(
         "--optics",
         metavar="SPEC",
         help="train through optics drawn within this tolerance, like shift=1:rotate=2:psf=0.5..0.8:black=0.002",
     )
-    parser.add_argument("--data-seed", type=int, default=0, metavar="N", help="of a drawn task's images (default 0)")
+    parser.add_argument(
+        "--data-seed", type=SEED.option, default=0, metavar="N", help="of a drawn task's images (default 0)"
+    )
     parser.add_argument("--history", type=Path, metavar="DIR", help="write and draw how the training went (extra plot)")
     parser.add_argument(
         "--device",

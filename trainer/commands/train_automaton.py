@@ -18,7 +18,8 @@ from pans.runtime.errors import UsageError
 
 from .arguments import needing, stated_tolerance, torch_with, usage_errors
 from .course import shown_course
-from .train_own import After, Chosen, choose, finish
+from .evaluate import class_words, warn_of_majority
+from .train_own import After, as_given, choose, finish
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
@@ -97,7 +98,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
 
     profile = load_profile(args.profile or DEFAULT_PROFILE)
     task = load_task(args.task, args.data_dir, data_seed=args.data_seed)
-    chosen = choose(args, task, profile) if own else Chosen(task, {})
+    chosen = choose(args, task, profile) if own else as_given(args, task)
     options = _options(args, profile)
     start, digest = (None, "") if args.start is None else load_bundle(args.start)
     if start is not None:
@@ -203,10 +204,12 @@ def _answer(
         "simulated": True,
         **after.payload,
     }
+    warn_of_majority(payload["by_class"], exported.measured.photons_mean)
     lines = [
         f"{args.out}  {exported.sha256[:12]}  trained in {seconds:.0f} s",
         f"{automaton.n_states} states, {bundle.n_patterns} patterns, at most {automaton.n_slots} exposures",
         _words("all held-out objects", exported.measured),
+        *class_words(payload["by_class"]),
         _words("the first 200", exported.first_200),
         *budget_words(trained.options, exported.measured),
     ]

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from pans.runtime.cli import say, warn
 
+from .evaluate import LEAST_PHOTONS
+
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
     from pans.trainer.choose.recipe import Recipe
@@ -24,7 +26,6 @@ AUTOMATON_PROFILE = "ideal"
 SIZES = ("exposures", "states")  # which a training that goes on from an automaton has from it
 CHANGES = ("copies", "shift_px", "offset_px")  # a user who asks for one of these has chosen how images are varied
 BASELINE_TRIALS = 10
-LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
 BUDGET_OFF = 0.05  # relative: more is said at the end
 RUN_DECISIONS = 1000
 
@@ -54,6 +55,16 @@ class Chosen:
 
     task: Task
     facts: dict[str, Any]
+
+
+def as_given(args: argparse.Namespace, task: Task) -> Chosen:
+    """Return the task as it is, and warn of the classes of a user's own images."""
+    if args.as_is:
+        from pans.trainer.choose import class_warnings
+
+        for text in class_warnings(task):
+            warn(text)
+    return Chosen(task, {})
 
 
 def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:

@@ -30,6 +30,8 @@ from .chain import Chain
 from .numbers import Numbers, vector_chances
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
+MAJORITY_SE = 2.0  # standard errors that a sensor must be above the largest class
+MAJORITY_ROUNDING = 1e-9  # sums of chances round
 _CHUNK_NUMBERS = 1 << 22  # numbers per piece of work, so that memory stays small
 
 F64 = NDArray[np.float64]
@@ -57,6 +59,52 @@ AS_IT_IS = Conditions()
 
 
 @dataclass(frozen=True, slots=True)
+class ByClass:
+    """How the decisions fall among the classes, and whether they tell more than always naming the largest one."""
+
+    majority_class: str  # the class with most of the objects
+    majority_share: float  # the accuracy of always naming it
+    above_majority: float  # the accuracy beyond that
+    above_majority_se: float  # its standard error over the objects, of paired differences
+    better_than_majority: bool  # by more than two standard errors
+    balanced_accuracy: float  # mean of the recalls
+    recall: dict[str, float | None]  # None of a class without objects, or without decisions
+
+
+def among_classes(
+    right: F64, labels: NDArray[np.int64], classes: tuple[str, ...], decided: F64 | None = None
+) -> ByClass | None:
+    """Return how decisions that are `right` with these chances (n,) fall among `classes`; None where there are no decisions.
+
+    `decided` (n,) are the chances that there is a decision at all, by default 1.
+    """
+    decided = np.ones(len(right)) if decided is None else decided
+    whole, n = float(decided.sum()), len(right)
+    if not whole:
+        return None
+    weights = np.bincount(labels, decided, len(classes))
+    found = np.bincount(labels, right, len(classes))
+    largest = int(weights.argmax())
+    gain = right - decided * (labels == largest)
+    above = float(gain.sum()) / whole
+    rest = gain - above * decided
+    error = math.sqrt(float((rest**2).sum()) * n / max(n - 1, 1)) / whole
+    recall = {
+        name: float(found[label] / weights[label]) if weights[label] else None for label, name in enumerate(classes)
+    }
+    known = [share for share in recall.values() if share is not None]
+    return ByClass(
+        majority_class=classes[largest],
+        majority_share=float(weights[largest]) / whole,
+        above_majority=above,
+        above_majority_se=error,
+        better_than_majority=above > MAJORITY_SE * error and above > MAJORITY_ROUNDING,
+        balanced_accuracy=sum(known) / len(known),
+        recall=recall,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Measured:
     """Means per decision. `accuracy_std` is the spread over trials, `accuracy_se_objects` the error from having few objects."""
 
@@ -69,6 +117,7 @@ class Measured:
     objects: int
     trials: int  # 0: exact, no trials were needed
     shots: int
+    by_class: ByClass | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,7 +260,8 @@ def evaluate_exactly(bundle: Bundle, light: Light, labels: NDArray[np.int64], *,
     right = decision_shares(bundle, light, shots=shots)[np.arange(len(labels)), labels]
     n = len(labels)
     over_trials = math.sqrt(float((right * (1 - right)).sum())) / n
-    return _measured(light, right, over_trials, trials=0, shots=shots)
+    found = _measured(light, right, over_trials, trials=0, shots=shots)
+    return replace(found, by_class=among_classes(right, labels, bundle.classes))
 
 
 def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
@@ -276,7 +326,9 @@ def evaluate_sampled(
         right += hit
         of_trial[trial] = hit.mean()
     spread = float(of_trial.std(ddof=1)) if trials > 1 else 0.0
-    return _measured(light, right / trials, spread, trials=trials, shots=shots, clicks=clicks / (trials * len(labels)))
+    clicks_mean = clicks / (trials * len(labels))
+    found = _measured(light, right / trials, spread, trials=trials, shots=shots, clicks=clicks_mean)
+    return replace(found, by_class=among_classes(right / trials, labels, bundle.classes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_n
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
-from .accuracy import AS_IT_IS, Conditions, demand_sequence, exposure_of, outcome_law_of
+from .accuracy import AS_IT_IS, ByClass, Conditions, among_classes, demand_sequence, exposure_of, outcome_law_of
 from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
@@ -57,6 +57,7 @@ class MeasuredWalks:
     objects: int
     trials: int  # 0: exact, no trials were needed
     shots: int = 1
+    by_class: ByClass | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,11 +73,13 @@ class Walks:
     by_class: F64  # chance that an object of this class ends at this leaf, summed over the objects
     automaton: Automaton  # the one that ran
     leaf_labels: NDArray[np.uint16]
+    labels: NDArray[np.int64]  # the true ones
+    classes: tuple[str, ...] = ()
     trials: int = 0
 
     def first(self, count: int) -> Walks:
         """Return the sums of the first `count` objects; `by_class` remains that of all."""
-        names = ("right", "decided", "clicks", "photons", "illumination", "exposures")
+        names = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
         return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
 
@@ -126,7 +129,7 @@ def walks_of(
             lit = _lit(shown, seen, conditions.bleaching)
             sums = _sampled(automaton, lit, shown.illumination, (law, afterpulses), trials, rng)
         parts.append(_judged(sums, labels[start : start + step], automaton, leaf_labels))
-    return _together(parts, trials or 0)
+    return replace(_together(parts, trials or 0), classes=bundle.classes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,11 +216,11 @@ def _judged(sums: _Sums, labels: NDArray[np.int64], automaton: Automaton, leaf_l
         right[of_class] = leaves[of_class] @ (leaf_labels == label).astype(np.float64)
         by_class[label] = leaves[of_class].sum(axis=0)
     decided = leaves @ decides
-    return Walks(np.minimum(right, decided), decided, *sums[:4], by_class, automaton, leaf_labels)
+    return Walks(np.minimum(right, decided), decided, *sums[:4], by_class, automaton, leaf_labels, labels)
 
 
 def _together(parts: list[Walks], trials: int) -> Walks:
-    names = ("right", "decided", "clicks", "photons", "illumination", "exposures")
+    names = ("right", "decided", "clicks", "photons", "illumination", "exposures", "labels")
     joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     by_class = sum((part.by_class for part in parts[1:]), parts[0].by_class)
     return replace(parts[0], **joined, by_class=by_class, trials=trials)
@@ -337,6 +340,7 @@ def measured_walks(walks: Walks) -> MeasuredWalks:
         abstained=0.0 if (walks.leaf_labels != NO_LABEL).all() else 1.0 - decided / n,
         objects=n,
         trials=walks.trials,
+        by_class=among_classes(walks.right, walks.labels, walks.classes, walks.decided) if walks.classes else None,
     )
 
 

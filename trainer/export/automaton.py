@@ -24,7 +24,7 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.adaptive.train import TrainedAutomaton
-from pans.trainer.evaluate.accuracy import Conditions, outcome_law_of
+from pans.trainer.evaluate.accuracy import ByClass, Conditions, outcome_law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
@@ -48,6 +48,7 @@ class WalkFigures:
     illumination: float
     exposures_mean: float
     expected_calibration_error: float
+    by_class: ByClass | None = None
 
 
 @dataclass(frozen=True, slots=True)

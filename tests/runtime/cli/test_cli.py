@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -197,6 +198,17 @@ def test_interrupted_with_json_is_one_object(installed: dict[str, object], capsy
     )
     installed["lab"] = command(130)  # a command that told it by itself, with figures
     assert json.loads(said(["lab", "--json"], capsys)[1]) == {"value": 0.5, "array": [0, 1]}
+
+
+def test_a_signal_is_told_in_words_and_logged_in_words(
+    installed: dict[str, object], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    installed["lab"] = command(KeyboardInterrupt("stopped by SIGTERM"))
+    code, _, err = said(["lab", "--log-file", str(tmp_path / "lab.log")], capsys)
+    assert (code, err) == (130, "pans: stopped by SIGTERM\n")
+    log = (tmp_path / "lab.log").read_text()
+    assert "ends: stopped by SIGTERM" in log
+    assert "KeyboardInterrupt" not in log
 
 
 def test_errors_of_the_system_are_told_and_others_are_faults_of_ours(

@@ -19,7 +19,7 @@ from bundles import made_bundle
 
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.decision import DECISION_DTYPE, DecisionFlag
-from pans.runtime.errors import DamagedFileError, PansError, UsageError
+from pans.runtime.errors import DamagedFileError, PansError, RecordingError, UsageError
 from pans.runtime.record import Recorder, Recording, read_recording
 from pans.runtime.record.format import TIMING_DTYPE, TIMING_RUN_DTYPE, Kind
 from pans.runtime.record.log import decision_log_sha256
@@ -445,3 +445,32 @@ def test_a_recording_must_say_who_drove_its_automaton() -> None:
         automaton_of({"confidence": 0.0}, walks)
     with pytest.raises(ValueError, match="not in the recording"):
         automaton_of({"drive": "host", "confidence": 0.0}, fixed)
+
+
+class FailsAtClose:
+    """A file whose disk fails when it is closed, and only then."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def close(self) -> None:
+        if not self._file.closed:
+            self._file.close()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+@pytest.mark.parametrize("leaves", [False, True], ids=["close", "exit"])
+def test_a_disk_that_fails_at_close_is_told_with_the_files_name(leaves: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.pansrec"
+    recorder = Recorder(path, HEADER)
+    recorder._file = FailsAtClose(recorder._file)  # type: ignore[assignment]
+    with pytest.raises(RecordingError, match=r"a\.pansrec: the disk failed when the recording was closed"):
+        if leaves:
+            with recorder:
+                pass
+        else:
+            recorder.close({})
+    assert recorder._file.closed

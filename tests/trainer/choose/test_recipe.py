@@ -61,6 +61,9 @@ def test_warnings():
     assert told(task_of([100, 100])) == []
     assert "'class1' has 20 training images" in told(task_of([100, 20]))[0]
     assert "the sensor prefers the larger class" in told(task_of([600, 100]))[0]
+    unequal = told(task_of([298, 32, 6]))  # too few of one class does not hide that they are unequal
+    assert "'class2' has 6 training images, wanted are" in unequal[0]
+    assert "'class0' has 298 training images, 'class2' has 6: the sensor prefers the larger class" in unequal[1]
     assert "60 held-out images: the standard error" in told(task_of([100, 100], held_out=60))[0]
     dark = load_profile("dmd-spad")
     assert told(task_of([100, 100]), dark) == []

@@ -95,6 +95,40 @@ def test_the_course_of_an_automaton_is_written_and_drawn(letters, tmp_path):
     assert main(["train", letters, *QUICK, "--history", "course", "-o", "again.pans"]) == 2  # nothing is replaced
 
 
+def test_a_sensor_that_always_names_the_largest_class_is_warned_of(tmp_path, monkeypatch, capsys):
+    """Squares, bars and few crosses, 298:32:6, and a training too short for any of them but the squares."""
+    rng, labels = np.random.default_rng(0), np.repeat([0, 1, 2], [298, 32, 6])
+    images = np.zeros((len(labels), 8, 8), np.uint8)
+    for image, label in zip(images, labels):
+        row, column = rng.integers(0, 5, 2)
+        image[row : row + 4 if label != 1 else 8, column : column + (4 if label == 0 else 1)] = 200
+    monkeypatch.chdir(tmp_path)
+    np.savez("unequal.npz", images=images, labels=labels, classes=np.array(["square", "bar", "cross"]))
+    quick = ["--as-is", "--features", "4", "--encoder", "active", "--epochs", "1"]
+    assert main(["train", "unequal.npz", *quick, "-o", "s.pans", "--json"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)["by_class"]
+    held_out = labels[4::5]
+    assert found["majority_class"] == "square"
+    assert found["majority_share"] == pytest.approx(np.mean(held_out == 0))
+    assert found["recall"] == pytest.approx({"square": 1.0, "bar": 0.0, "cross": 0.0}, abs=0.01)
+    assert found["balanced_accuracy"] == pytest.approx(1 / 3, abs=0.01)
+    assert not found["better_than_majority"]
+    assert "not better than always naming the largest class, 'square'" in said.err
+    assert "class 'cross' has 5 training images" in said.err
+    assert "'square' has 238 training images, 'cross' has 5: the sensor prefers the larger class" in said.err
+    assert main(["evaluate", "s.pans", "--task", "unequal.npz", "--exact"]) == 0
+    said = capsys.readouterr()
+    assert "not better than always naming the largest class" in said.err
+    assert "balanced accuracy       33.33 %; recall bar 0.00 %, cross 0.00 %, square 100.00 %" in said.out
+
+
+def test_a_negative_seed_is_refused(letters, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", letters, *QUICK, "--seed", "-1", "-o", "letters.pans"])
+    assert "--seed: '-1' is not a whole number from 0" in capsys.readouterr().err
+
+
 def test_a_sensor_without_light_is_not_compared(capsys):
     figures = {"clicks_mean": 0.0, "photons_mean": 0.0, "illumination": 0.0}
     budgets = {"clicks": None, "photons": 10.0, "illumination": 5.0}

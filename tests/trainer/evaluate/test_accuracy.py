@@ -4,7 +4,7 @@ import itertools
 import math
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,13 @@ from pans.runtime.cli import main
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import Conditions, evaluate
-from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of, outcome_probabilities
+from pans.trainer.evaluate.accuracy import (
+    among_classes,
+    evaluate_exactly,
+    evaluate_sampled,
+    light_of,
+    outcome_probabilities,
+)
 from pans.trainer.evaluate.held_out import held_out_of
 
 RNG = np.random.default_rng(0)
@@ -138,7 +144,10 @@ def test_a_bundle_is_judged_by_one_call(own_task, tmp_path):
     write_bundle(model, tmp_path / "small.pans")
     exact = evaluate_exactly(model, light_of(model, PROFILE, IMAGES), LABELS)
     for given in (model, tmp_path / "small.pans"):  # never trained on this file: all its objects are held out
-        assert asdict(evaluate(given, task=own_task)) == pytest.approx(asdict(exact), rel=1e-12)
+        found = evaluate(given, task=own_task)
+        assert found.by_class.recall == pytest.approx(exact.by_class.recall, rel=1e-12)
+        found, wanted = (asdict(replace(one, by_class=0)) for one in (found, exact))  # which is compared above
+        assert found == pytest.approx(wanted, rel=1e-12)
     assert evaluate(model, task=own_task, exact=False).trials == 30
     doubled = Conditions(profile="ideal", eta=2.0, dark=0.1, seed=3)
     held_out = held_out_of(model, own_task, 7, None, doubled).objects
@@ -177,3 +186,28 @@ def test_evaluation_loads_no_torch():
         "assert 'torch' not in sys.modules and 'onnx' not in sys.modules"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_recall_and_the_gain_over_the_largest_class_are_those_of_a_loop():
+    """By hand: 6 objects of three classes, the chances of a right decision each, and a decision for only part of the last one."""
+    right, labels = np.array([1.0, 0.5, 0.5, 0.0, 1.0, 0.25]), np.array([0, 0, 0, 0, 1, 1])
+    found = among_classes(right, labels, ("a", "b", "none"))
+    assert found.majority_class == "a"
+    assert found.majority_share == pytest.approx(4 / 6)
+    assert found.recall == {"a": 0.5, "b": 0.625, "none": None}
+    assert found.balanced_accuracy == pytest.approx(0.5625)
+    gains = [0.0, -0.5, -0.5, -1.0, 1.0, 0.25]  # right, less 1 where the object is of class a
+    assert found.above_majority == pytest.approx(sum(gains) / 6)
+    assert found.above_majority_se == pytest.approx(np.std(gains, ddof=1) / math.sqrt(6))
+    assert not found.better_than_majority
+    half = among_classes(right, labels, ("a", "b", "none"), np.array([1.0, 1, 1, 1, 1, 0.5]))
+    assert half.recall["b"] == pytest.approx(1.25 / 1.5)
+    assert among_classes(np.zeros(6), labels, ("a", "b", "none"), np.zeros(6)) is None
+
+
+@pytest.mark.parametrize(("right_of_b", "better"), [(0, False), (8, True)])
+def test_a_sensor_is_better_than_the_largest_class_by_two_standard_errors_only(right_of_b, better):
+    labels = np.repeat([0, 1], [90, 10])
+    right = np.ones(100)
+    right[90 : 100 - right_of_b] = 0
+    assert among_classes(right, labels, ("a", "b")).better_than_majority == better
