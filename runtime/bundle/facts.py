@@ -6,10 +6,9 @@ allowed, for the caller to say where.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -80,6 +79,7 @@ class Bundle:
     golden_walks: NDArray[np.uint32] | None = None  # (g, n_slots + 1) nodes that each golden click word passes
     expected: Mapping[str, Any] | None = None  # of an automaton: its exact expectation, walks.EXPECTED_KEYS
     outcomes: int = 2  # of fixed patterns: readings of an exposure; 3: no photon, one, two or more
+    sha256: str = field(default="", init=False)  # of the file that it was read from; `replace` drops it
 
     @property
     def n_features(self) -> int:
@@ -141,14 +141,12 @@ class Bundle:
         return self.light_of(self.automaton)
 
     def __repr__(self) -> str:
-        """Return the facts in a line; the hash is that of the file."""
-        from .format import bundle_bytes  # which needs this module
-
+        """Return the facts in a line."""
         rows, columns = self.image_shape
         outputs = f"{self.n_classes} classes" if self.picture_shape is None else "a picture"
         return (
             f"<Bundle {self.name!r}: {self.task}, {self.n_patterns} patterns of {rows} x {columns} pixels, {outputs}, "
-            f"{' and '.join(self._parts()) or 'no back end'}, SHA-256 {hashlib.sha256(bundle_bytes(self)).hexdigest()[:12]}>"
+            f"{' and '.join(self._parts()) or 'no back end'}, {f'SHA-256 {self.sha256[:12]}' if self.sha256 else 'of no file'}>"
         )
 
     def _parts(self) -> list[str]:

@@ -158,7 +158,9 @@ def read_bundle(file: BinaryIO, size: int, where: str) -> tuple[Bundle, str]:
             raise ValueError(_what_changed(source, header_bytes, header_end))
         digest.update(closing)
         header = parse_json_object(header_bytes, "header")
-        return _build(header, _read_parts(header, version, source, header_end)), digest.hexdigest()
+        bundle = _build(header, _read_parts(header, version, source, header_end))
+        object.__setattr__(bundle, "sha256", digest.hexdigest())
+        return bundle, bundle.sha256
     except DamagedFileError as error:
         raise DamagedFileError(f"{where}: {error.message}", remedy=error.remedy or _REMEDY) from error
     except (ValueError, TypeError, OverflowError) as error:

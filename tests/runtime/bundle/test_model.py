@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +181,7 @@ def test_a_resealed_lie_is_named(change: Any, reason: str) -> None:
 
 def test_a_table_that_contradicts_its_golden_vectors_is_refused() -> None:
     made = small_bundle()
-    swapped = Bundle(**{name: getattr(made, name) for name in made.__slots__} | {"table": made.table[::-1].copy()})
+    swapped = replace(made, table=made.table[::-1].copy())
     with pytest.raises(DamagedFileError, match="golden"):
         parse_bundle(bundle_bytes(swapped), "x")
 
