@@ -283,7 +283,7 @@ def _memory_of_patterns(afterpulses: Afterpulses, rate: F64, plan: Plan, paralle
     """Return the afterpulses that an exposure of each pattern (the last: dark) sees after silence and after a click, (patterns, 2)."""
     dark = len(rate) - 1
     shown = np.where(plan.slot_pattern == DARK_PATTERN, dark, 0 if parallel else shown_in_slots(plan))
-    before = afterpulses.memory_by_last(rate[shown])
+    before = afterpulses.sight_by_last(rate[shown])
     sums, counts = np.zeros((len(rate), 2)), np.bincount(shown, minlength=len(rate))
     np.add.at(sums, shown, before)
     return np.asarray(sums / np.maximum(counts, 1)[:, None])

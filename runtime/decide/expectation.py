@@ -3,8 +3,8 @@
 Owns the sums over all walks. P(node | object) is carried forward slot by slot, alpha(s') = sum of alpha(s) P(outcome | s, object) over the
 edges into s', in float64, whether the outcomes are clicks, photon numbers or the clicks of several channels, which are independent given
 the object: every state is at one depth, so that alpha is whole when its slot comes. Where the detector has afterpulses, a click depends on
-the click before: alpha is then carried for both outcomes of the last exposure; where they have a time constant, with the mean memory of
-each (remembering.py). Never draws anything.
+the click before: alpha is then carried for both outcomes of the last exposure; where they have a time constant, with the memory of each
+(remembering.py).
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class ExpectedWalk:
     illumination: F64
     exposures: F64
     leaves: F64
-    ends: F64 | None = None  # mean memory of the detector behind a walk, where afterpulses have a time constant
+    ends: F64 | None = (
+        None  # (n, 2): mean and mean square of the carriers in traps behind a walk, where afterpulses have a time constant
+    )
 
 
 def expected_walk(
@@ -55,7 +57,7 @@ def expected_walk(
     photons_per_level: float = 1.0,
     *,
     afterpulses: Afterpulses = NO_AFTERPULSES,
-    begins: float = 0.0,
+    begins: tuple[float, float] = (0.0, 0.0),
 ) -> ExpectedWalk:
     """Return what `automaton` does on each of n objects, exactly.
 
@@ -63,14 +65,14 @@ def expected_walk(
     time; `transmission` (n, pixels), 0 to 1. `law` is that of one whole exposure: dark counts and read noise come whatever the dwell.
     Of `afterpulses` without a time constant a click makes the next exposure click as well; the exposure before a walk is taken to have
     none (that of the last object's end is forgotten, at most one click in so many walks). With one, `begins` is the memory with which a
-    walk begins, and remembering.py says what is exact.
+    walk begins, mean and variance, and remembering.py says what is exact.
     Of several channels `law` is that of each. ValueError for shapes that do not fit, a law of other outcomes than the automaton's, and
     afterpulses of a detector that counts or of several channels.
     """
     _check_arguments(automaton, patterns, transmission)
     _check_law(automaton, law, afterpulses)
     n, n_leaves = len(transmission), automaton.n_leaves
-    ends = np.empty(n) if afterpulses.time else None
+    ends = np.empty((n, 2)) if afterpulses.time else None
     found = ExpectedWalk(np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, n_leaves)), ends)
     step = max(1, _NUMBERS_AT_ONCE // max(len(patterns), len(automaton.posteriors)))
     slots, shown = _states_by_slot(automaton), patterns.sum(axis=1, dtype=np.float64) * photons_per_level
@@ -144,7 +146,7 @@ class _Walked(Protocol):
         """The chance of each leaf, (objects, leaves)."""
 
     def ends(self) -> F64 | None:
-        """Mean memory of the detector behind a walk, (objects,), where it has one."""
+        """Moments of the detector's memory behind a walk, (objects, 2), where it has one."""
 
 
 class _ByClicks:
@@ -234,7 +236,7 @@ class _ByMemory:
         return np.asarray(self._walked.chance[:, :, self._n_states :].sum(axis=0))
 
     def ends(self) -> F64:
-        return self._walked.ends
+        return self._walked.ends.T
 
 
 def _walk_block(

@@ -1,8 +1,7 @@
 """Sums over an automaton's walks on a detector whose clicks depend on several exposures before: afterpulses with a time constant.
 
-Owns the step from one slot to the next; expectation.py owns the whole. Beside the chance of every node, by the outcome of the last
-exposure, stands the mean memory (detector/afterpulses.py) of the walks that came so. A state with one walk into it for each outcome is
-exact in this; where several walks meet, their mean stands for all of them, which errs in the second order of the memory.
+Beside the chance of every node, by the outcome of the last exposure, stands the memory (detector/afterpulses.py) of the walks that came
+so, as the sums of its mean and of its mean square. Where several walks meet, their moments are those of all of them together.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.detector import Afterpulses
+from pans.runtime.detector.afterpulses import LEAST_MEAN, SMALL_RATIO
 
 F64 = NDArray[np.float64]
 
@@ -24,23 +24,25 @@ class _Sums(NamedTuple):
 
     chance: F64
     memory: F64
+    squares: F64
     ends: F64
 
 
 class Remembered:
-    """The walks of some objects: `chance` and `memory` are float64 (2, objects, nodes), the first axis is the last outcome.
+    """The walks of some objects: `chance` is float64 (2, objects, nodes), the first axis is the last outcome.
 
-    `memory` is times the chance. `ends` (objects,) sums up what memory is left when the last slot of a walk is over, the slots behind
-    its leaf being silent.
+    `begins` is the memory, mean and variance, with which every walk begins. `ends` (2, objects) are the mean and the mean square of what
+    is left when the last slot of a walk is over; the slots behind its leaf are dark.
     """
 
-    def __init__(self, automaton: Automaton, afterpulses: Afterpulses, n: int, begins: float) -> None:
+    def __init__(self, automaton: Automaton, afterpulses: Afterpulses, n: int, begins: tuple[float, float]) -> None:
         self._automaton, self._afterpulses = automaton, afterpulses
         nodes = (2, n, len(automaton.posteriors))
-        self._sums = _Sums(np.zeros(nodes), np.zeros(nodes), np.zeros(n))
-        self.chance, self.memory, self.ends = self._sums
-        self.chance[0, :, 0], self.memory[0, :, 0] = 1.0, begins
-        self._of_law = np.array([afterpulses.decay, *afterpulses.steps])
+        self._sums = _Sums(np.zeros(nodes), np.zeros(nodes), np.zeros(nodes), np.zeros((2, n)))
+        self.chance, self.ends = self._sums.chance, self._sums.ends
+        self.chance[0, :, 0], self._sums.memory[0, :, 0] = 1.0, begins[0]
+        self._sums.squares[0, :, 0] = begins[1] + begins[0] ** 2
+        self._of_law = np.array(afterpulses.steps)
 
     def go_on(self, states: NDArray[np.int64], mean: F64) -> tuple[F64, F64]:
         """Leave `states` (m,) of one slot, whose exposures have `mean` (objects, m), -log of silence without memory.
@@ -51,20 +53,22 @@ class Remembered:
         reached = self.chance[:, :, states].sum(axis=0)
         clicks = np.zeros(len(mean))
         behind = automaton.n_slots - 1 - int(automaton.depth[states[0]])
-        left_behind = self._afterpulses.after_silences(behind)
-        _pass_memory_on(self._sums, states, automaton.successors, mean, self._of_law, left_behind, clicks)
+        of_law = np.append(self._of_law, self._afterpulses.dark_flow(behind))
+        _pass_memory_on(self._sums, states, automaton.successors, mean, of_law, clicks)
         return reached, clicks
 
 
 @njit(cache=True, nogil=True)
-def _pass_memory_on(sums, states, successors, mean, of_law, left_behind, clicks):  # type: ignore[no-untyped-def]
+def _pass_memory_on(sums, states, successors, mean, of_law, clicks):  # type: ignore[no-untyped-def]
     """Add what leaves `states` (m,) to its successors in `sums`, with its memory, and the expected clicks to `clicks` (objects,).
 
-    of_law float64 (5,): decay and the four steps of `Afterpulses`; left_behind: what is left of a memory when the slots behind are over.
+    of_law float64 (13,): the steps of `Afterpulses`, and its flow through the slots behind. The same as `Afterpulses.after`.
     """
-    chance, memory, ends = sums
+    chance, memory, squares, ends = sums
     n_states = successors.shape[0]
-    decay, fixed, per_mean, per_memory, in_pause = of_law[0], of_law[1], of_law[2], of_law[3], of_law[4]
+    to_x, of_m, spread_m, spread_x = of_law[0], of_law[1], of_law[2], of_law[3]
+    pause_x, pause_m, pause_spread_m, pause_spread_x = of_law[4], of_law[5], of_law[6], of_law[7]
+    seen, kept, behind, behind_spread = of_law[8], of_law[9], of_law[11], of_law[12]
     for before in range(2):
         for i in range(mean.shape[0]):
             for k in range(states.size):
@@ -73,15 +77,27 @@ def _pass_memory_on(sums, states, successors, mean, of_law, left_behind, clicks)
                 if reached <= 0.0:
                     continue
                 m, x = mean[i, k], memory[before, i, state] / reached
-                click = -np.expm1(-(m + x))
-                silent = decay * x + in_pause * m
-                added = fixed + (per_mean * m + per_memory * x) / max(click, 1e-300)
+                variance = max(squares[before, i, state] / reached - x * x, 0.0)
+                ratio = seen * variance / max(x, LEAST_MEAN)
+                sight = seen * x * (np.log1p(ratio) / ratio if ratio > SMALL_RATIO else 1.0 - ratio / 2.0)
+                click, fewer = -np.expm1(-(m + sight)), 1.0 / (1.0 + ratio)
+                silent_x, silent_v = x * kept * fewer, variance * (kept * fewer) ** 2
+                more_x = of_m * m + x * (to_x - kept) + x * kept * (1.0 - fewer)
+                more_v = spread_m * m + spread_x * x + variance * (to_x**2 - (kept * fewer) ** 2)
                 for outcome in range(2):
-                    part = reached * (click if outcome else np.exp(-(m + x)))
-                    carried = part * (silent + added if outcome else silent)
+                    part, here, spread = reached * np.exp(-(m + sight)), silent_x, silent_v
+                    if outcome:
+                        part, chance_of = reached * click, max(click, LEAST_MEAN)
+                        here = silent_x + more_x / chance_of
+                        square = silent_x**2 + (more_v + more_x * (2.0 * silent_x + more_x)) / chance_of
+                        spread = max(silent_v + square - here**2, 0.0)
+                    spread = pause_x**2 * spread + pause_spread_m * m + pause_spread_x * here
+                    here = pause_x * here + pause_m * m
                     after = successors[state, outcome]
                     chance[outcome, i, after] += part
-                    memory[outcome, i, after] += carried
+                    memory[outcome, i, after] += part * here
+                    squares[outcome, i, after] += part * (spread + here**2)
                     if after >= n_states:
-                        ends[i] += carried * left_behind
+                        ends[0, i] += part * behind * here
+                        ends[1, i] += part * (behind**2 * (spread + here**2) + behind_spread * here)
                 clicks[i] += reached * click

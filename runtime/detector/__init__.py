@@ -1,9 +1,9 @@
 """What links the exposures of one detector: afterpulses of the clicks before.
 
-Owns the law; the simulator has its own code for it, and a program in tests/independent counts single events. Never draws anything.
+The simulator has code of its own for them, and a program in tests/independent counts single events.
 
 >>> from pans.runtime.detector import Afterpulses
->>> round(float(Afterpulses(0.05, 2.0).chance(0.1, 0.0)), 3)
+>>> round(float(Afterpulses(0.05, 2.0).chance(0.1, [0.0, 0.0])), 3)
 0.1
 """
 

@@ -1,7 +1,7 @@
 """Fixed patterns on one detector with afterpulses: the chances of click words, and clicks drawn one exposure after the other.
 
-Owns the order of exposures: pattern after pattern, shot after shot, object after object without a break. An object begins with
-the memory that objects leave in the mean. Given this, `word_chances` are exact sums under the law of detector/afterpulses.py.
+Exposures come pattern after pattern, shot after shot, object after object without a break. An object begins with the memory of all that
+objects leave. Given this, `word_chances` are sums under the law of detector/afterpulses.py.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ ROUNDS = 4  # by which the memory is found with which an object comes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """`first`: chances of a click without memory, (objects, d_f); `mean`: -log(1 - first); `begins`: memory at an object's begin."""
+    """`first`: chances of a click without memory, (objects, d_f); `mean`: -log(1 - first); `begins`: memory at an object's begin, (2,)."""
 
     first: F64
     mean: F64
     afterpulses: Afterpulses
-    begins: float
+    begins: F64
 
     @classmethod
     def of(cls, first: F64, afterpulses: Afterpulses) -> Chain:
         """Return the chain of objects that come in any order, each about as often as the others."""
-        mean, begins = -np.log1p(-np.minimum(first, 1 - 2.0**-53)), 0.0
+        mean, begins = -np.log1p(-np.minimum(first, 1 - 2.0**-53)), np.zeros(2)
         for _ in range(ROUNDS if len(first) else 0):
             begins = cls(first, mean, afterpulses, begins)._passed()[1]
         return cls(first, mean, afterpulses, begins)
@@ -37,40 +37,44 @@ class Chain:
     def mean_chances(self) -> F64:
         """Return the chance of each click of one shot, of the shape of `first`.
 
-        The memory before an exposure is the mean of all words with the same last click. Without a time constant that is exact.
+        The memory before an exposure is that of all words with the same last click. Without a time constant that is exact.
         """
         return self._passed()[0]
 
-    def _passed(self) -> tuple[F64, float]:
-        """`mean_chances`, and the memory that acts on the next object as all that is left does in the mean."""
+    def _began(self, *shape: int) -> F64:
+        return np.broadcast_to(self.begins.reshape(2, *[1] * len(shape)), (2, *shape))
+
+    def _passed(self) -> tuple[F64, F64]:
+        """`mean_chances`, and the memory of all that is left to the next object."""
         law, found = self.afterpulses, np.empty_like(self.first)
-        chance, memory = np.zeros((2, len(self.first))), np.full((2, len(self.first)), self.begins)
+        n = len(self.first)
+        chance, memory = np.zeros((2, n)), self._began(2, n)
         chance[0] = 1.0
         for i in range(self.first.shape[1]):
             click, mean = law.chance(self.first[:, i], memory), self.mean[:, i]
-            parts = chance * np.stack([1 - click, click])  # (last click now, last click before, objects)
-            left = np.stack([law.after(mean, memory, clicked) for clicked in (0, 1)])
+            parts = np.stack([chance * (1 - click), chance * click])  # (last click now, last click before, objects)
+            left = np.stack([law.after(mean, memory, clicked) for clicked in (0, 1)], axis=1)
             chance = parts.sum(axis=1)
-            memory = (parts * left).sum(axis=1) / np.maximum(chance, 1e-300)
+            memory = law.mixed(parts, left, axis=1)
             found[:, i] = chance[1]
-        return found, -float(np.log((chance * np.exp(-memory)).sum(axis=0).mean()))
+        return found, law.mixed(chance, memory, axis=(0, 1))
 
     def word_chances(self, rows: slice) -> F64:
         """Return P(word | object) of one shot, (objects, 2**d_f); bit i of the word is pattern i."""
         first, mean = self.first[rows], self.mean[rows]
-        chance, memory = np.ones((len(first), 1)), np.full((len(first), 1), self.begins)
+        chance, memory = np.ones((len(first), 1)), self._began(len(first), 1)
         for i in range(first.shape[1]):
             click, m = self.afterpulses.chance(first[:, i : i + 1], memory), mean[:, i : i + 1]
             chance = np.concatenate([chance * (1 - click), chance * click], axis=1)
             if i < first.shape[1] - 1:
                 after = [self.afterpulses.after(m, memory, clicked) for clicked in (0, 1)]
-                memory = np.concatenate(after, axis=1)
+                memory = np.concatenate(after, axis=2)
         return chance
 
     def counts(self, shots: int, rng: np.random.Generator, rows: slice) -> NDArray[np.int64]:
         """Draw the clicks of `shots` exposures of every pattern, int64 (objects, d_f): shot after shot."""
         first, mean = self.first[rows], self.mean[rows]
-        counts, memory = np.zeros(first.shape, np.int64), np.full(len(first), self.begins)
+        counts, memory = np.zeros(first.shape, np.int64), self._began(len(first))
         for _ in range(shots):
             for i in range(first.shape[1]):
                 clicks = rng.random(len(first)) < self.afterpulses.chance(first[:, i], memory)

@@ -115,7 +115,7 @@ def walks_of(
     shown = _Shown(
         automaton, _patterns(bundle, conditions.imaging_on(profile)), bundle.photons_per_level * conditions.eta
     )
-    begins, rng = 0.0, np.random.default_rng(conditions.seed)
+    begins, rng = (0.0, 0.0), np.random.default_rng(conditions.seed)
     if trials is None and afterpulses.time:
         few = object_transmission(profile, _spread(images, min(step, BEGIN_OBJECTS)).reshape(-1, bundle.n_pixels))
         begins = _begins(shown, few, law, afterpulses)
@@ -178,7 +178,7 @@ def _lit(shown: _Shown, seen: NDArray[Any], bleaching: Bleaching) -> _Lit:
 
 
 def _expected(
-    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: float
+    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses, begins: tuple[float, float]
 ) -> ExpectedWalk:
     return expected_walk(
         shown.automaton, shown.patterns, seen, law, shown.scale, afterpulses=afterpulses, begins=begins
@@ -194,13 +194,16 @@ def _spread(images: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return images[np.linspace(0, len(images) - 1, min(count, len(images))).astype(np.int64)]
 
 
-def _begins(shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses) -> float:
-    """The detector's memory when an object comes: the mean of what the objects before leave, which begin with it themselves."""
-    begins = 0.0
+def _begins(
+    shown: _Shown, seen: NDArray[Any], law: ClickLaw | CountLaw, afterpulses: Afterpulses
+) -> tuple[float, float]:
+    """The detector's memory when an object comes: that of all that the objects before leave, which begin with it themselves."""
+    begins = (0.0, 0.0)
     for _ in range(BEGIN_ROUNDS):
         found = _expected(shown, seen, law, afterpulses, begins)
         assert found.ends is not None
-        begins = float(found.ends.mean())
+        mean, square = found.ends.mean(axis=0).tolist()
+        begins = mean, max(square - mean**2, 0.0)
     return begins
 
 
@@ -275,29 +278,29 @@ def _sampled(
     law, afterpulses = detector
     n, rows = lit.n, np.arange(lit.n)
     sums, leaves = np.zeros((4, n)), np.zeros((n, automaton.n_leaves))
-    memory = np.zeros(n)
+    memory = np.zeros((2, n))
     warming = BEGIN_ROUNDS if afterpulses.time else 0
     for trial in range(-warming, trials):
         if trial == 0:
             sums[:], leaves[:] = 0.0, 0.0
         node, going = np.zeros(n, np.int64), rows
-        memory = rng.permutation(memory) if afterpulses.time else np.zeros(n)
+        memory = rng.permutation(memory, axis=1) if afterpulses.time else np.zeros((2, n))
         lit.fresh()
         for _ in range(automaton.n_slots):
             if not going.size:
-                memory *= afterpulses.decay
+                memory = afterpulses.in_the_dark(memory)
                 continue
             state = node[going]
             shown = whole[automaton.rows[state]].sum(axis=1) * (automaton.dwell[state] / automaton.dwell_steps)
             photoelectrons = lit.photoelectrons(going, state)
-            clicks = outcome = _drawn(law, photoelectrons, memory[going], rng)
+            clicks = outcome = _drawn(law, photoelectrons, afterpulses.sight(memory[:, going]), rng)
             if automaton.channels > 1:
                 clicks, outcome = outcome.sum(axis=1), outcome @ (1 << np.arange(automaton.channels))
                 photoelectrons = photoelectrons.sum(axis=1)
             if afterpulses and isinstance(law, ClickLaw):
-                known = afterpulses.after(-log_no_click(law, photoelectrons), memory[going], outcome)
-                memory *= afterpulses.decay
-                memory[going] = known
+                known = afterpulses.after(-log_no_click(law, photoelectrons), memory[:, going], outcome)
+                memory = afterpulses.in_the_dark(memory)
+                memory[:, going] = known
             each: tuple[Any, ...] = (clicks, photoelectrons, shown, 1.0)
             for total, values in zip(sums, each):
                 total[going] += values
@@ -308,14 +311,17 @@ def _sampled(
     return sums[0], sums[1], sums[2], sums[3], leaves / trials
 
 
-def _drawn(law: ClickLaw | CountLaw, light: F64, memory: F64, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Draw the outcome of each exposure (n,), of several channels their clicks (n, channels); `memory` (n,): mean afterpulses in it."""
+def _drawn(law: ClickLaw | CountLaw, light: F64, sight: F64, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Draw the outcome of each exposure (n,), of several channels their clicks (n, channels).
+
+    `sight` (n,) is what afterpulses add to -log of silence.
+    """
     if isinstance(law, CountLaw):
         passed = rng.random(light.size) >= np.cumsum(count_chances(law, light)[:-1], axis=0)
         return np.asarray(passed.sum(axis=0), np.int64)
     probability = click_probability(law, light)
     if light.ndim == 1:
-        probability -= (1 - probability) * np.expm1(-memory)
+        probability -= (1 - probability) * np.expm1(-sight)
     return np.asarray(rng.random(light.shape) < probability, np.int64)
 
 

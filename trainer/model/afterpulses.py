@@ -1,17 +1,20 @@
 """Afterpulses in training: what the clicks before add to the chance of each, in the mean, in torch.
 
-Owns the twin of pans.runtime.detector.Afterpulses on tensors. Fixed patterns are trained with the mean memory: clicks stay independent, as
-the estimators ask, each with its right chance in the mean; how clicks depend on each other is left out, and `pans evaluate` has it.
-In an automaton every state has the mean memory of the walks that reach it: exact where one walk leads there, else their mean for all.
+The twin of pans.runtime.detector.Afterpulses on tensors. Fixed patterns are trained with the memory of all words: clicks stay independent,
+as the estimators ask, each with its right chance; how clicks depend on each other is left out, and `pans evaluate` has it.
+In an automaton every state has the memory of all walks that reach it, mean and variance.
 The gradient is that of a memory that stays as it is. Growing looks at a level without memory; all that follows has it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from pans.runtime.detector import Afterpulses, afterpulses_of
+from pans.runtime.detector.afterpulses import SMALL_RATIO
 from pans.runtime.instrument.profile import Profile
 
 ROUNDS = 3  # the last one with gradients; those before find the memory with which objects come
@@ -25,12 +28,36 @@ def trained_through(profile: Profile, exposure_us: float) -> Afterpulses | None:
     return afterpulses_of(profile, exposure_us)
 
 
-def after(afterpulses: Afterpulses, mean: Tensor, memory: Tensor, clicks: Tensor) -> Tensor:
-    """Return the memory after an exposure: as `Afterpulses.after`, of a time constant above 0, and differentiable."""
-    _, per_mean, per_memory, in_pause = afterpulses.steps
-    chance = -torch.expm1(-(mean + memory))
-    gain = (per_mean * mean + per_memory * memory) / chance.clamp(min=1e-30)
-    return afterpulses.decay * memory + in_pause * mean + clicks * gain
+def _sight(afterpulses: Afterpulses, memory: Tensor) -> tuple[Tensor, Tensor]:
+    """`Afterpulses.sight` of `memory` (2, ...), and q times variance over mean."""
+    ratio = afterpulses.seen * memory[1] / memory[0].clamp(min=_LEAST)
+    wide = ratio.clamp(min=SMALL_RATIO)
+    shape = torch.where(ratio > SMALL_RATIO, torch.log1p(wide) / wide, 1 - ratio / 2)
+    return afterpulses.seen * memory[0] * shape, ratio
+
+
+def after(afterpulses: Afterpulses, mean: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the memory (2, ...) after a silent exposure, and after a click: as `Afterpulses.after`, of a time constant above 0."""
+    to_x, of_m, spread_m, spread_x, *pause, _, kept, _ = afterpulses.steps
+    x, variance = memory
+    sight, ratio = _sight(afterpulses, memory)
+    left = kept / (1 + ratio)
+    silent_x, silent_v = x * left, variance * left**2
+    chance = -torch.expm1(-(mean + sight)).clamp(max=-_LEAST)
+    more_x = of_m * mean + x * (to_x - left)
+    more_v = spread_m * mean + spread_x * x + variance * (to_x**2 - left**2)
+    clicked_x = silent_x + more_x / chance
+    squares = silent_v + silent_x**2 + (more_v + more_x * (2 * silent_x + more_x)) / chance
+    behind = []
+    for one, spread in ((silent_x, silent_v), (clicked_x, (squares - clicked_x**2).clamp(min=0))):
+        behind.append(_through(pause, mean, torch.stack([one, spread])))
+    return behind[0], behind[1]
+
+
+def _through(flow: Sequence[float], mean: Tensor, memory: Tensor) -> Tensor:
+    """The memory after a time of whose clicks nothing is known; `flow` as of `Afterpulses.flow`."""
+    to_x, of_m, spread_m, spread_x = flow
+    return torch.stack([to_x * memory[0] + of_m * mean, to_x**2 * memory[1] + spread_m * mean + spread_x * memory[0]])
 
 
 def with_mean_memory(p: Tensor, afterpulses: Afterpulses | None) -> Tensor:
@@ -39,36 +66,39 @@ def with_mean_memory(p: Tensor, afterpulses: Afterpulses | None) -> Tensor:
         return p
     first = p.double()
     mean = -torch.log1p(-first.clamp(max=_SURE))
-    begins = torch.zeros((), dtype=torch.float64, device=p.device)
+    begins = torch.zeros(2, 1, dtype=torch.float64, device=p.device)
     for number in range(ROUNDS):
         with torch.set_grad_enabled(torch.is_grad_enabled() and number == ROUNDS - 1):
-            memory, found = begins.expand(len(p)), []
+            memory, found = begins.expand(2, len(p)), []
             for i in range(p.shape[1]):
-                click = first[:, i] - (1 - first[:, i]) * torch.expm1(-memory)
-                memory = after(afterpulses, mean[:, i], memory, click)
-                found.append(click)
-            begins = memory.detach().mean()
+                found.append(first[:, i] - (1 - first[:, i]) * torch.expm1(-_sight(afterpulses, memory)[0]))
+                exposed = _through(afterpulses.steps[:4], mean[:, i], memory)
+                memory = _through(afterpulses.steps[4:8], mean[:, i], exposed)
+            x, square = memory[0].detach().mean(), (memory[1] + memory[0] ** 2).detach().mean()
+            begins = torch.stack([x, (square - x**2).clamp(min=0)])[:, None]
     return torch.stack(found, dim=1).to(p.dtype)
 
 
 class MeanMemory:
-    """The memory of the nodes of a level as an automaton is passed: sums over the walks there, (nodes, objects), times their chances."""
+    """The memory of the nodes of a level as an automaton is passed: sums of mean and mean square, (2, nodes, objects), times chances."""
 
     def __init__(self, afterpulses: Afterpulses, root: Tensor) -> None:
-        self.afterpulses, self._sums = afterpulses, torch.zeros_like(root)
+        self.afterpulses, self._sums = afterpulses, torch.zeros(2, *root.shape, dtype=root.dtype)
 
     def go_on(
         self, alpha: Tensor, chances: tuple[Tensor, ...], falls: tuple[Tensor, ...], successors: Tensor, n_nodes: int
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Leave a level's states of chance `alpha`: silence and how fast it falls with light, with memory from those without."""
-        memory = self._sums[: len(alpha)] / alpha.clamp(min=_LEAST)
-        kept = torch.exp(-memory)
+        x, squares = self._sums[:, : len(alpha)] / alpha.clamp(min=_LEAST)
+        memory = torch.stack([x, (squares - x**2).clamp(min=0)])
+        kept = torch.exp(-_sight(self.afterpulses, memory)[0])
         silent, fall = chances[0] * kept, falls[0] * kept
         mean = -torch.log(chances[0].clamp(min=_LEAST))
-        sums = torch.zeros(n_nodes, alpha.shape[1], dtype=alpha.dtype)
-        for clicked, to in enumerate(successors):
-            part = alpha * (1 - silent if clicked else silent)
-            left = after(self.afterpulses, mean, memory, torch.full_like(mean, float(clicked)))
-            sums.index_add_(0, to, part * left)
+        sums = torch.zeros(2, n_nodes, alpha.shape[1], dtype=alpha.dtype)
+        for part, to, (x, variance) in zip(
+            (alpha * silent, alpha * (1 - silent)), successors, after(self.afterpulses, mean, memory)
+        ):
+            sums[0].index_add_(0, to, part * x)
+            sums[1].index_add_(0, to, part * (variance + x**2))
         self._sums = sums
         return (silent,), (fall,)

@@ -50,11 +50,11 @@ def steady(mean: float, law: Afterpulses, exposures: int, seed: int, length: int
 
 def words_of(law: Afterpulses, light: tuple[float, ...]) -> np.ndarray:
     """Chances of all words of clicks by the law, exposure by exposure from empty traps; the first exposure is the lowest bit."""
-    chance, memory = np.ones(1), np.zeros(1)
+    chance, memory = np.ones(1), np.zeros((2, 1))
     for mean in light:
         click = law.chance(-math.expm1(-mean), memory)
         chance = np.concatenate([chance * (1 - click), chance * click])
-        memory = np.concatenate([law.after(mean, memory, clicked) for clicked in (0, 1)])
+        memory = np.concatenate([law.after(mean, memory, clicked) for clicked in (0, 1)], axis=1)
     return chance
 
 

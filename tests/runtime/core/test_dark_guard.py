@@ -355,7 +355,7 @@ def test_dark_exposures_count_when_it_was_silent_for_long_enough() -> None:
 def test_it_is_silent_for_long_enough_when_afterpulses_hide_behind_dark_counts() -> None:
     law = Afterpulses(0.05, 2.0, 0.1)
     behind = law.exposures_seen(1e-4)
-    memory = law.gain(1e-3, 0.0) * law.decay ** np.array([behind - 2, behind])
+    memory = law.sight(law.after(1e-3, np.zeros(2), 1)) * law.decay ** np.array([behind - 2, behind])
     assert memory[0] > 1e-5 > memory[1]
     assert (Afterpulses(0.0).exposures_seen(1e-4), Afterpulses(0.1).exposures_seen(1e-4)) == (0, 1)
 

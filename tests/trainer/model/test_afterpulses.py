@@ -29,15 +29,15 @@ from pans.trainer.model.afterpulses import trained_through, with_mean_memory
 LAW = Afterpulses(0.15, 2.0, 0.1)
 
 
-def chances_of_words(first: list[float], law: Afterpulses, begins: float) -> dict[tuple[int, ...], float]:
+def chances_of_words(first: list[float], law: Afterpulses, begins: np.ndarray) -> dict[tuple[int, ...], float]:
     """The chance of every word, one at a time: the memory follows from its clicks."""
     found = {}
     for word in product((0, 1), repeat=len(first)):
         chance, memory = 1.0, begins
         for p, clicked in zip(first, word):
-            click = 1 - (1 - p) * np.exp(-memory)
+            click = float(law.chance(p, memory))
             chance *= click if clicked else 1 - click
-            memory = float(law.after(-np.log1p(-p), memory, clicked))
+            memory = law.after(-np.log1p(-p), memory, clicked)
         found[word] = chance
     return found
 
@@ -46,7 +46,7 @@ def chances_of_words(first: list[float], law: Afterpulses, begins: float) -> dic
 def test_words_and_their_draws_are_those_of_the_chain(law: Afterpulses) -> None:
     first = np.random.default_rng(0).random((3, 5)) * 0.8
     chain = Chain.of(first, law)
-    assert chain.begins > 0
+    assert chain.begins[0] > 0
     words = chain.word_chances(slice(None))
     for i, row in enumerate(first.tolist()):
         for word, chance in chances_of_words(row, law, chain.begins).items():
@@ -115,15 +115,15 @@ def tree(slots: int) -> Automaton:
 def test_expected_walks_are_sums_over_words_where_each_walk_has_its_states(law: Afterpulses) -> None:
     automaton, rng = tree(4), np.random.default_rng(1)
     patterns, seen = rng.random((3, 5)) * 0.5, rng.random((2, 5))
-    found = expected_walk(automaton, patterns, seen, ClickLaw(0.01), afterpulses=law, begins=0.07)
+    found = expected_walk(automaton, patterns, seen, ClickLaw(0.01), afterpulses=law, begins=(0.07, 0.02))
     for i in range(2):
         first = -np.expm1(-(patterns[automaton.pattern] @ seen[i] + 0.01))
         for word in product((0, 1), repeat=4):
-            passed, chance, memory = naive.walk(automaton, word), 1.0, 0.07
+            passed, chance, memory = naive.walk(automaton, word), 1.0, np.array([0.07, 0.02])
             for state, clicked in zip(passed.states, word):
-                click = 1 - (1 - first[state]) * np.exp(-memory)
+                click = float(law.chance(first[state], memory))
                 chance *= click if clicked else 1 - click
-                memory = float(law.after(-np.log1p(-first[state]), memory, clicked))
+                memory = law.after(-np.log1p(-first[state]), memory, clicked)
             assert found.leaves[i, passed.leaf] == pytest.approx(chance, rel=1e-9)
 
 
@@ -137,11 +137,11 @@ def test_where_walks_meet_their_mean_memory_is_near_what_is_drawn() -> None:
     for word, passed in {
         w[: len(naive.walk(automaton, w).states)]: naive.walk(automaton, w) for w in product((0, 1), repeat=8)
     }.items():
-        chance, memory = 1.0, 0.0
+        chance, memory = 1.0, np.zeros(2)
         for state, clicked in zip(passed.states, word):
-            click = 1 - np.exp(-light[state] - memory)
+            click = float(law.chance(-np.expm1(-light[state]), memory))
             chance *= click if clicked else 1 - click
-            memory = float(law.after(light[state], memory, clicked))
+            memory = law.after(light[state], memory, clicked)
         clicks, n = clicks + chance * sum(word), n + 1
         leaves[passed.leaf] += chance
     assert found.leaves[0] == pytest.approx(leaves, abs=1e-3)
@@ -159,7 +159,7 @@ def test_a_machine_in_training_clicks_as_its_expectation() -> None:
     first, second = passed.steps[0], passed.steps[1]
     assert torch.equal(first.dark, plain.steps[0].dark)  # nothing before the first exposure
     silent = float(first.dark[0, 0])
-    after_click = float(LAW.after(-np.log(silent), 0.0, 1))
+    after_click = float(LAW.sight(LAW.after(-np.log(silent), np.zeros(2), 1)))
     ways = machine.levels[0].successors[:, 0].tolist()
     if ways[0] != ways[1]:
         for clicked, node in enumerate(ways):
