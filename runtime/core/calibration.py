@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.bundle.facts import Bundle
 from pans.runtime.detector import Afterpulses, afterpulses_of
+from pans.runtime.detector.crosstalk import crosstalk_of, spared_by_neighbours, without_crosstalk
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
 from pans.runtime.instrument.click_law import click_law
@@ -251,17 +252,12 @@ class CalibrationCore(Follower):
 
 def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[Counts]:
     """Return each channel's counts, with what the exposure before and the neighbours add to a click's probability."""
-    detector = profile.detector
-    afterpulses = afterpulses_of(profile, design.plan.exposure_us)
+    afterpulses, kernel = afterpulses_of(profile, design.plan.exposure_us), crosstalk_of(profile)
     pooled = core.sums.sum(axis=2)  # channel, pattern, (exposures, clicks)
     rate = pooled[..., 1] / np.maximum(pooled[..., 0], 1)
+    across = spared_by_neighbours(without_crosstalk(rate.T, kernel), kernel).T  # of each channel and pattern
     result = []
     for channel in range(core.channels):
-        across = np.zeros(core.sums.shape[1])
-        if core.parallel:
-            for neighbour in (channel - 1, channel + 1):
-                if 0 <= neighbour < core.channels:
-                    across += np.log1p(-detector.crosstalk_probability * rate[neighbour])
         own = np.arange(channel, len(design.drives), core.channels)  # what it was shown; in parallel mode one pattern
         drive, pattern = np.append(design.drives[own], 0.0), np.append(own, -1)
         primed = -_memory_of_patterns(afterpulses, rate[channel], design.plan, core.parallel)
@@ -270,7 +266,7 @@ def counts_of(core: CalibrationCore, design: Design, profile: Profile) -> list[C
                 np.repeat(drive, 2),
                 core.sums[channel, :, :, 1].ravel(),
                 core.sums[channel, :, :, 0].ravel(),
-                (primed + across[:, None]).ravel(),
+                (primed + across[channel][:, None]).ravel(),
                 np.repeat(pattern, 2),
             )
         )

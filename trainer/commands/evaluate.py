@@ -92,6 +92,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from pans.trainer.evaluate.held_out import (
         Conditions,
         afterpulses_in,
+        crosstalk_in,
         default_trials,
         held_out_of,
         imaging_on,
@@ -148,6 +149,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         "profile_assumed": assumed,
         "optics": imaging_on(held_out, conditions).numbers(),
         "afterpulses": afterpulses_in(bundle, held_out, args.shots, measured.trials),
+        "crosstalk": crosstalk_in(bundle, held_out, args.shots, measured.trials),
         **_facts(held_out, digest, started),
     }
     warn_of_majority(payload.get("by_class"), measured.photons_mean)

@@ -18,6 +18,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.decide.onnx import PictureDecider
 from pans.runtime.detector import afterpulses_of
+from pans.runtime.detector.crosstalk import Kernel, crosstalk_of, fired, seen_from_own, with_crosstalk
 from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
@@ -124,8 +125,8 @@ class Measured:
 class Light:
     """What reaches the detector: photoelectrons per exposure, float64 (objects, d_f), and the law that turns them to clicks.
 
-    `probability` holds afterpulses in the mean, where the profile states them; word by word they are in chain.py. Of photon numbers it is
-    the mean number.
+    `probability` holds afterpulses and crosstalk in the mean, where the profile states them; word by word afterpulses are in chain.py. Of
+    photon numbers it is the mean number.
     """
 
     photoelectrons: F64
@@ -134,6 +135,8 @@ class Light:
     illumination: float  # of one shot
     chain: Chain | None = None  # what links exposures: None without afterpulses
     numbers: Numbers | None = None  # of a bundle that takes photon numbers
+    crosstalk: Kernel = ()
+    own: F64 | None = None  # of a click without crosstalk, where there is some
 
     @property
     def chances(self) -> F64:
@@ -146,6 +149,10 @@ class Light:
         """Draw the clicks of `shots` exposures of every pattern, int64 (objects, d_f), for the objects in `rows`."""
         if self.numbers is not None:
             return self.numbers.counts(shots, rng, rows)
+        if self.own is not None:
+            own = self.own[rows]
+            drawn = (fired(rng.random(own.shape) < own, self.crosstalk, rng) for _ in range(shots))
+            return sum(drawn, np.zeros(own.shape, np.int64))
         if self.chain is None:
             return rng.binomial(shots, self.probability[rows])
         return self.chain.counts(shots, rng, rows)
@@ -201,6 +208,8 @@ def _lit(light: F64, law: ClickLaw | CountLaw, illumination: float, profile: Pro
         return Light(light, numbers.mean(), law, illumination, numbers=numbers)
     first = click_probability(law, light)
     afterpulses = afterpulses_of(profile, exposure_of(bundle, profile))
+    if kernel := crosstalk_of(profile):
+        return Light(light, with_crosstalk(first, kernel), law, illumination, crosstalk=kernel, own=first)
     if not afterpulses or profile.mode == "parallel":
         return Light(light, first, law, illumination)
     chain = Chain.of(first, afterpulses)
@@ -277,16 +286,19 @@ def decision_shares(bundle: Bundle, light: Light, *, shots: int = 1) -> F64:
     counts = (np.arange(outcomes)[:, None] // digits) % base
     decided = make_decider(bundle, shots=shots).decide_batch(counts, shots)
     of_class = np.eye(bundle.n_classes)[decided]
+    chances, one_shot = light.probability, shots == 1
+    if light.own is not None and one_shot:
+        chances, of_class = light.own, seen_from_own(of_class, bundle.n_features, light.crosstalk)
     shares = np.empty((len(light.probability), bundle.n_classes))
     step = max(1, _CHUNK_NUMBERS // outcomes)
     for start in range(0, len(shares), step):
         part = slice(start, start + step)
         if light.numbers is not None:
             shares[part] = vector_chances(light.numbers.sums(shots, part)) @ of_class
-        elif light.chain is not None and shots == 1:
+        elif light.chain is not None and one_shot:
             shares[part] = light.chain.word_chances(part) @ of_class
-        else:  # of several shots, afterpulses are in the mean
-            shares[part] = outcome_probabilities(light.probability[part], shots) @ of_class
+        else:  # of several shots, afterpulses and crosstalk are in the mean
+            shares[part] = outcome_probabilities(chances[part], shots) @ of_class
     return np.clip(shares, 0.0, 1.0)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
+from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.trainer.tasks.registry import Objects, Task, load_task
@@ -178,6 +179,13 @@ def afterpulses_in(bundle: Bundle, held_out: HeldOut, shots: int = 1, trials: in
         return "sampled"
     merged = bundle.automaton is not None and detector.afterpulse_time_us is not None
     return "mean memory" if merged or shots > 1 else "exact"
+
+
+def crosstalk_in(bundle: Bundle, held_out: HeldOut, shots: int = 1, trials: int | None = None) -> str:
+    """Return how the figures of `measure` hold crosstalk: none, exact, mean or sampled."""
+    if not crosstalk_of(held_out.profile) or bundle.largest > 1:
+        return "none"
+    return "sampled" if trials else "exact" if shots == 1 else "mean"
 
 
 def trials_needed(bundle: Bundle, shots: int = 1) -> int | None:

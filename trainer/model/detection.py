@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
 from pans.runtime.instrument.count_law import CountLaw
@@ -78,6 +79,18 @@ def counted_mean(mean: Tensor, dead_time: DeadTime) -> tuple[Tensor, Tensor]:
     rise = table[left + 1] - table[left]
     ratio = table[left] + rise * (place - left)
     return mean * ratio, ratio + rise / STEP * mean / (1 + mean)
+
+
+def with_crosstalk(p: Tensor, kernel: tuple[float, ...]) -> Tensor:
+    """Return the chances of clicks (n, d_f) with crosstalk of neighbouring patterns, from `p`, those without.
+
+    The same as `pans.runtime.detector.crosstalk.with_crosstalk`: right for each click; that clicks then depend on each other is left out.
+    """
+    spared = torch.ones_like(p)
+    for distance, chance in enumerate(kernel[: p.shape[1] - 1], 1):
+        below, above = 1 - chance * p[:, :-distance], 1 - chance * p[:, distance:]
+        spared = spared * pad(below, (distance, 0), value=1.0) * pad(above, (0, distance), value=1.0)
+    return p + (1 - p) * (1 - spared) if kernel else p
 
 
 class _StraightThrough(torch.autograd.Function):

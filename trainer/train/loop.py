@@ -24,6 +24,7 @@ from torch import Tensor
 
 from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.detector import Afterpulses
+from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.errors import as_usage_error
 from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.count_law import CountLaw, counting
@@ -31,7 +32,7 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.afterpulses import trained_through, with_mean_memory
 from pans.trainer.model.concentration import concentration
-from pans.trainer.model.detection import Law
+from pans.trainer.model.detection import Law, with_crosstalk
 from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
 from pans.trainer.model.estimators import LossOf, cross_entropy, similarity_loss
 from pans.trainer.model.exposure import exposure_us_of
@@ -147,6 +148,7 @@ class Run:
     ) -> None:
         self.own_law, self.readings = law, readings_of(options.outcomes)
         self.data, self.profile, self.options, self.restart = data, profile, options, restart
+        self.crosstalk = crosstalk_of(profile) if options.outcomes == 2 else ()
         self.random = new_generator(options.seed + restart)
         self.encoder = new_encoder(data.shown.shape[1], profile, options, self.random)
         if data.optics is not None and isinstance(self.encoder, ActiveIllumination):
@@ -182,7 +184,7 @@ class Run:
             light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
             slope, clamp = schedule.slope_and_clamp(options, now)
-            p = with_mean_memory(readings.chances(light.clamp(max=clamp), law, slope), traps)
+            p = self._linked(readings.chances(light.clamp(max=clamp), law, slope), traps)
             loss_of = schedule.loss_at(options, now, data.picture_shape)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
             if options.mix > 0 and self.epoch >= schedule.second_stage(options):
@@ -223,6 +225,10 @@ class Run:
         """What the clicks before add to a click at the same exposure, where that is trained through."""
         return None if self.own_law is not None else trained_through(self.profile, self._exposure_us())
 
+    def _linked(self, p: Tensor, traps: Afterpulses | None) -> Tensor:
+        """Chances of clicks with what other clicks add in the mean: those before, and those of neighbours in the same exposure."""
+        return with_mean_memory(p if self.own_law is not None else with_crosstalk(p, self.crosstalk), traps)
+
     def _exposure_us(self) -> float:
         if not isinstance(self.encoder, ActiveIllumination):
             return self.profile.exposure.min_us
@@ -261,7 +267,7 @@ class Run:
             for first in range(start, stop, CHUNK):
                 which = torch.arange(first, min(first + CHUNK, stop))
                 parts.append(self.readings.chances(self.encoder(shown[which], floor).double(), law))
-        return with_mean_memory(torch.cat(parts), traps)
+        return self._linked(torch.cat(parts), traps)
 
     def validation_loss(self) -> float:
         """The loss of the present epoch on the validation objects: exact where the words can be enumerated, else of 8 samples.
