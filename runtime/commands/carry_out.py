@@ -10,7 +10,7 @@ import hashlib
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -158,11 +158,12 @@ class _Prepared:
     header: dict[str, Any]
     expected_decisions: int
     registration: InUse | None = None
+    law_warnings: Sequence[str] = ()
 
 
 def _prepare(job: Job, started_ns: int) -> _Prepared:
     from pans.runtime.bundle.model import load_bundle
-    from pans.runtime.core.plan import build_plan
+    from pans.runtime.core.plan import build_plan, detector_warnings
     from pans.runtime.core.plan_codec import drive_words
     from pans.runtime.core.still import Core
     from pans.runtime.decide.backends import make_decider
@@ -211,7 +212,10 @@ def _prepare(job: Job, started_ns: int) -> _Prepared:
     if flow_run is not None:
         header["config"]["flow"] = flow_run.header()
     decisions = n_objects * job.trials
-    return _Prepared(bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, decisions, placed)
+    doubts = detector_warnings(dark.profile, bundle, plan.exposure_us)
+    return _Prepared(
+        bundle, bundle_sha256, decider, dark, plan, core, flow_run, config, header, decisions, placed, doubts
+    )
 
 
 def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
@@ -226,7 +230,7 @@ def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
         if besides and isinstance(error, PansError):
             error.message += f"\nbesides, the device could not be opened: {besides}"
         raise
-    for warning in ready.dark.warnings:
+    for warning in [*ready.dark.warnings, *ready.law_warnings]:
         warn(warning)
     link = opening.result()
     try:

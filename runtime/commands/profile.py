@@ -62,6 +62,7 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
+    from pans.runtime.detector.limits import law_warnings
     from pans.runtime.instrument.profile import load_profile
 
     if not args.names:
@@ -73,7 +74,18 @@ def _check(args: argparse.Namespace) -> int:
     for name, profile in found:
         lines.append(f"ok        {name}: {profile.name}, {profile.mode}, {profile.detector.channels} channel(s)")
         lines += [f"          to be measured: {key}" for key in profile.measure]
-    emit(args, {"ok": True, "rows": [_facts(name, profile) for name, profile in found]}, "\n".join(lines))
+        lines += [f"          warning: {text}" for text in law_warnings(profile, profile.exposure.min_us)]
+    emit(
+        args,
+        {
+            "ok": True,
+            "rows": [
+                _facts(name, profile) | {"warnings": law_warnings(profile, profile.exposure.min_us)}
+                for name, profile in found
+            ],
+        },
+        "\n".join(lines),
+    )
     return EXIT_FINE
 
 

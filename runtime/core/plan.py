@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pans.runtime.detector.limits import BRIGHT, law_warnings
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.count_law import cannot_count
 from pans.runtime.instrument.profile import Profile
@@ -117,6 +118,21 @@ def _fixed(profile: Profile, n: int, order: str, shots: int, dark: int, ticks: T
     if displays * shots > MAX_SLOTS or displays * _hold(shots, ticks) >= plan.object_ticks:
         return plan
     return _pattern_major(profile, n, shots, dark, ticks)
+
+
+def detector_warnings(
+    profile: Profile, bundle: Bundle, exposure_us: float, *, eta: float = 1.0, one_by_one: bool = False
+) -> list[str]:
+    """Return where the laws of `profile`'s detector do not hold as stated for the light of `bundle` times `eta` (detector/limits.py).
+
+    `one_by_one`: the clicks of an exposure are taken to be independent.
+    """
+    light = BRIGHT
+    if bundle.automaton is not None:
+        light = float(bundle.state_light().max())
+    elif bundle.analyser is None:
+        light = int(bundle.pattern_levels.sum(axis=1, dtype=np.uint64).max()) * bundle.photons_per_level
+    return law_warnings(profile, exposure_us, light * eta, one_by_one=one_by_one)
 
 
 def exposure_us(profile: Profile, bundle: Bundle) -> float:

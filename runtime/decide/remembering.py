@@ -42,7 +42,7 @@ class Remembered:
         self.chance, self.ends = self._sums.chance, self._sums.ends
         self.chance[0, :, 0], self._sums.memory[0, :, 0] = 1.0, begins[0]
         self._sums.squares[0, :, 0] = begins[1] + begins[0] ** 2
-        self._of_law = np.array(afterpulses.steps)
+        self._of_law = np.array([*afterpulses.steps, afterpulses.dead])
 
     def go_on(self, states: NDArray[np.int64], mean: F64) -> tuple[F64, F64]:
         """Leave `states` (m,) of one slot, whose exposures have `mean` (objects, m), -log of silence without memory.
@@ -62,13 +62,13 @@ class Remembered:
 def _pass_memory_on(sums, states, successors, mean, of_law, clicks):  # type: ignore[no-untyped-def]
     """Add what leaves `states` (m,) to its successors in `sums`, with its memory, and the expected clicks to `clicks` (objects,).
 
-    of_law float64 (13,): the steps of `Afterpulses`, and its flow through the slots behind. The same as `Afterpulses.after`.
+    of_law float64 (14,): the steps of `Afterpulses`, its dead time, and its flow through the slots behind. The same as `Afterpulses.after`.
     """
     chance, memory, squares, ends = sums
     n_states = successors.shape[0]
     to_x, of_m, spread_m, spread_x = of_law[0], of_law[1], of_law[2], of_law[3]
     pause_x, pause_m, pause_spread_m, pause_spread_x = of_law[4], of_law[5], of_law[6], of_law[7]
-    seen, kept, behind, behind_spread = of_law[8], of_law[9], of_law[11], of_law[12]
+    seen, kept, dead, behind, behind_spread = of_law[8], of_law[9], of_law[11], of_law[12], of_law[13]
     for before in range(2):
         for i in range(mean.shape[0]):
             for k in range(states.size):
@@ -77,13 +77,14 @@ def _pass_memory_on(sums, states, successors, mean, of_law, clicks):  # type: ig
                 if reached <= 0.0:
                     continue
                 m, x = mean[i, k], memory[before, i, state] / reached
+                found, varied = m / (1.0 + dead * m), m / (1.0 + dead * m) ** 3
                 variance = max(squares[before, i, state] / reached - x * x, 0.0)
                 ratio = seen * variance / max(x, LEAST_MEAN)
                 sight = seen * x * (np.log1p(ratio) / ratio if ratio > SMALL_RATIO else 1.0 - ratio / 2.0)
                 click, fewer = -np.expm1(-(m + sight)), 1.0 / (1.0 + ratio)
                 silent_x, silent_v = x * kept * fewer, variance * (kept * fewer) ** 2
-                more_x = of_m * m + x * (to_x - kept) + x * kept * (1.0 - fewer)
-                more_v = spread_m * m + spread_x * x + variance * (to_x**2 - (kept * fewer) ** 2)
+                more_x = of_m * found + x * (to_x - kept) + x * kept * (1.0 - fewer)
+                more_v = spread_m * varied + spread_x * x + variance * (to_x**2 - (kept * fewer) ** 2)
                 for outcome in range(2):
                     part, here, spread = reached * np.exp(-(m + sight)), silent_x, silent_v
                     if outcome:
@@ -91,8 +92,8 @@ def _pass_memory_on(sums, states, successors, mean, of_law, clicks):  # type: ig
                         here = silent_x + more_x / chance_of
                         square = silent_x**2 + (more_v + more_x * (2.0 * silent_x + more_x)) / chance_of
                         spread = max(silent_v + square - here**2, 0.0)
-                    spread = pause_x**2 * spread + pause_spread_m * m + pause_spread_x * here
-                    here = pause_x * here + pause_m * m
+                    spread = pause_x**2 * spread + pause_spread_m * varied + pause_spread_x * here
+                    here = pause_x * here + pause_m * found
                     after = successors[state, outcome]
                     chance[outcome, i, after] += part
                     memory[outcome, i, after] += part * here

@@ -1,12 +1,16 @@
 """Samples that bleach: what a pattern still brings where the light before it has left fewer emitters.
 
-Owns the law of first-order photobleaching, its stable forms and its spelling; never shows a pattern. A pixel that has received the
+The law is first-order photobleaching. A pixel that has received the
 dose D gives exp(-D / D0) of its first signal, as every absorbed photon kills its emitter with the same chance (Eggeling et al., Anal.
 Chem. 70, 2651, 1998; of uneven light: Berglund, J. Chem. Phys. 121, 2899, 2004). A dose is illumination: the
 photoelectrons that a pixel of full transmission would give, as `illumination` counts them.
 
 While a pattern is shown, its own light bleaches too. A pixel lit by P in that exposure gives
 `P exp(-D / D0) (1 - exp(-P / D0)) / (P / D0)`, the mean over the exposure.
+
+This is the mean over many emitters. Of M emitters in the light of an exposure, how many are left is random: the chance of a click is then
+lower, by about lambda^2 s (1 - s) exp(-lambda s) / (2 M) where s of the signal lambda is left. At one photoelectron per exposure and
+D0 = 4 that is 0.024 for 3 emitters, 0.0075 for 10, 0.0025 for 30 and 0.0008 for 100.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Dead time of a detector of which an exposure asks only whether it clicked: what is left of the mean when a click before blinds it.
 
-Owns the law and its table; never samples and never links exposures. Nothing within an exposure can suppress its first click: what counts
+Nothing within an exposure can suppress its first click: what counts
 is the rest of the dead time that a detection of the exposure before, or of the pause between, carries over. The law is the stationary
 share of silent exposures, P0, under steady light. It is given as the *counted mean* -log P0, which takes the mean's place in a click
-law, and holds on average over exposures of about equal light. How exposures depend on each other is left out: after a silent one a
-gated, non-paralysable detector is awake, and its chance is 1 - exp(-mean).
+law, and holds to 0.002 where exposures are of about equal light. Where dim and bright ones alternate, as in automata, it errs by up to
+`unequal_error`: at 30 photoelectrons 0.003 for a reach r of 0.03 exposures, 0.013 for 0.1 (paralysable: for 0.023, and 0.2). How exposures
+depend on each other is left out: after a silent one a gated, non-paralysable detector is awake, and its chance is 1 - exp(-mean).
 
 With the exposure as unit of time, mean m, dead time f, pause g, a = m f, and r = f - g the reach into the next exposure (gated; r = f
 where the detector stays on in the pause, or there is none):
@@ -92,6 +93,27 @@ def mean_of_most_clicks(dead_time: DeadTime) -> float:
         return math.inf
     mean = np.expm1(_MARKS)
     return float(mean[np.argmax(mean * counted_table(dead_time))])
+
+
+def unequal_error(dead_time: DeadTime, brightest: float) -> float:
+    """Return by how much the chance of a click can be off where exposures of 0 to `brightest` photoelectrons come in any order.
+
+    The law takes each exposure to follow its like. Against that stand the two extremes: one behind a dark exposure, which begins awake, and
+    one behind the brightest, of which detections fill the reach r before the next exposure with the density w = m / (1 + m f) (of photons,
+    where they paralyse; a quarter is added for what exposures then say of each other). At most 0.0005 below what single events give, while
+    it is below 0.003.
+    """
+    mean = np.append(np.geomspace(1e-3, max(brightest, 2e-3), 200), np.linspace(0, brightest, 200)[1:])
+    silent, awake, reach = np.exp(-counted_mean(dead_time, mean)), np.exp(-mean), dead_time.reach
+    if dead_time.paralysable:
+        blind = (np.arange(_CELLS) + 0.5) / _CELLS * min(reach, 1.0)
+        density = brightest * np.exp(-brightest * (min(reach, 1.0) - blind))
+        blinded = (np.expm1(mean[:, None] * blind) @ density) * (blind[1] - blind[0]) * np.exp(mean * dead_time.dead)
+    else:
+        blinded = (np.expm1(mean * reach) / mean - reach) * brightest / (1 + brightest * dead_time.dead)
+    after_bright = np.minimum(awake * (1 + blinded), 1.0)
+    off = float(max((silent - awake).max(), (after_bright - silent).max()))
+    return 1.25 * off if dead_time.paralysable else off
 
 
 @lru_cache(maxsize=64)

@@ -6,11 +6,15 @@ import argparse
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from pans.runtime.cli import warn
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Tolerance
 from pans.runtime.instrument.profile import Profile
+
+if TYPE_CHECKING:
+    from pans.runtime.bundle.model import Bundle
 
 
 def add_data_dir(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +32,8 @@ def add_order_and_bleach(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bleach",
         metavar="D0[:mixed]",
-        help="train for objects that bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination",
+        help="train for objects of many emitters per pixel that bleach: 1/e of a pixel's light is left after D0 photoelectrons of "
+        "illumination",
     )
 
 
@@ -48,6 +53,15 @@ def interruptible(run: Callable[[argparse.Namespace], int]) -> Callable[[argpars
             return run(args)
 
     return guarded
+
+
+def warn_of_laws(bundle: Bundle, profile: Profile, *, eta: float = 1.0, one_by_one: bool = False) -> None:
+    """Warn where the laws of the detector do not hold as stated, for the light of `bundle` on `profile`."""
+    from pans.runtime.core.plan import detector_warnings
+    from pans.trainer.evaluate.accuracy import exposure_of
+
+    for text in detector_warnings(profile, bundle, exposure_of(bundle, profile), eta=eta, one_by_one=one_by_one):
+        warn(text)
 
 
 def torch_with(threads: int, what: str = "training") -> Any:

@@ -21,7 +21,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 from pans.runtime.safe_text import one_line
 
-from .arguments import add_data_dir, needing, usage_errors
+from .arguments import add_data_dir, needing, usage_errors, warn_of_laws
 from .evaluate_dose import add_dose, bleaching_given, evaluate_dose, is_dosed
 from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
 
@@ -127,6 +127,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         _check_data_seed(args, held_out)
         assumed = not args.profile and "profile" not in bundle.provenance
         note(f"evaluating {bundle.name} on {held_out.task.name}")
+        warn_of_laws(bundle, held_out.profile, eta=args.eta, one_by_one=args.exact and args.shots > 1)
         started = time.perf_counter()
         if several or dosed:
             answer, words = (evaluate_tables if several else evaluate_dose)(args, bundle, held_out, conditions)

@@ -26,7 +26,7 @@ from pans.trainer.options import (
     plain_options,
 )
 
-from .arguments import interruptible, needing, stated_tolerance, torch_with, usage_errors
+from .arguments import interruptible, needing, stated_tolerance, torch_with, usage_errors, warn_of_laws
 from .course import shown_course
 from .evaluate import passive_light, warn_of_majority, words_of
 from .train_arguments import AS_GIVEN, AUTOMATON, DEFAULT_PROFILE, OF_AUTOMATA, configure_train
@@ -90,6 +90,7 @@ def _train(args: argparse.Namespace) -> int:
         say(f"interrupted; the last whole epoch is in {checkpoint}\n  go on: the same command with --resume")
         return EXIT_INTERRUPTED
     exported = _export(args, task, profile, trained, watch.seconds(), chosen.facts)
+    warn_of_laws(exported.bundle, profile, one_by_one=True)
     answer, words = _figures(exported, trained, task, profile)
     checkpoint.unlink(missing_ok=True)
     if history is not None:

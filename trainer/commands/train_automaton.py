@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, emit, say
 from pans.runtime.errors import UsageError
 
-from .arguments import needing, stated_tolerance, torch_with, usage_errors
+from .arguments import needing, stated_tolerance, torch_with, usage_errors, warn_of_laws
 from .course import shown_course
 from .evaluate import class_words, warn_of_majority
 from .train_own import After, as_given, choose, finish
@@ -144,6 +144,7 @@ def train_automaton_command(args: argparse.Namespace, checkpoint: Path, own: boo
 
         for path in write_course(args.history, course, force=args.force):
             say(f"wrote {path}")
+    warn_of_laws(exported.bundle, profile)
     after = finish(args, task, profile, asdict(exported.measured)) if own else After({}, "")
     _answer(args, trained, exported, watch.seconds(), after)
     return EXIT_FINE

@@ -151,8 +151,10 @@ class Light:
             return self.numbers.counts(shots, rng, rows)
         if self.own is not None:
             own = self.own[rows]
-            drawn = (fired(rng.random(own.shape) < own, self.crosstalk, rng) for _ in range(shots))
-            return sum(drawn, np.zeros(own.shape, np.int64))
+            counts = np.zeros(own.shape, np.int64)
+            for _ in range(shots):
+                counts += fired(rng.random(own.shape) < own, self.crosstalk, rng)
+            return counts
         if self.chain is None:
             return rng.binomial(shots, self.probability[rows])
         return self.chain.counts(shots, rng, rows)

@@ -40,24 +40,27 @@ def after(afterpulses: Afterpulses, mean: Tensor, memory: Tensor) -> tuple[Tenso
     """Return the memory (2, ...) after a silent exposure, and after a click: as `Afterpulses.after`, of a time constant above 0."""
     to_x, of_m, spread_m, spread_x, *pause, _, kept, _ = afterpulses.steps
     x, variance = memory
+    found, varied = mean / (1 + afterpulses.dead * mean), mean / (1 + afterpulses.dead * mean) ** 3
     sight, ratio = _sight(afterpulses, memory)
     left = kept / (1 + ratio)
     silent_x, silent_v = x * left, variance * left**2
     chance = -torch.expm1(-(mean + sight)).clamp(max=-_LEAST)
-    more_x = of_m * mean + x * (to_x - left)
-    more_v = spread_m * mean + spread_x * x + variance * (to_x**2 - left**2)
+    more_x = of_m * found + x * (to_x - left)
+    more_v = spread_m * varied + spread_x * x + variance * (to_x**2 - left**2)
     clicked_x = silent_x + more_x / chance
     squares = silent_v + silent_x**2 + (more_v + more_x * (2 * silent_x + more_x)) / chance
     behind = []
     for one, spread in ((silent_x, silent_v), (clicked_x, (squares - clicked_x**2).clamp(min=0))):
-        behind.append(_through(pause, mean, torch.stack([one, spread])))
+        behind.append(_through(pause, (found, varied), torch.stack([one, spread])))
     return behind[0], behind[1]
 
 
-def _through(flow: Sequence[float], mean: Tensor, memory: Tensor) -> Tensor:
-    """The memory after a time of whose clicks nothing is known; `flow` as of `Afterpulses.flow`."""
-    to_x, of_m, spread_m, spread_x = flow
-    return torch.stack([to_x * memory[0] + of_m * mean, to_x**2 * memory[1] + spread_m * mean + spread_x * memory[0]])
+def _through(flow: Sequence[float], filled: tuple[Tensor, Tensor], memory: Tensor) -> Tensor:
+    """The memory after a time of whose clicks nothing is known, by `Afterpulses.flow`; `filled`: detections and their variance."""
+    (to_x, of_m, spread_m, spread_x), (found, varied) = flow, filled
+    return torch.stack(
+        [to_x * memory[0] + of_m * found, to_x**2 * memory[1] + spread_m * varied + spread_x * memory[0]]
+    )
 
 
 def with_mean_memory(p: Tensor, afterpulses: Afterpulses | None) -> Tensor:
@@ -72,8 +75,9 @@ def with_mean_memory(p: Tensor, afterpulses: Afterpulses | None) -> Tensor:
             memory, found = begins.expand(2, len(p)), []
             for i in range(p.shape[1]):
                 found.append(first[:, i] - (1 - first[:, i]) * torch.expm1(-_sight(afterpulses, memory)[0]))
-                exposed = _through(afterpulses.steps[:4], mean[:, i], memory)
-                memory = _through(afterpulses.steps[4:8], mean[:, i], exposed)
+                fewer = 1 + afterpulses.dead * mean[:, i]
+                filled = mean[:, i] / fewer, mean[:, i] / fewer**3
+                memory = _through(afterpulses.steps[4:8], filled, _through(afterpulses.steps[:4], filled, memory))
             x, square = memory[0].detach().mean(), (memory[1] + memory[0] ** 2).detach().mean()
             begins = torch.stack([x, (square - x**2).clamp(min=0)])[:, None]
     return torch.stack(found, dim=1).to(p.dtype)

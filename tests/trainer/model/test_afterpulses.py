@@ -85,7 +85,7 @@ def test_what_is_trained_through_is_what_has_a_time_constant() -> None:
     profile = load_profile("dmd-spad")
     assert trained_through(profile, 100.0) is None
     timed = replace(profile, detector=replace(profile.detector, afterpulse_time_us=50.0))
-    assert trained_through(timed, 100.0) == Afterpulses(0.005, 0.5, 0.03)
+    assert trained_through(timed, 100.0) == Afterpulses(0.005, 0.5, 0.03, dead=0.024 / 100)
 
 
 def test_exact_and_sampled_figures_of_fixed_patterns_agree() -> None:
