@@ -1,0 +1,77 @@
+"""Commands warn where the laws of a profile's detector do not hold as stated, and say nothing of a shipped profile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from commands import json_of
+
+from pans.runtime import SHIPPED
+from pans.runtime.cli import main
+from pans.runtime.instrument.profile import load_profile
+
+REACHES = "dead_time_ns reaches"
+ADAPTIVE = SHIPPED / "fashion-adaptive.pans"
+
+
+def microled(tmp_path: Path, *, blinded: bool) -> str:
+    """The shipped microLED profile with a finer dwell; `blinded`: its detector stays on, dead from one shortest exposure to the next."""
+    profile = load_profile("microled-spad")
+    dead = 1000 * (profile.exposure.min_us + profile.exposure.readout_us)
+    changes = {"dwell_steps = 100\n": "dwell_steps = 1000\n"}
+    if blinded:
+        changes["dead_time_ns = 35.0"] = f'dead_time_ns = {dead}\nbetween_exposures = "free-running"'
+    text = profile.text
+    for old, new in changes.items():
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (tmp_path / "led.toml").write_text(text)
+    return str(tmp_path / "led.toml")
+
+
+def test_a_check_of_a_profile_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (row,) = json_of(capsys, "profile check", microled(tmp_path, blinded=True))["rows"]
+    assert len(row["warnings"]) == 1
+    assert REACHES in row["warnings"][0]
+    assert json_of(capsys, "profile check microled-spad")["rows"][0]["warnings"] == []
+
+
+@pytest.mark.parametrize("blinded", [False, True])
+def test_a_run_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = microled(tmp_path, blinded=blinded)
+    device = f"sim:{profile}?scene=fashion200&pace=fast&seed=1"
+    words = ("--profile", profile, "--decisions", "2", "--no-realtime", "--out", str(tmp_path / "run"))
+    assert main(["run", str(ADAPTIVE), "--device", device, *words]) in (0, 1)
+    assert (REACHES in capsys.readouterr().err) is blinded
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("blinded", [False, True])
+def test_an_evaluation_warns(blinded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch", reason="needs the train extra")
+    profile = microled(tmp_path, blinded=blinded)
+    assert main(["evaluate", str(ADAPTIVE), "--profile", profile, "--objects", "5", "--task", "fashion-mnist"]) in (
+        0,
+        1,
+    )
+    assert (REACHES in capsys.readouterr().err) is blinded
+
+
+@pytest.mark.parametrize("encoder", ["active", "automaton"])
+def test_a_training_warns(encoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch", reason="needs the train extra")
+    size = ("--exposures", "3", "--states", "4") if encoder == "automaton" else ("--features", "3")
+    words = (
+        "train",
+        "barcode",
+        "--profile",
+        microled(tmp_path, blinded=True),
+        "--photons",
+        "4",
+        "--epochs",
+        "1",
+        *size,
+    )
+    assert main([*words, "--encoder", encoder, "-o", str(tmp_path / "out.pans")]) == 0
+    assert REACHES in capsys.readouterr().err
