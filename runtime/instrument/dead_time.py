@@ -100,8 +100,8 @@ def unequal_error(dead_time: DeadTime, brightest: float) -> float:
 
     The law takes each exposure to follow its like. Against that stand the two extremes: one behind a dark exposure, which begins awake, and
     one behind the brightest, of which detections fill the reach r before the next exposure with the density w = m / (1 + m f) (of photons,
-    where they paralyse; a quarter is added for what exposures then say of each other). At most 0.0005 below what single events give, while
-    it is below 0.003.
+    where they paralyse). A seventh is added, a quarter where they paralyse, for what clicks of neighbouring exposures say of each other: up
+    to 0.003 this is never below what single events give.
     """
     mean = np.append(np.geomspace(1e-3, max(brightest, 2e-3), 200), np.linspace(0, brightest, 200)[1:])
     silent, awake, reach = np.exp(-counted_mean(dead_time, mean)), np.exp(-mean), dead_time.reach
@@ -113,7 +113,7 @@ def unequal_error(dead_time: DeadTime, brightest: float) -> float:
         blinded = (np.expm1(mean * reach) / mean - reach) * brightest / (1 + brightest * dead_time.dead)
     after_bright = np.minimum(awake * (1 + blinded), 1.0)
     off = float(max((silent - awake).max(), (after_bright - silent).max()))
-    return 1.25 * off if dead_time.paralysable else off
+    return (1.25 if dead_time.paralysable else 1.15) * off
 
 
 @lru_cache(maxsize=64)
