@@ -162,11 +162,16 @@ def _latest_round_trip(stamped: Iterable[Stamped], begin: int, end: int) -> Stam
 
 
 def _words(cause: str, share: int, facts: Facts) -> str:
-    total = _ms(facts.end_ns - facts.begin_ns)
+    length_ns = facts.end_ns - facts.begin_ns
+    total = _ms(length_ns)
     if cause == "host":
+        # the system's counters are read around the delay, not at its ends: they hold time beyond it
+        waited, stolen, computed = (
+            _ms(min(one, length_ns)) for one in (facts.run_delay_ns, facts.steal_ns, facts.cpu_ns)
+        )
         return (
-            f"the host did not run for {_ms(share)} of {total}: waiting for a processor {_ms(facts.run_delay_ns)}, "
-            f"stolen from the machine {_ms(facts.steal_ns)}, computing at most {_ms(facts.cpu_ns)}, "
+            f"the host did not run for {_ms(share)} of {total}: waiting for a processor {waited}, "
+            f"stolen from the machine {stolen}, computing at most {computed}, "
             f"{facts.switches} involuntary switches"
         )
     sentence = {

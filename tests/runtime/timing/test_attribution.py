@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -134,6 +135,13 @@ def test_no_cause_explains_more_than_the_delay(
 
 def gap(dropped: int, exposures: int = 10) -> Gap:
     return Gap(5, exposures, 2, dropped)
+
+
+def test_no_time_in_the_words_is_longer_than_the_delay() -> None:
+    """The system's counters are read around the delay."""
+    why = judge(facts(arrival=1, end=41, run_delay=160, cpu=90)).why
+    assert why.startswith("the host did not run for")
+    assert max(float(one) for one in re.findall(r"([\d.]+) ms", why)) == 41.0
 
 
 def test_what_never_came_is_the_links_fault_unless_the_device_dropped_it() -> None:
