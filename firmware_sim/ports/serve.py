@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -189,6 +190,7 @@ class ChildLink:
 
     def __init__(self, url: str, options: SimOptions, profile: Profile) -> None:
         self.name = url
+        self._closed = False
         self._child = _spawn(options)
         try:
             _check_scene(
@@ -218,9 +220,11 @@ class ChildLink:
         return self
 
     def close(self) -> None:
-        """Close the port and end the child; idempotent."""
+        """Close the port and let the child end, which a thread waits for: what a run has to tell does not; idempotent."""
         self._link.close()
-        self._end_child()
+        if not self._closed:
+            self._closed = True
+            threading.Thread(target=self._end_child, name="pans-sim-end").start()
 
     def _first_line(self) -> str:
         assert self._child.stdout is not None

@@ -440,8 +440,19 @@ def test_real_pace_runs_in_a_process_that_ends_with_the_link() -> None:
         check_run(run_of(link)[0])
     finally:
         link.close()
-    assert child.poll() == 0
+    assert child.wait(60) == 0
     link.close()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP")
+def test_closing_a_link_does_not_wait_for_a_child_that_hangs() -> None:
+    link = open_sim("sim:ideal?scene=uniform")
+    assert isinstance(link, ChildLink)
+    child = link._child
+    child.send_signal(signal.SIGSTOP)
+    link.close()
+    assert child.returncode is None
+    assert child.wait(60) == -signal.SIGKILL  # the thread that waits for it has ended it
 
 
 def test_the_child_ends_when_its_parent_dies() -> None:
