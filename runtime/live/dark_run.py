@@ -135,7 +135,13 @@ class DarkRun:
         return None if serial is None else str(serial)
 
     def look(self, run: LiveRun, output: Output) -> None:
-        """After a block: compare the clicks of its decisions with those of the run's beginning."""
+        """After a block: compare the clicks of its decisions with those of the run's beginning.
+
+        Not while the detector is in a state that changes them: that is named already, and is no change of light.
+        """
+        guard = getattr(run.core, "guard", None)
+        if guard is not None and guard.health.present:
+            return
         many = cast(object, output.decisions)
         if isinstance(many, RowDecisions):
             for found in self._look_at(many):

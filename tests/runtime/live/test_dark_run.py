@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -26,3 +28,14 @@ def test_dark_counts_beyond_the_calibration_are_a_fault(clicks: int, contradicts
     assert bool(faults) == contradicts
     assert all("the calibration contradicts the dark counts" in fault for fault in faults)
     assert DarkRun(profile, None, "warn", []).figures(report).faults == []
+
+
+@pytest.mark.parametrize("present", [[], ["a burst"]])
+def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> None:
+    dark: Any = DarkRun(small_setup()[0], None, "warn", [])
+    dark.light = MagicMock()
+    dark.light.take.return_value = ""
+    run, output = MagicMock(), MagicMock(decisions=[MagicMock(flags=0, clicks=4)])
+    run.core.guard.health.present = present
+    dark.look(run, output)
+    assert dark.light.take.called == (not present)
