@@ -12,6 +12,7 @@ together.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -102,6 +103,7 @@ class ChannelWatch:
         self.dropped_alarms = 0
         high = self.expected if guard_high is None else np.clip(guard_high, self.expected, RATE_MAX)
         low = self.expected if guard_low is None else np.clip(guard_low, FLOOR_RATE, self.expected)
+        self.low = low
         self.high = high  # up to here a rate is what was expected
         self.designs = _designs(self.expected, low, high, self.settings)
         self._tests = [name for name, _, _ in self.designs]
@@ -174,6 +176,17 @@ class ChannelWatch:
     def sums(self) -> F64:
         """Return every test's sum as a fraction of its threshold, float64 (tests,), for a live view; 1 is an alarm."""
         return self._state[:, SUM] / self._state[:, THRESHOLD]
+
+    def alarm_after(self) -> int | None:
+        """Return how many more dark exposures at the rates counted so far lead to an alarm, None where no test would give one."""
+        if not self.exposures:
+            return None
+        own, state, pooled = self.clicks / self.exposures, self._state, self._channel_of == ALL_CHANNELS
+        rates = np.where(pooled, own.mean(), own[self._channel_of])
+        steps = rates * state[:, CLICK_STEP] + (1 - rates) * state[:, SILENT_STEP]
+        gains = steps * np.where(pooled, self.n_channels, 1)
+        needed = (state[:, THRESHOLD] - state[:, SUM])[gains > 0] / gains[gains > 0]
+        return math.ceil(needed.min()) if len(needed) else None
 
     def _alarms(self, n: int) -> list[Alarm]:
         self.dropped_alarms += max(0, n - _ALARM_ROOM)

@@ -51,11 +51,11 @@ def headline(history: History) -> str:
     accuracy = "" if not picture["known"] else f" · accuracy {picture['right'] / picture['known']:.1%}"
     clicks = picture["clicks"] / decisions if decisions else 0.0
     p99 = quantile_us(history.latency, 0.99) or 0.0
-    dark = picture.get("dark_words")
+    dark, dark_level = _dark_state(picture)
     return (
         f"{decisions}{f' of {expected}' if expected else ''} decisions{accuracy} · {clicks:.2f} clicks each"
         f" · p99 {p99 / 1000:.2f} ms · late {picture['late']} · lost {picture['lost']}"
-        + (f" · dark counts: {one_line(dark, 200)}" if dark else "")
+        + (f" · dark counts: {dark}" if dark_level not in ("", "good") else "")
     )
 
 
@@ -145,13 +145,26 @@ def _dark(picture: dict[str, Any]) -> Row:
     if expected is not None:
         top = picture["dark_high"]
         text += f"; expected {expected:.2g}" + (f", at most {top:.2g}" if top > expected * 1.0001 else "")
-    words = picture.get("dark_words")
-    return Row(
-        "instrument",
-        "dark counts",
-        text + (f"; {one_line(words, 200)}" if words else "; as expected" if expected is not None else ""),
-        LEVELS.get(picture.get("dark_level", ""), "good" if expected is not None else ""),
-    )
+    words, level = _dark_state(picture)
+    return Row("instrument", "dark counts", text + (f"; {words}" if words else ""), level)
+
+
+def _dark_state(picture: dict[str, Any]) -> tuple[str, str]:
+    """Return what the dark counts are, in words, and its level; ("", "") where nothing is expected of them or none came.
+
+    A rate whose interval excludes what is expected is not called so, long before there is evidence for an alarm.
+    """
+    if words := picture.get("dark_words"):
+        return one_line(words, 200), LEVELS.get(picture.get("dark_level", ""), "note")
+    expected = picture.get("dark_expected")
+    if expected is None or not picture["dark_exposures"]:
+        return "", ""
+    low, high = wilson_interval(picture["dark_clicks"], picture["dark_exposures"])
+    if low <= picture["dark_high"] and high >= picture.get("dark_low", expected):
+        return "as expected", "good"
+    after = picture.get("dark_alarm_after")
+    then = "no alarm at this rate" if after is None else f"alarm after about {after:,} more dark exposures at this rate"
+    return f"{'higher' if low > picture['dark_high'] else 'lower'} than expected, not yet sure ({then})", "note"
 
 
 def _machine(history: History) -> list[Row]:

@@ -99,6 +99,8 @@ def now_facts(history: History) -> dict[str, Any]:
         "state": picture.get("state", "setting up"),
         "ended": bool(picture.get("ended")),
         "elapsed_s": picture.get("elapsed_s", 0.0),
+        "late": picture.get("late", 0),
+        "lost": picture.get("lost", 0),
         "progress": [picture.get("decisions", 0), history.begin.get("expected", 0)],
         "deadline_us": history.begin.get("deadline_us", 0),
         "dark_expected": picture.get("dark_expected"),

@@ -159,11 +159,13 @@ class Snapshots:
         if guard is None:
             return facts
         watch = guard.watch
-        if not facts["dark_exposures"]:  # a flow tells by its empty frames
+        if watch.exposures:  # one detector in one exposure, as what is expected; a flow tells by its empty frames
             facts = {"dark_exposures": watch.exposures * watch.n_channels, "dark_clicks": int(watch.clicks.sum())}
         return facts | {
             "dark_expected": float(watch.expected.mean()),
+            "dark_low": float(watch.low.mean()),
             "dark_high": float(watch.high.mean()),
+            "dark_alarm_after": watch.alarm_after(),
             "dark_words": guard.words(),
             "dark_level": max((one.level for one in guard.health.present), key=LEVELS.index, default=""),
         }

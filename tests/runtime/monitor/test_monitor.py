@@ -20,14 +20,16 @@ import numpy as np
 import pytest
 from commands import fixed_run
 
-from pans.runtime import SHIPPED
+from pans.runtime import SHIPPED, monitor
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
 from pans.runtime.commands import carry_out
+from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor, Snapshots
 from pans.runtime.monitor.figures import class_rows, headline, latest_rows, rows_of, series
 from pans.runtime.monitor.history import MAX_BINS, quantile_us
+from pans.runtime.monitor.server import now_facts
 from pans.runtime.monitor.snapshot import begin_facts
 from pans.runtime.timing.ledger import LatencyHistogram
 
@@ -108,6 +110,57 @@ def test_what_is_wrong_is_marked_and_in_words() -> None:
     assert latest_rows(history)[0]["level"] == "bad"
     assert headline(history).startswith("50 of 100 decisions · accuracy 50.0% · 2.00 clicks each · p99")
     assert headline(history).endswith("late 3 · lost 7")
+
+
+@pytest.mark.parametrize(
+    ("clicks", "words", "level"),
+    [
+        (2, "higher than expected, not yet sure (alarm after about", "note"),
+        (0, "as expected", "good"),
+    ],
+)
+def test_a_rate_whose_interval_excludes_the_expected_one_is_not_called_expected(
+    clicks: int, words: str, level: str
+) -> None:
+    watch = ChannelWatch(1, np.array([2.8e-5]))
+    dark = np.zeros((1000, 1), np.uint8)
+    dark[:clicks] = 1
+    watch.update_words(dark)
+    history = History()
+    history.take({"kind": "begin"})
+    seen = {"dark_exposures": 1000, "dark_clicks": clicks, "dark_expected": 2.8e-5, "dark_high": 2.8e-5}
+    history.take(picture(1.0, **seen, dark_low=2.8e-5, dark_words="", dark_alarm_after=watch.alarm_after()))
+    row = next(row for row in rows_of(history) if row.name == "dark counts")
+    assert words in row.text
+    assert (row.level, "as expected" in row.text) == (level, clicks == 0)
+    assert ("dark counts" in headline(history)) == (clicks > 0)
+
+
+@pytest.mark.parametrize("n_channels", [1, 4])
+def test_the_alarm_comes_when_it_was_said_to_come(n_channels: int) -> None:
+    watch = ChannelWatch(n_channels, np.full(n_channels, 0.001))
+    assert watch.alarm_after() is None
+    word = np.array([[0], *[[(1 << n_channels) - 1]], *[[0]] * 98], np.uint8)  # each channel clicks in 1 of 100
+    assert not watch.update_words(word)
+    said = watch.alarm_after()
+    assert said is not None
+    for block in range(1, 1000):
+        if watch.update_words(word):
+            assert 100 * (block - 1) <= said <= 100 * (block + 1)
+            return
+    raise AssertionError("no alarm")
+
+
+def test_late_and_lost_are_one_number_each_on_the_page() -> None:
+    history = History()
+    history.take({"kind": "begin"})
+    history.take(picture(1.0, late=90, lost=7))
+    facts = now_facts(history)
+    rows = {row.name: row.text for row in rows_of(history)}
+    assert (facts["late"], rows["late"]) == (90, "90 decisions")
+    assert (facts["lost"], rows["lost"]) == (7, "7 exposures in 0 gaps")
+    page = (Path(monitor.__file__).parent / "live.html").read_text()
+    assert "${now.late} late decisions and ${now.lost} lost exposures" in page
 
 
 def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
