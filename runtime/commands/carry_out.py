@@ -10,8 +10,8 @@ import hashlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
@@ -21,7 +21,14 @@ from pans.runtime.cli.talk import is_quiet
 from pans.runtime.errors import DamagedFileError, PansError
 from pans.runtime.html_card import html_card
 from pans.runtime.link.base import open_link
-from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED, REFUSED, Stop, stop_signals
+from pans.runtime.live.continuous import (
+    DISK_NEARLY_FULL,
+    INTERRUPTED,
+    RECORDING_DELETED,
+    REFUSED,
+    Stop,
+    stop_signals,
+)
 from pans.runtime.operate.first_start import compiled_beside, load_ahead
 
 from .job import Job, recording_header, stops_of, what_was_run
@@ -43,6 +50,7 @@ if TYPE_CHECKING:
     from pans.runtime.registration.use import InUse
     from pans.runtime.report.summary import Summary
     from pans.runtime.watch import Watchdog
+    from pans.runtime.watch.metrics import MetricsServer
 
 T = TypeVar("T")
 
@@ -118,8 +126,10 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
 
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
-            with compiled_beside() as compiled, _monitor_of(job) as monitor:
-                return _run_job(job, started_ns or time.perf_counter_ns(), _Beside(stop, watchdog, monitor, compiled))
+            # ports first: a busy one is refused before anything is compiled or opened
+            with _metrics_of(job) as metrics, _monitor_of(job) as monitor, compiled_beside() as compiled:
+                beside = _Beside(stop, watchdog, monitor, compiled, metrics)
+                return _run_job(job, started_ns or time.perf_counter_ns(), beside)
         except PansError:
             raise
         except Exception as error:
@@ -135,6 +145,18 @@ class _Beside(NamedTuple):
     watchdog: Watchdog | None
     monitor: Monitor
     compiled: Callable[[], None]  # waits until the largest kernels are
+    metrics: MetricsServer | None
+
+
+@contextmanager
+def _metrics_of(job: Job) -> Iterator[MetricsServer | None]:
+    if not job.continuous.metrics:
+        yield None
+        return
+    from pans.runtime.watch.metrics import MetricsServer
+
+    with closing(MetricsServer(job.continuous.metrics)) as server:
+        yield server
 
 
 def _monitor_of(job: Job) -> Monitor:
@@ -272,6 +294,11 @@ def _recorded(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcom
         )
         result = _watched(job, ready, link, recorder, recovery, beside)
         summary = _summary(job, ready, result)
+        if (kept := recorder.keep_deleted()) is not None:
+            job = replace(job, out=kept.parent, record=kept, continuous=replace(job.continuous, limits=None))
+            fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
+            warn(fault)
+            summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
         summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
     return _conclude(job, ready, result, summary)
 
@@ -296,7 +323,7 @@ def _watched(
 
     dark, monitor = ready.dark, beside.monitor
     monitor.begin(ready.bundle, recorder, _facts(job, ready, link))
-    with Attendants(job.continuous, recorder, beside.watchdog, beside.stop) as seen:
+    with Attendants(job.continuous, recorder, beside.watchdog, beside.stop, beside.metrics) as seen:
 
         def prepared(run: LiveRun) -> None:
             dark.check_device(run)
@@ -395,11 +422,9 @@ def _closed_quietly(opening: _Background[Any]) -> str:
 
 
 def _exit_code(summary: Summary) -> int:
-    if summary.ended == ASKED_TO_STOP:
-        return EXIT_FINE  # what went wrong on the way stands in the summary
     if summary.ended == INTERRUPTED:
         return EXIT_INTERRUPTED
-    if summary.ended == DISK_NEARLY_FULL:
+    if summary.ended in (DISK_NEARLY_FULL, RECORDING_DELETED):
         return EXIT_ALERT
     if summary.link_lost or summary.ended.startswith(REFUSED):
         return EXIT_DEVICE

@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the options must not load what a run needs
 INTERRUPTED = "interrupted"
 ASKED_TO_STOP = "stopped by SIGTERM"
 DISK_NEARLY_FULL = "the disk is nearly full"
+RECORDING_DELETED = "the recording was deleted during the run"
 REFUSED = "the device refused: "  # and what it said
 LOADERS = frozenset(("numba", "llvmlite", "importlib", "_frozen_importlib"))  # top-level modules
 AGAIN_S = 0.02

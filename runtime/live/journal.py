@@ -25,7 +25,15 @@ MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
 TROUBLE = (
     *("blame", "gap", "link_lost", "clock_step", "gate_refused", "show_refused"),
-    *("parts_trouble", "beyond_plan", "contradiction", "disk_short", "disk_nearly_full", "host_clock_step"),
+    *(
+        "parts_trouble",
+        "beyond_plan",
+        "contradiction",
+        "disk_short",
+        "disk_nearly_full",
+        "recording_deleted",
+        "host_clock_step",
+    ),
 )
 
 

@@ -56,7 +56,8 @@ class PartedRecorder:
         self.path, self.limits = Path(path), limits
         self.watch_write: Callable[[int, int], None] | None = None
         self.parts = 0
-        self._first_decision, self._chain = 0, ""
+        self._is_kept = False  # elsewhere: its folder was deleted
+        self._chain = ""
         self.keeper = PartKeeper(self.path, header, limits, bundle, overwrite)
         self.open_part = self.keeper.start()
         try:
@@ -142,12 +143,30 @@ class PartedRecorder:
         """See `Recorder`."""
         self.open_part.flush()
 
+    @property
+    def n_written(self) -> int:
+        """See `Recorder`."""
+        return self.open_part.n_written
+
+    @property
+    def is_deleted(self) -> bool:
+        """See `Recorder`."""
+        return self.open_part.is_deleted
+
+    def keep_deleted(self) -> Path | None:
+        """See `Recorder`; of the parts that were closed before nothing can be kept."""
+        kept = self.open_part.keep_deleted()
+        self._is_kept = self._is_kept or kept is not None
+        return kept
+
     def close(self, summary: Mapping[str, Any]) -> str:
         """Close the last part with `summary`, wait for the others, write the index; return the hash over all logs (`chained`)."""
+        self.keep_deleted()
         facts = self._facts(self.open_part, self.open_part.close(summary))
-        self.keeper.settle(facts)
+        if not self._is_kept:  # the index is for the folder that is gone
+            self.keeper.settle(facts)
         self.keeper.close()
-        if trouble := self.keeper.trouble or self.keeper.index_trouble:
+        if not self._is_kept and (trouble := self.keeper.trouble or self.keeper.index_trouble):
             raise RecordingError(
                 f"the run has ended, and its recording is not whole: {trouble}", remedy="verify the folder of parts"
             )
@@ -162,8 +181,9 @@ class PartedRecorder:
 
     @property
     def wants_part(self) -> bool:
-        """Whether the open part is full and the next one is ready to be written."""
-        return self.open_part.size_bytes >= self.limits.rotate_bytes and not self.keeper.ready.empty()
+        """Whether the open part is full and the next one is ready to be written; a deleted one is the last (`keep_deleted`)."""
+        part = self.open_part
+        return part.size_bytes >= self.limits.rotate_bytes and not self.keeper.ready.empty() and not part.is_deleted
 
     def next_part(self, place: Mapping[str, Any], commands: Iterable[bytes], host_ns: int) -> None:
         """Go on in the next part, which begins at `place` (of the core); `commands` repeat the plan and ARM, so that it stands alone."""
@@ -172,7 +192,7 @@ class PartedRecorder:
         full.flush()
         made = self.keeper.ready.get_nowait()
         facts = self._facts(full, full.written[1])
-        self._first_decision, self._chain = facts.first_decision + facts.decisions, facts.chain_sha256
+        made.first_decision, self._chain = facts.first_decision + facts.decisions, facts.chain_sha256
         self.open_part = made
         self._begin(place, commands, host_ns, facts)
         self.keeper.name(made, self.parts)
@@ -194,7 +214,7 @@ class PartedRecorder:
                 "kind": PART_EVENT,
                 "number": self.parts,
                 "utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
-                "first_decision": self._first_decision,
+                "first_decision": part.first_decision,
                 "before": None if before is None else asdict(before),
                 "place": dict(place),
             }
@@ -211,4 +231,4 @@ class PartedRecorder:
     def _facts(self, part: Recorder, digest: str) -> PartFacts:
         decisions = part.written[0]
         chain = chained(self._chain, digest)
-        return PartFacts(self.open_path.name, part.size_bytes, self._first_decision, decisions, digest, chain)
+        return PartFacts(self.open_path.name, part.size_bytes, part.first_decision, decisions, digest, chain)

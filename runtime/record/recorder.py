@@ -7,7 +7,9 @@ and never converts a time. `Recorder.close` returns the SHA-256 of the decision 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -82,6 +84,7 @@ class Recorder:
         self._log = LogEncoder()
         self._pack, self._pack_stamped = _packing()
         self._n_decisions = self._n_blocks = 0
+        self.first_decision = 0  # of a run in parts
         self._version = version = version_for(header)
         facts = {"format_version": version, "created_utc": datetime.now(UTC).isoformat(timespec="seconds")}
         facts |= {"bundle_sha256": hashlib.sha256(bundle).hexdigest()} if bundle else {}
@@ -90,6 +93,7 @@ class Recorder:
             raise refuse_existing(self.path)
         beside = beside_name(self.path)
         self._file = _create(beside, self.path)
+        self._has_names = os.fstat(self._file.fileno()).st_nlink > 0  # not every file system counts them
         start, self._chain = file_prologue(MAGIC, version)
         self._end = 0
         try:
@@ -116,6 +120,7 @@ class Recorder:
         if self._file.closed:
             return self._drop_unplaced()
         try:
+            self.keep_deleted()
             self.flush()
             self._close_file()
         except PansError:
@@ -135,6 +140,41 @@ class Recorder:
     def written(self) -> tuple[int, str]:
         """Number of the decisions in the file and the SHA-256 (hex) of their log; all of them after `flush`."""
         return self._n_decisions, self._log.hexdigest()
+
+    @property
+    def n_written(self) -> int:
+        """Number of the decisions in the file, for another thread too."""
+        return self.first_decision + self._n_decisions
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether the open file has no name any more; for another thread too."""
+        try:
+            return self._has_names and os.fstat(self._file.fileno()).st_nlink == 0
+        except (OSError, ValueError):  # it is closed
+            return False
+
+    def keep_deleted(self) -> Path | None:
+        """Go on in a copy beside the folder of a file that was deleted; return its path, None where nothing was deleted.
+
+        A file without a name cannot be given one again (link(2) refuses it), but it can be read as long as it is open.
+        """
+        if not self.is_deleted:
+            return None
+        self.before_first = self._unplaced = None
+        self.flush()
+        deleted, path = self._file, self.path.absolute()
+        try:
+            self.path = _folder_beside(path.parent) / path.name.removeprefix(".")
+            self._file = _create(self.path, self.path)
+            deleted.seek(0)
+            shutil.copyfileobj(deleted, self._file, MIB)
+        except OSError as error:
+            raise self._broken(error) from error
+        finally:
+            deleted.close()
+        self.sync()
+        return self.path
 
     def add_message(self, host_ns: int, data: bytes | bytearray | memoryview) -> None:
         """Keep one decoded device message of at most 1 MiB and the host time at which it arrived, in ns."""
@@ -264,6 +304,7 @@ class Recorder:
 
     def close(self, summary: Mapping[str, Any]) -> str:
         """Flush, write END with `summary` (JSON-able), sync, close; return the SHA-256 (hex) of the decision log."""
+        self.keep_deleted()
         self.flush()
         digest = self._log.hexdigest()
         end = {"blocks": self._n_blocks, "decisions": self._n_decisions, "decisions_sha256": digest, "summary": summary}
@@ -395,9 +436,19 @@ def _packing() -> tuple[Any, Any]:
 
 def _create(beside: Path, path: Path) -> Any:
     try:
-        return open(beside, "xb", buffering=0)  # one write per block, nothing half written behind our back
+        return open(beside, "x+b", buffering=0)  # one write per block, nothing half written behind our back
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _folder_beside(folder: Path) -> Path:
+    """Make a new folder beside `folder`, which may be gone itself."""
+    for number in itertools.count(1):
+        kept = folder.with_name(f"{folder.name}-kept" + (f"-{number}" if number > 1 else ""))
+        with suppress(FileExistsError):
+            kept.mkdir(parents=True)
+            return kept
+    raise AssertionError
 
 
 def _place(beside: Path, path: Path, overwrite: bool) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pans.runtime.record import AnyRecorder
 
     from .host import HostWatch
+    from .metrics import MetricsServer
     from .state_file import StateFile
     from .systemd import Notifier
     from .watchdog import Watchdog
@@ -31,30 +32,28 @@ class Attendants:
         recorder: AnyRecorder | None,
         watchdog: Watchdog | None = None,
         stop: Stop | None = None,
+        metrics: MetricsServer | None = None,
     ) -> None:
         self._wanted, self._recorder, self._watchdog, self._stop = wanted, recorder, watchdog, stop
         self._host: HostWatch | None = None
         self._run: LiveRun | None = None
         self._state: StateFile | None = None
         self._notifier: Notifier | None = None
+        self._metrics = metrics
         self._started_s = time.monotonic()
         self._open = ExitStack()
-        self.metrics_url = ""
 
     def __enter__(self) -> Self:
         from .host import HostWatch
-        from .metrics import MetricsServer
         from .state_file import StateFile
         from .systemd import Notifier
 
         with ExitStack() as opening:
             ask = (lambda why: None) if self._stop is None else self._stop.request
-            self._host = HostWatch(self._recorded, self._wanted.stop_below, ask)
+            self._host = HostWatch(self._recorded, self._wanted.stop_below, ask, self._is_deleted)
             opening.callback(self._host.close)
-            if self._wanted.metrics:
-                server = MetricsServer(self._wanted.metrics, self.look)
-                opening.callback(server.close)
-                self.metrics_url = f"http://{server.host}:{server.port}/metrics"
+            if self._metrics is not None:
+                self._metrics.look = self.look
             if self._wanted.state is not None:
                 self._state = StateFile(self._wanted.state, self.look)
                 opening.callback(self._state.close)
@@ -71,9 +70,13 @@ class Attendants:
     ) -> None:
         if self._watchdog is not None:
             self._watchdog.closes()
-        if self._run is not None and error is None:
-            self.tell(self._run)  # the recording is still open
-        self._open.close()
+        try:
+            if self._run is not None and error is None:
+                self.tell(self._run)  # the recording is still open
+                if self._recorder is not None:
+                    self._recorder.flush()  # the last state names all decisions
+        finally:
+            self._open.close()
 
     def prepared(self, run: LiveRun) -> None:
         """Show `run` from here on."""
@@ -100,6 +103,9 @@ class Attendants:
         """Return the file that is being written."""
         recorder = self._recorder
         return None if recorder is None else Path(getattr(recorder, "open_path", recorder.path))
+
+    def _is_deleted(self) -> bool:
+        return self._recorder is not None and self._recorder.is_deleted
 
     def _told(self, why: str) -> None:
         """The watchdog ends the process: leave word."""

@@ -19,9 +19,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pans.runtime.live.continuous import DISK_NEARLY_FULL
+from pans.runtime.cli import warn
+from pans.runtime.live.continuous import DISK_NEARLY_FULL, RECORDING_DELETED
 
 EVERY_S = 5.0
+FILE_EVERY_S = 0.5  # whether the recording still has a name
 SLOPE_S = 600.0  # over which the present rate is taken
 SLOPE_LEAST_S = 30.0
 SHORT_S = 3600.0  # a warning below that
@@ -34,8 +36,14 @@ _TIME_ERROR = 5
 class HostWatch:
     """Watches `recording`'s disk (None: the clock alone) and calls `stop` once with fewer than `reserve` bytes free (0: never)."""
 
-    def __init__(self, recording: Callable[[], Path | None], reserve: int, stop: Callable[[str], None]) -> None:
-        self._recording, self._reserve, self._stop = recording, reserve, stop
+    def __init__(
+        self,
+        recording: Callable[[], Path | None],
+        reserve: int,
+        stop: Callable[[str], None],
+        is_deleted: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._recording, self._reserve, self._stop, self._is_deleted = recording, reserve, stop, is_deleted
         self._disk = DiskTrend()
         self._clock = ClockSteps()
         self._facts: dict[str, Any] = {}
@@ -70,8 +78,16 @@ class HostWatch:
         self._facts = facts
 
     def _keep(self) -> None:
-        while not self._ending.wait(EVERY_S):
-            self.look()
+        due_s, told = time.monotonic() + EVERY_S, False
+        while not self._ending.wait(FILE_EVERY_S):
+            if not told and self._is_deleted():
+                told = True
+                warn(f"{RECORDING_DELETED}: {self._recording()}; the run ends, and what can be kept is kept beside it")
+                self._news.append({"kind": "recording_deleted", "path": str(self._recording())})
+                self._stop(RECORDING_DELETED)
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + EVERY_S
+                self.look()
 
     def _look_at_disk(self, path: Path) -> dict[str, Any]:
         free = shutil.disk_usage(path.parent).free

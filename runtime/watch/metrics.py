@@ -96,7 +96,8 @@ class Collector:
 class MetricsServer:
     """Serves the figures until `close`; `port` is the one that was given, or found for port 0."""
 
-    def __init__(self, address: str, look: Callable[[], dict[str, Any]]) -> None:
+    def __init__(self, address: str, look: Callable[[], dict[str, Any]] = dict) -> None:
+        self.look = look  # a run that is there later than its server gives its own
         host, port = parse_address(address)
         try:
             from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
@@ -106,7 +107,7 @@ class MetricsServer:
                 remedy="pip install 'pans-runtime[metrics]'",
             ) from error
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(Collector(look))
+        registry.register(Collector(lambda: self.look()))
         try:
             self._server = PageServer(host, port, CONTENT_TYPE_LATEST, lambda: generate_latest(registry))
         except OSError as error:

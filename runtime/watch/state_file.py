@@ -53,7 +53,8 @@ def picture_of(run: LiveRun | None, recorder: AnyRecorder | None, started_s: flo
         "state": state_of(run),
         "loop_age_s": round(loop_age_s(run), 3),
         "ended": run.ended,
-        "decisions": run.core.n_decisions,
+        # of those that are recorded only what is in the file: the rest is lost if the process is killed
+        "decisions": run.core.n_decisions if recorder is None else recorder.n_written,
         "late": timing.late,
         "late_cause": dict(incidents.causes),
         "lost_exposures": stream.lost_exposures,

@@ -5,26 +5,37 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
+from pans.runtime.commands import carry_out
+from pans.runtime.commands.carry_out import _exit_code
 from pans.runtime.errors import UsageError
-from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, Stop, stop_signals
-from pans.runtime.record import read_recording
+from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
+from pans.runtime.record import Recorder, read_recording
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
 from pans.runtime.watch.metrics import FIGURES, MetricsServer, parse_address
 from pans.runtime.watch.state_file import FORMAT, StateFile, picture_of
+
+DEVICE = "sim:ideal?scene=uniform&seed=3"
 
 
 def test_the_state_file_is_always_whole(tmp_path: Path) -> None:
@@ -143,22 +154,118 @@ def bundle_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.skipif(not hasattr(signal, "SIGTERM") or sys.platform == "win32", reason="needs signals")
 @pytest.mark.parametrize(("limit", "code"), [([], 0), (["--seconds", "60"], 130)])
 def test_sigterm_ends_a_continuous_run_well(bundle_file: Path, tmp_path: Path, limit: list[str], code: int) -> None:
-    fixed = ["run", "--device", "sim:ideal?scene=uniform&seed=3", "--no-realtime", "--json", "--rotate-mb", "0.02"]
-    words = [*fixed, str(bundle_file), "--out", str(tmp_path / "out"), "--state", str(tmp_path / "state.json"), *limit]
-    command = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen([sys.executable, "-c", command, *words], stdout=subprocess.PIPE, text=True)
-    try:
+    with _running(bundle_file, tmp_path, "--rotate-mb", "0.02", *limit) as process:
         _wait_for(lambda: _state(tmp_path).get("parts", 0) >= 3)
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=60)
-    finally:
-        process.kill()
     summary = json.loads(out)
     assert (process.returncode, summary["ended"]) == (code, ASKED_TO_STOP if code == 0 else INTERRUPTED)
     state = _state(tmp_path)
     assert (state["state"], state["decisions"]) == ("stopped", summary["decisions"])
     assert all(verdict.ok for verdict in verify_parts(tmp_path / "out"))
     assert sum(read_recording(path).n_decisions for path in parts_in(tmp_path / "out")) == summary["decisions"]
+
+
+@contextmanager
+def _running(bundle_file: Path, folder: Path, *more: str, device: str = DEVICE) -> Iterator[subprocess.Popen[str]]:
+    """A run in a process of its own, with its files in `folder`."""
+    words = ["run", "--device", device, "--no-realtime", "--json", str(bundle_file), *more]
+    words += ["--out", str(folder / "out"), "--state", str(folder / "state.json")]
+    command = "import sys; from pans.runtime.cli import main; sys.exit(main(sys.argv[1:]))"
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([sys.executable, "-c", command, *words], text=True, **pipes)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
+def test_a_verdict_of_fail_is_never_exit_code_0(bundle_file: Path, tmp_path: Path) -> None:
+    with _running(bundle_file, tmp_path, device=f"{DEVICE}&faults=loss:0.05") as process:
+        _wait_for(lambda: _state(tmp_path).get("lost_exposures", 0) > 0)
+        process.send_signal(signal.SIGTERM)
+        summary = json.loads(process.communicate(timeout=60)[0])
+    assert (process.returncode, summary["ended"], summary["verdict"]) == (4, ASKED_TO_STOP, "FAIL")
+
+
+@pytest.mark.parametrize(
+    ("facts", "code"),
+    [
+        ({"verdict": "PASS", "ended": ASKED_TO_STOP}, 0),
+        ({"verdict": "FAIL", "ended": ASKED_TO_STOP}, 1),  # reconnections alone
+        ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "late": 1}, 4),
+        ({"verdict": "FAIL", "ended": ASKED_TO_STOP, "link_lost": True}, 3),
+        ({"verdict": "FAIL", "ended": RECORDING_DELETED}, 1),
+        ({"verdict": "PASS", "ended": INTERRUPTED}, 130),
+    ],
+)
+def test_exit_codes_of_a_run(facts: dict[str, Any], code: int) -> None:
+    fine = {"link_lost": False, "late": 0, "lost": 0, "stream": {"lost_messages": 0}, "contradictions": {}}
+    assert _exit_code(SimpleNamespace(**{**fine, **facts})) == code  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs kill -9 and files that are read without a name")
+def test_after_kill_9_the_recording_has_every_decision_that_the_state_file_names(
+    bundle_file: Path, tmp_path: Path
+) -> None:
+    with _running(bundle_file, tmp_path) as process:
+        _wait_for(lambda: _state(tmp_path).get("decisions", 0) > 50)
+        process.kill()
+        process.communicate()
+    named = _state(tmp_path)["decisions"]
+    assert 50 < named <= read_recording(tmp_path / "out" / "run.pansrec").n_decisions
+
+
+def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "run.pansrec", {"simulated": True}) as recorder:
+        run: Any = MagicMock()
+        run.core.n_decisions, run.journal.trouble, run.turned_s = 3, None, 0.0
+        run.core.tallies = np.zeros(16, np.int64)
+        run.timing.total.max_ns, run.timing.total.quantile_ns.return_value = 0, 0
+        run.lateness.incidents.causes = run.lateness.incidents.missing = {}
+        for number in range(3):
+            recorder.add_decision((number, 0, 0, 0, 0, 0, 0, -1, 0, 0.5, 0, 0))
+        assert picture_of(run, recorder, 0.0)["decisions"] == 0
+        recorder.flush()
+        assert picture_of(run, recorder, 0.0)["decisions"] == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs files that are read without a name")
+@pytest.mark.parametrize("parts", [[], ["--rotate-mb", "0.02"]])
+def test_a_run_whose_folder_is_deleted_keeps_its_recording(bundle_file: Path, tmp_path: Path, parts: list[str]) -> None:
+    with _running(bundle_file, tmp_path, *parts) as process:
+        _wait_for(lambda: _state(tmp_path).get("parts", 0) >= 3 if parts else _state(tmp_path).get("decisions", 0) > 50)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        out, told = process.communicate(timeout=60)
+    summary, kept = json.loads(out), tmp_path / "out-kept"
+    assert (process.returncode, summary["ended"], summary["verdict"]) == (1, RECORDING_DELETED, "FAIL")
+    recording = read_recording(summary["recording"])
+    assert recording.path.parent == Path(summary["report"]).parent == kept
+    assert recording.complete
+    assert 0 < recording.n_decisions <= summary["decisions"]
+    assert bool(parts) or recording.n_decisions == summary["decisions"]
+    assert any(str(kept) in fault for fault in summary["faults"])
+    assert RECORDING_DELETED in told
+    assert RECORDING_DELETED in (kept / "summary.md").read_text()
+
+
+def test_a_busy_port_is_refused_before_anything_is_prepared(
+    bundle_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("prometheus_client")
+    begun = list[str]()
+    for name in ("open_link", "compiled_beside", "_prepare"):
+        monkeypatch.setattr(carry_out, name, lambda *_, name=name: begun.append(name))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        words = ["run", str(bundle_file), "--device", f"{DEVICE}&pace=fast", "--out", str(tmp_path / "out")]
+        assert main([*words, "--metrics", address, "--decisions", "4"]) == 2
+    assert (begun, list(tmp_path.iterdir())) == ([], [])
+    said = capsys.readouterr().err
+    assert f"--metrics {address}: cannot listen there" in said
+    assert "choose another port" in said
 
 
 def _state(folder: Path) -> dict[str, Any]:
