@@ -23,8 +23,9 @@ import numpy as np
 
 from pans.firmware_sim.options import option
 from pans.firmware_sim.probes.processes import start_command, wait_until
-from pans.runtime.cli import say
+from pans.runtime.cli import EXIT_FINE, say
 from pans.runtime.errors import PansError
+from pans.runtime.live.continuous import ASKED_TO_STOP
 from pans.runtime.record import read_recording, replay
 from pans.runtime.record.parts import parts_in
 from pans.runtime.report.verify import verify_parts
@@ -78,7 +79,10 @@ def judged(
     samples: list[dict[str, Any]], exit_code: int, summary: dict[str, Any], out: Path, goodbye_s: float
 ) -> dict[str, Any]:
     """Return the figures and `broken`, one sentence for each promise that was not kept."""
-    broken = [] if exit_code == 0 else [f"exit code {exit_code} after SIGTERM, expected 0"]
+    ended, verdict = summary.get("ended"), summary.get("verdict")
+    # with faults the verdict is FAIL, which is never exit code 0
+    ended_well = ended == ASKED_TO_STOP and (exit_code == EXIT_FINE) == (verdict == "PASS")
+    broken = [] if ended_well else [f"exit code {exit_code} after SIGTERM, ended {ended!r} with verdict {verdict}"]
     later = [sample for sample in samples if sample["elapsed_s"] >= WARM_UP_SHARE * samples[-1]["elapsed_s"]]
     minutes = np.array([sample["elapsed_s"] / 60 for sample in later])
     rss = np.array([sample["rss_bytes"] for sample in later], float)

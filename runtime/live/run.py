@@ -80,6 +80,7 @@ class LiveRun(Reconciled):
         self.ended, self.link_lost, self.reconnects = "", False, 0
         self.turned_s = time.monotonic()  # the loop's heartbeat: when it turned last
         self.stops = False  # the device is being told to go dark
+        self.stopped = False  # it has been told, and what came is recorded
         self.outage_ns: int | None = None  # since when there has been no block
         self.decoded: Counter[str] = Counter()  # what the connections that are gone have counted
         self.contradictions: Counter[str] = Counter()  # between messages and the clock, or the host's own books
@@ -192,6 +193,7 @@ class LiveRun(Reconciled):
             self.journal.take(verdict)
         self.lateness.close()
         self.journal.clock(self.connection)
+        self.stopped = True
 
     def take_rest(self) -> None:
         """Decide on and record what has arrived on a connection that is given up: lost is only what never came."""

@@ -36,6 +36,7 @@ SENTENCES = {
     "part_deleted": "The part {name} was deleted: {why}.",
     "parts_trouble": "A part of the recording made trouble: {message}.",
     "disk_short": "The disk of the recording was nearly full: {free_bytes} bytes were free.",
+    "recording_deleted": "The recording was deleted during the run: {path}. The run ended.",
     "disk_nearly_full": "The run stopped before its disk was full: {free_bytes} bytes were free, {reserve_bytes} are kept.",
     "host_clock_step": "The computer's clock was set by {step_s} s; decisions and latencies do not depend on it.",
     "show_refused": "The device refused to show a state: {text}.",

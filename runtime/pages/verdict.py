@@ -61,8 +61,8 @@ def add_verdict(page: Page, recording: Recording, bundle: Bundle | None) -> None
 
 def _why_passed(summary: Mapping[str, Any]) -> str:
     dark = summary.get("dark")
-    counted = isinstance(dark, Mapping) and dark.get("exposures")
-    agree = counted and dark.get("low", 1) <= dark.get("expected", 0) <= dark.get("high", 0)
+    counted = dark if isinstance(dark, Mapping) and dark.get("exposures") else {}
+    agree = counted.get("low", 1) <= counted.get("expected", 0) <= counted.get("high", 0)
     return (
         f"All {summary.get('decisions', 0):,} decisions were made within {float(summary.get('deadline_us', 0)) / 1000:g} ms, no exposure "
         f"was lost{', and the dark counts are as expected' if agree else ''}."

@@ -86,10 +86,15 @@ class Watchdog:
             self._turn_light_off(self.run)
         if self._is_done_by(asked_s + END_AFTER_S):
             return
-        while self._closing and time.monotonic() < asked_s + CLOSING_END_AFTER_S:
+        while self._is_closing and time.monotonic() < asked_s + CLOSING_END_AFTER_S:
             if self._done.wait(0.1):
                 return
         self._end_process(signum)
+
+    @property
+    def _is_closing(self) -> bool:
+        """Whether only links and files are left, which a busy machine is slow to close."""
+        return self._closing or (self.run is not None and self.run.stopped)
 
     def _is_done_by(self, at_s: float) -> bool:
         return self._done.wait(max(0.0, at_s - time.monotonic()))

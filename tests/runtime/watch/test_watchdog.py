@@ -18,6 +18,7 @@ from host_process import HANGS, lit_instrument, start_host, until
 from pans.runtime.cli import EXIT_INTERRUPTED, EXIT_TIMING
 from pans.runtime.record import read_recording, replay
 from pans.runtime.report.verify import verify_file
+from pans.runtime.watch import watchdog
 from pans.runtime.watch.heartbeat import is_stalled
 from pans.runtime.watch.systemd import Notifier
 
@@ -107,3 +108,23 @@ def test_the_loop_alone_is_spoken_for_to_systemd(tmp_path: Path, monkeypatch: py
     monkeypatch.delenv("NOTIFY_SOCKET")
     assert Notifier.of_environment() is None
     assert os.environ["WATCHDOG_USEC"]
+
+
+def test_a_run_whose_light_is_off_has_time_to_close_its_links_and_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = list[int]()
+    dog = watchdog.Watchdog(continuous=True)
+
+    class Dark:
+        stops = True
+
+        @property
+        def stopped(self) -> bool:
+            dog._done.set()  # it ends while it is waited for
+            return True
+
+    dog.run = Dark()  # type: ignore[assignment]
+    monkeypatch.setattr(dog, "_end_process", ended.append)
+    monkeypatch.setattr(watchdog, "LIGHT_OFF_AFTER_S", 0.0)
+    monkeypatch.setattr(watchdog, "END_AFTER_S", 0.0)
+    dog._see_off(signal.SIGTERM, time.monotonic())
+    assert ended == []
