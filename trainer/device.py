@@ -16,6 +16,9 @@ from torch import Tensor
 
 from pans.runtime.errors import UsageError
 
+from .processor import settle
+
+CHOICE = settle()  # before torch's first operation
 DEVICES = ("cpu", "cuda")
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
@@ -66,11 +69,10 @@ def new_generator(seed: int) -> torch.Generator:
 
 
 def product_dtype() -> torch.dtype:
-    """Return the type of training's matrix products: bfloat16 where the device multiplies it fast, else float32.
+    """Return the type of training's matrix products: the fastest that works on the device (see processor.py).
 
-    Grey values and one-bit patterns are exact in it, sums are float32; final figures are always float32 or wider.
+    Grey values and one-bit patterns are exact in bfloat16, sums are float32; final figures are always float32 or wider.
     """
     if torch.get_default_device().type == "cuda":
         return torch.bfloat16
-    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return torch.bfloat16 if supported is not None and supported() else torch.float32
+    return torch.float32 if CHOICE is None else getattr(torch, CHOICE.products)

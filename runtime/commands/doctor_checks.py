@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -146,13 +147,6 @@ def check_numba() -> Iterator[Finding]:
     yield Finding("numba cache", ok, str(folder), "" if ok else remedy)
 
 
-def check_onnxruntime() -> Iterator[Finding]:
-    """ONNX Runtime loads."""
-    import onnxruntime
-
-    yield Finding("onnxruntime", True, f"onnxruntime {onnxruntime.__version__}", needed=True)
-
-
 def check_libusb() -> Iterator[Finding]:
     """pyusb finds libusb."""
     import usb.backend.libusb1
@@ -173,27 +167,91 @@ def check_clock() -> Iterator[Finding]:
     yield Finding("clock resolution", ok, f"{finest} ns ({source or 'source unknown'})", remedy)
 
 
-def check_privileges() -> Iterator[Finding]:
-    """Real-time scheduling and locked memory are allowed."""
+def check_processor() -> Iterator[Finding]:
+    """Kernels and heads compute, SCHED_FIFO and locked memory are granted: announced, tried in a child process, taken.
+
+    A child, since an instruction that is announced and not granted ends the process, and so that nothing stays locked here.
+    """
+    import llvmlite.binding
+    import numba
+    import onnxruntime
+
+    tried = _tried("compiled", "onnxruntime", "sched_fifo", "mlockall")
+    host, chosen = llvmlite.binding.get_host_cpu_name(), numba.config.CPU_NAME
+    right = tried["compiled"] == "right"
+    yield Finding(
+        "numba's target",
+        right,
+        f"announced {host}; works {tried['compiled']}; taken {chosen or host}",
+        "" if right else "export NUMBA_CPU_NAME=generic: kernels without the instructions that are refused here",
+        needed=True,
+    )
+    announced, right = ", ".join(onnxruntime.get_available_providers()), tried["onnxruntime"] == "right"
+    yield Finding(
+        "onnxruntime",
+        right,
+        f"{onnxruntime.__version__}: announced {announced}; works {tried['onnxruntime']}; taken CPUExecutionProvider",
+        "" if right else "pip install --force-reinstall onnxruntime; a bundle with a table decides without it",
+        needed=True,
+    )
     if sys.platform == "win32":
         return
     import resource
 
     user = os.environ.get("USER", "$USER")
-    for check, name, line in (
-        ("SCHED_FIFO", "RLIMIT_RTPRIO", f"{user} - rtprio 20"),
-        ("locked memory", "RLIMIT_MEMLOCK", f"{user} - memlock unlimited"),
+    for check, name, key, line in (
+        ("SCHED_FIFO", "RLIMIT_RTPRIO", "sched_fifo", f"{user} - rtprio 20"),
+        ("locked memory", "RLIMIT_MEMLOCK", "mlockall", f"{user} - memlock unlimited"),
     ):
-        if not hasattr(resource, name):
-            continue
-        limit = resource.getrlimit(getattr(resource, name))[0]
-        ok = os.geteuid() == 0 or limit == resource.RLIM_INFINITY or (name == "RLIMIT_RTPRIO" and limit > 0)
+        limit = resource.getrlimit(getattr(resource, name))[0] if hasattr(resource, name) else None
+        stated = "root" if os.geteuid() == 0 else "unlimited" if limit == resource.RLIM_INFINITY else f"limit {limit}"
+        ok = tried[key] == "granted"
         remedy = (
-            ""
-            if ok
-            else f"for steadier latencies: echo '{line}' | sudo tee -a /etc/security/limits.d/pans.conf, log in again"
+            f"for steadier latencies: echo '{line}' | sudo tee -a /etc/security/limits.d/pans.conf, log in again"
+            + ("; a container or virtual machine may refuse it all the same" if stated in ("root", "unlimited") else "")
         )
-        yield Finding(check, ok, "allowed" if ok else f"limit {limit}", remedy)
+        taken = "asked for by each run" if ok else "runs go on without it"
+        yield Finding(check, ok, f"announced {stated}; works {tried[key]}; taken: {taken}", "" if ok else remedy)
+
+
+# What a child process tries, each answer on a line: integers and floats in vectors, the golden scores of a shipped head, privileges.
+_TRIAL = """
+import numba, numpy
+@numba.njit
+def kernel(integers, floats):
+    total, kept = 0, 0.0
+    for i in range(len(integers)):
+        total += integers[i] * integers[i]
+        floats[i] = floats[i] * floats[i] + floats[i]
+    return total
+floats = numpy.arange(1000.0)
+right = kernel(numpy.arange(1000), floats) == 332833500 and (floats == numpy.arange(1000.0) * numpy.arange(1, 1001)).all()
+print("compiled=" + ("right" if right else "wrong results"), flush=True)
+from pans.runtime import SHIPPED
+from pans.runtime.bundle.model import load_bundle
+from pans.runtime.decide.onnx import OnnxDecider
+try:
+    OnnxDecider(load_bundle(SHIPPED / "fashion10.pans")[0])
+    print("onnxruntime=right", flush=True)
+except Exception as error:
+    print(f"onnxruntime={error}".splitlines()[0], flush=True)
+from pans.runtime.timing.ledger import request_fifo, request_mlockall
+print("sched_fifo=" + request_fifo([0]), flush=True)
+print("mlockall=" + request_mlockall(), flush=True)
+"""
+TRIAL_PATIENCE_S = 120.0  # compiling on a busy machine
+
+
+def _tried(*names: str) -> dict[str, str]:
+    """Return what a child process answered for each name; how it ended, for those without an answer."""
+    try:
+        done = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, text=True, timeout=TRIAL_PATIENCE_S)
+        printed, reason = done.stdout, (done.stderr.strip().splitlines() or [""])[-1]
+        ended = f"the process ended by signal {-done.returncode}" if done.returncode < 0 else reason
+    except subprocess.TimeoutExpired as error:
+        printed, ended = (error.stdout or b"").decode(), f"no answer within {TRIAL_PATIENCE_S:.0f} s"
+    answers = dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
+    return {name: answers.get(name, ended) for name in names}
 
 
 def check_governor() -> Iterator[Finding]:
@@ -235,16 +293,22 @@ def check_ports() -> Iterator[Finding]:
             yield Finding(f"FTDI latency {device}", ok, f"{timer_ms} ms", remedy)
 
 
+def check_others() -> Iterator[Finding]:
+    """What other packages check, by the entry points `pans.checks`: torch's products among them."""
+    for point in entry_points(group="pans.checks"):
+        yield from point.load()()
+
+
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_python,
     check_numba,
-    check_onnxruntime,
     check_libusb,
     check_clock,
-    check_privileges,
+    check_processor,
     check_governor,
     check_udev,
     check_ports,
+    check_others,
 )
 
 

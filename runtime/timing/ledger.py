@@ -186,10 +186,10 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
     threads, held = [0, *other_threads], ExitStack()
     try:
         if wanted:
-            granted["sched_fifo"] = _request_fifo(threads)
+            granted["sched_fifo"] = request_fifo(threads)
             if granted["sched_fifo"] == "granted":
                 threads += _raised(threads)
-            granted["mlockall"] = _request_mlockall()
+            granted["mlockall"] = request_mlockall()
             granted["heap_touched"] = held.enter_context(held_heap())
         yield granted
     finally:
@@ -206,7 +206,8 @@ def arm_realtime(wanted: bool, other_threads: Sequence[int] = ()) -> Iterator[di
             ctypes.CDLL(None).munlockall()
 
 
-def _request_fifo(threads: Sequence[int]) -> str:
+def request_fifo(threads: Sequence[int]) -> str:
+    """Ask for SCHED_FIFO for `threads` (native ids, 0 for the calling one); return "granted" or the reason why not."""
     if not hasattr(os, "sched_setscheduler"):
         return "this system has no SCHED_FIFO"
     try:
@@ -235,7 +236,8 @@ def _set_scheduler(threads: Sequence[int], policy: str, priority: int) -> None:
         os.sched_setscheduler(thread, getattr(os, policy), os.sched_param(priority))
 
 
-def _request_mlockall() -> str:
+def request_mlockall() -> str:
+    """Ask for all memory of this process to stay resident; return "granted" or the reason why not."""
     if sys.platform != "linux":
         return "not asked for on this system"
     libc = ctypes.CDLL(None, use_errno=True)

@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+import pans.trainer.device  # noqa: F401  # before a convolution: it sets what torch needs on this processor
+
 from .common import F32, I64, Decide, Measurement, Report, silent
 
 CHUNK = 1000  # readouts per pass where no gradient is needed

@@ -70,6 +70,8 @@ def torch_with(threads: int, what: str = "training") -> Any:
         raise UsageError(f"--threads is {threads}, allowed: 1 to 1024")
     try:
         import torch
+
+        import pans.trainer.device  # noqa: F401  # it sets what torch needs on this processor
     except ModuleNotFoundError as error:
         raise UsageError(
             f"{what} needs the package torch, which is not installed", remedy="pip install 'pans-runtime[train]'"

@@ -17,12 +17,10 @@ from pans.trainer.paper import Asked, Made, Page, rewrite_page, write_page
 from pans.trainer.paper.page import Rows, is_page_file, page_files, read_rows
 from pans.trainer.paper.tables import ACTIVE, PASSIVE, UNPRINTED, table_of
 
-from .arguments import interruptible
+from .arguments import interruptible, torch_with
 
 CACHE = Path("~/.cache/pans-runtime/reproduce")
 SEEDS_MAX = 100
-THREADS_MAX = 1024
-NEEDS_TORCH = "pip install 'pans-runtime[train]'"
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:
@@ -50,17 +48,12 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    if not 1 <= args.threads <= THREADS_MAX:
-        raise UsageError(f"--threads is {args.threads}, allowed: 1 to {THREADS_MAX}")
     if args.data_seed < 0:
         raise UsageError(f"--data-seed is {args.data_seed}, allowed: 0 or more")
     if args.name == "list":
         emit(args, {"rows": list(PAGES)}, "\n".join(PAGES))
         return EXIT_FINE
-    try:
-        import torch
-    except ModuleNotFoundError as error:
-        raise UsageError("training needs the package torch, which is not installed", remedy=NEEDS_TORCH) from error
+    torch_with(args.threads)
     if args.name == "check":
         from .reproduce_check import check  # of torch, as the pages are
 
@@ -73,7 +66,6 @@ def _run(args: argparse.Namespace) -> int:
         return _rewrite(names, args)
     for name in names:
         _check(name, args)
-    torch.set_num_threads(args.threads)
     args.cache = args.cache.expanduser()
     make_folder(args.cache)
     results: dict[str, tuple[Page, Made]] = {}

@@ -25,6 +25,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError, as_usage_error
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
+from pans.trainer.device import CHOICE
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.tasks.registry import Objects, Task
@@ -131,8 +132,9 @@ def origin(task: Task, profile: Profile) -> dict[str, Any]:
 
 
 def programs() -> str:
-    """Return the programs that trained a bundle, with their versions."""
-    return f"pans-runtime {__version__}, torch {torch.__version__}"
+    """Return the programs that trained a bundle, with their versions, and what this processor computes products with."""
+    computed = "" if CHOICE is None else f", {CHOICE.words()}"
+    return f"pans-runtime {__version__}, torch {torch.__version__}{computed}"
 
 
 def export_trained(

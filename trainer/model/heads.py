@@ -17,6 +17,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+import pans.trainer.device  # noqa: F401  # before a convolution: it sets what torch needs on this processor
 from pans.trainer.options import PICTURE_HEADS, Options
 
 KERNEL = 15  # the paper, comparison of back ends

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.outputs import replace_file
-from pans.trainer.device import here
+from pans.trainer.device import here, product_dtype
 from pans.trainer.tasks.distort import SIDE_MIN_PX, distorted
 from pans.trainer.tasks.registry import Objects
 
@@ -100,7 +100,7 @@ def _version(images: NDArray[np.uint8], epoch: int) -> NDArray[np.uint8]:
 
 
 def _scores(network: nn.Module, images: NDArray[np.uint8]) -> Tensor:
-    """Scores of images (n, height, width), in bfloat16 where it is fast, as float32 (n, classes)."""
+    """Scores of images (n, height, width), in the type of training's products, as float32 (n, classes)."""
     shown = (
         here(torch.from_numpy(images.copy()))
         .float()
@@ -108,7 +108,7 @@ def _scores(network: nn.Module, images: NDArray[np.uint8]) -> Tensor:
         .div_(255.0)
         .contiguous(memory_format=torch.channels_last)
     )
-    with torch.autocast(shown.device.type, torch.bfloat16):
+    with torch.autocast(shown.device.type, torch.bfloat16, enabled=product_dtype() == torch.bfloat16):
         scores: Tensor = network(shown)
     return scores.float()
 

@@ -1,0 +1,114 @@
+"""Products are chosen by what a child process computes: a machine that announces an instruction and refuses it trains all the same."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the train extra")
+
+import torch
+from trainings import practice_folder
+
+from pans.runtime.bundle.model import load_bundle
+from pans.trainer.device import product_dtype
+from pans.trainer.processor import FASTER, LIMITS, Trial, choose
+
+REFUSING = Path(__file__).parents[1] / "support" / "refusing_torch"
+AMX = {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE_BF16"}
+QUICK = ("--encoder", "automaton", "--exposures", "3", "--states", "4", "--epochs", "2", "--photons", "5")
+SETTLE = "from pans.trainer.processor import settle; c = settle(); print(c.products, sorted(c.limits.values()))"
+
+
+def refusing(tmp_path: Path, how: str) -> dict[str, str]:
+    """Return the environment of a process whose torch refuses what its processor announces."""
+    path = os.pathsep.join(filter(None, (str(REFUSING), os.environ.get("PYTHONPATH"))))
+    kept = {name: value for name, value in os.environ.items() if name not in LIMITS[-1]}
+    return {**kept, "PANS_REFUSES": how, "PYTHONPATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+
+
+def ran(env: dict[str, str], *words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, *words], env=env, cwd=cwd, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+def trial(float32: float | None, bfloat16: float | None, limits: dict[str, str] | None = None) -> Trial:
+    rates = {"float32": float32, "bfloat16": bfloat16}
+    works = {name: rate for name, rate in rates.items() if rate is not None}
+    return Trial(limits or {}, works, {name: "refused" for name in rates if name not in works})
+
+
+@pytest.mark.parametrize(
+    ("trials", "products", "limits"),
+    [
+        ([trial(108, 487)], "bfloat16", {}),
+        ([trial(117, 24)], "float32", {}),  # emulated
+        ([trial(100, 100 * FASTER * 0.99)], "float32", {}),  # coarser, and hardly faster
+        ([trial(None, None), trial(117, 71, AMX)], "float32", AMX),
+        ([trial(110, None), trial(112, 480, AMX)], "bfloat16", AMX),
+        ([trial(110, None), trial(112, None, AMX)], "float32", {}),
+        ([trial(None, 500), trial(90, None, AMX)], "float32", AMX),  # convolutions are of float32 in any case
+        ([trial(None, None), trial(None, None, AMX)], "float32", {}),
+    ],
+)
+def test_the_fastest_that_works_is_taken(trials, products, limits):
+    chosen = choose(trials)
+    assert (chosen.products, chosen.limits) == (products, limits)
+
+
+def test_the_type_of_products_works_in_this_process():
+    dtype = product_dtype()
+    drawn = np.random.default_rng(1)
+    a, b = drawn.random((70, 300), np.float32), drawn.random((300, 90), np.float32)
+    found = (torch.from_numpy(a).to(dtype) @ torch.from_numpy(b).to(dtype)).float().numpy()
+    np.testing.assert_allclose(found, a.astype(float) @ b, rtol=2e-2)
+
+
+@pytest.mark.parametrize("how", ["raise", "die"])
+def test_refused_products_and_convolutions_are_found_out_once(tmp_path, how):
+    answer = "float32 ['AVX512_CORE_BF16']"
+    env = refusing(tmp_path, how)
+    first = ran(env, "-c", SETTLE)
+    assert first.stdout.strip() == answer
+    assert "once per machine" in first.stderr
+    (kept, inherited) = (
+        tmp_path / "cache" / "pans-runtime"
+    ).iterdir()  # by the environment before and after the choice
+    told = json.loads(kept.read_text())
+    reasons = {reason for tried in told["trials"] for reason in tried["failed"].values()}
+    assert reasons == {"signal 4" if how == "die" else "RuntimeError: could not create a primitive"}
+    again = ran(env, "-c", SETTLE)
+    assert again.stdout.strip() == answer
+    assert "once per machine" not in again.stderr
+    for file in (kept, inherited):
+        file.write_text('{"products": "float64"}')  # of another version, or damaged
+    assert "once per machine" in ran(env, "-c", SETTLE).stderr
+
+
+def test_training_and_convolutions_run_where_torch_refuses(tmp_path):
+    env = refusing(tmp_path, "raise-unlimited")
+    out = tmp_path / "strings.pans"
+    said = ran(env, "-m", "pans", "train", "barcode", *QUICK, "-v", "-o", str(out)).stderr
+    assert "products" in said
+    assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in said
+    assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in load_bundle(out)[0].provenance["trained_with"]
+    convolve = "from pans.trainer.baselines.nets import FrameNet; import torch; FrameNet((28, 28), 10)(torch.rand(3, 784)).sum().backward()"
+    ran(env, "-c", convolve)
+
+
+@pytest.mark.slow  # kernels of another target are compiled anew
+@pytest.mark.parametrize(
+    "limits", [{"NUMBA_CPU_NAME": "generic"}, {"ONEDNN_MAX_CPU_ISA": "SSE41"}, {"PANS_REFUSES": "die"}], ids=str
+)
+def test_training_own_images_and_the_demo_on_a_plain_processor(tmp_path, limits):
+    env = {**refusing(tmp_path, ""), **limits, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    practice_folder(tmp_path / "letters", "letters", 150)
+    ran(env, "-m", "pans", "train", "barcode", *QUICK, "-o", "strings.pans", cwd=tmp_path)
+    ran(env, "-m", "pans", "train", "letters", "--exposures", "4", "--states", "8", "-o", "letters.pans", cwd=tmp_path)
+    shown = json.loads(ran(env, "-m", "pans", "demo", "--pace", "fast", "--json", cwd=tmp_path).stdout)
+    assert shown["verdict"] == "PASS"

@@ -1,0 +1,258 @@
+"""Which matrix products and convolutions torch really computes on this processor, found by trying them in child processes.
+
+In: the processor and the installed torch. Out: a `Choice`: the type of training's products and the environment that torch needs. A
+processor's flags are no proof: a virtual machine may announce AMX and refuse it, and then every bfloat16 product and every convolution
+of oneDNN fails, or ends the process by SIGILL. So each candidate is tried once, checked and timed. The answer is kept in the user's cache
+folder, by machine and torch version. Start reading at `settle`. Nothing here loads torch into this process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from pans.runtime.cli import note, say
+from pans.runtime.commands.doctor_checks import Finding
+
+# Environments that torch is tried with, until one computes everything. oneDNN and ATen read them at their first operation.
+LIMITS: tuple[dict[str, str], ...] = (
+    {},
+    {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE_BF16"},  # AMX announced, not granted
+    {"ONEDNN_MAX_CPU_ISA": "AVX512_CORE"},
+    {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"},
+    {"ONEDNN_MAX_CPU_ISA": "SSE41", "ATEN_CPU_CAPABILITY": "default"},
+)
+TYPES = ("float32", "bfloat16")
+FASTER = 1.2  # bfloat16 is coarser, so it must bring something
+PATIENCE_S = 300.0  # loading torch on a busy machine takes tens of seconds
+SHAPE = (512, 784, 256)  # images by states: the products of an automaton
+REPEATS = 5
+TOLERANCE = {"float32": 1e-4, "bfloat16": 2e-2}  # of the largest value; bfloat16 keeps 8 bits
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What a child process computed correctly in one environment: GFLOP/s of one core by type, and why the others failed."""
+
+    limits: dict[str, str]
+    gflops: dict[str, float]
+    failed: dict[str, str]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every type worked."""
+        return not self.failed
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The type of training's products, and the environment in which torch computes them and convolutions."""
+
+    products: str
+    limits: dict[str, str]
+    trials: list[Trial]
+
+    def words(self) -> str:
+        """Return the choice in a few words, as a bundle's provenance has it."""
+        limits = "".join(f", {name}={value}" for name, value in self.limits.items())
+        return f"products {self.products}{limits}"
+
+
+@cache
+def settle() -> Choice | None:
+    """Set the environment that torch needs here and return what was chosen; None where torch is not installed.
+
+    It must come before torch's first operation. The first call on a machine tries the candidates, which takes a few seconds. Later calls
+    read the answer.
+    """
+    try:
+        choice = _kept()
+        if choice is None:
+            choice = _tried()
+            _keep(choice)
+            os.environ.update(choice.limits)
+            _keep(choice)  # once more, by the environment that child processes inherit
+    except PackageNotFoundError:
+        return None
+    os.environ.update(choice.limits)
+    rates = choice.trials[-1].gflops
+    note(f"pans: torch computes with {choice.words()} ({_rates(rates)})")
+    return choice
+
+
+def choose(trials: list[Trial]) -> Choice:
+    """Return the fastest type and environment among `trials`; float32 unless bfloat16 is 1.2 times as fast."""
+    best, fastest = Choice("float32", trials[0].limits, trials), 0.0
+    for trial in trials:
+        for products in TYPES:
+            rate = trial.gflops.get(products, 0.0) if "float32" in trial.gflops else 0.0
+            if rate > FASTER * fastest:
+                best, fastest = Choice(products, trial.limits, trials), rate
+    return best
+
+
+def attempt(limits: dict[str, str]) -> Trial:
+    """Compute products and convolutions in a child process under `limits`: it may die, as of an illegal instruction."""
+    started = [sys.executable, "-c", "from pans.trainer.processor import compute_all; compute_all()"]
+    silence = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    try:
+        done = subprocess.run(
+            started, env={**os.environ, **silence, **limits}, capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        ended = f"the process ended with {done.returncode}" if done.returncode >= 0 else f"signal {-done.returncode}"
+        printed = done.stdout
+    except subprocess.TimeoutExpired as error:
+        ended, printed = f"no answer within {PATIENCE_S:.0f} s", (error.stdout or b"").decode()
+    answers = dict(line.split("=", 1) for line in printed.splitlines() if line.startswith(TYPES))
+    gflops, failed = {}, {}
+    for products in TYPES:
+        answer = answers.get(products, ended)
+        try:
+            gflops[products] = float(answer)
+        except ValueError:
+            failed[products] = answer
+    return Trial(limits, gflops, failed)
+
+
+def compute_all() -> None:
+    """Print a line `TYPE=GFLOP/s` or `TYPE=REASON` for each type: the child process of `attempt`."""
+    import torch
+
+    torch.set_num_threads(1)
+    for products in TYPES:
+        try:
+            answer = f"{_rate(products):.1f}"
+        except Exception as error:
+            answer = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        print(f"{products}={answer}", flush=True)
+
+
+def _rate(products: str) -> float:
+    """Return GFLOP/s of the product of SHAPE; ValueError where a product or a convolution is wrong."""
+    import numpy as np
+    import torch
+
+    dtype, tolerance = getattr(torch, products), TOLERANCE[products]
+
+    def compare(what: str, found: torch.Tensor, exact: np.ndarray) -> None:
+        values = found.detach().float().numpy()
+        if not np.abs(values - exact).max() <= tolerance * np.abs(exact).max():
+            raise ValueError(f"{what} is wrong")
+
+    rows, inner, columns = SHAPE
+    drawn = np.random.default_rng(0)
+    left, right = (drawn.random(shape, np.float32) for shape in ((rows, inner), (inner, columns)))
+    a, b = (torch.from_numpy(values).to(dtype).requires_grad_() for values in (left, right))
+    product = a @ b
+    product.sum().backward()
+    compare("a product", product, left.astype(np.float64) @ right)
+    assert a.grad is not None
+    compare("a product's gradient", a.grad, np.broadcast_to(right.sum(axis=1, dtype=np.float64), left.shape))
+
+    images, kernels = drawn.random((8, 1, 28, 28), np.float32), drawn.random((16, 1, 3, 3), np.float32)
+    layer = torch.nn.Conv2d(1, 16, 3, bias=False)
+    layer.weight.data = torch.from_numpy(kernels)
+    with torch.autocast("cpu", dtype, enabled=products != "float32"):
+        shown = layer(torch.from_numpy(images).contiguous(memory_format=torch.channels_last))
+    shown.float().sum().backward()
+    windows = np.lib.stride_tricks.sliding_window_view(images[:, 0].astype(np.float64), (3, 3), axis=(1, 2))
+    compare("a convolution", shown, np.einsum("nhwij,kij->nkhw", windows, kernels[:, 0]))
+    assert layer.weight.grad is not None
+    compare("a convolution's gradient", layer.weight.grad[:, 0], np.tile(windows.sum(axis=(0, 1, 2)), (16, 1, 1)))
+
+    times = []
+    with torch.no_grad():
+        for _ in range(REPEATS):
+            before = time.process_time()
+            a @ b
+            times.append(time.process_time() - before)
+    return 2e-9 * rows * inner * columns / max(min(times), 1e-9)
+
+
+def check_torch() -> Iterator[Finding]:
+    """What torch announces, computes and takes here: a check of `pans doctor`."""
+    choice = settle()
+    if choice is None:
+        yield Finding("torch", True, "not installed; only training needs it")
+        return
+    first = choice.trials[0]
+    works = "; ".join(
+        f"{' '.join(f'{name}={value}' for name, value in trial.limits.items()) or 'as it comes'}: "
+        + ", ".join([_rates(trial.gflops), *(f"{name} failed ({why})" for name, why in trial.failed.items())])
+        for trial in choice.trials
+    )
+    found = f"announced {_announced() or 'nothing special'}; works {works}; taken {choice.words()}"
+    remedy = "nothing: training uses what works. A host that grants all that its processor announces may be faster"
+    yield Finding("torch's products", first.complete, found, "" if first.complete else remedy)
+
+
+def _rates(gflops: dict[str, float]) -> str:
+    return ", ".join(f"{name} {rate:.0f} GFLOP/s" for name, rate in gflops.items()) or "nothing"
+
+
+def _tried() -> Choice:
+    version("torch")
+    say("pans: trying which products this processor computes: once per machine and torch version")
+    trials: list[Trial] = []
+    for limits in LIMITS:
+        trials.append(attempt(limits))
+        if trials[-1].complete:
+            break
+    return choose(trials)
+
+
+# ---- the answer of this machine ----
+
+
+def _announced() -> str:
+    """Return the wide instruction sets that the processor's flags name."""
+    return ", ".join(
+        sorted(flag for flag in _cpu().split() if flag.startswith(("amx", "avx512_bf16", "avx512f", "avx2")))
+    )
+
+
+def _cpu() -> str:
+    with suppress(OSError):
+        block = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
+        return "\n".join(line for line in block.splitlines() if line.startswith(("model name", "flags")))
+    return platform.processor()
+
+
+def _file() -> Path:
+    """Where the answer for this machine, torch and environment is kept."""
+    limits = [f"{name}={os.environ.get(name, '')}" for name in LIMITS[-1]]
+    facts = "\n".join([version("torch"), platform.node(), platform.release(), _cpu(), *limits])
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(folder) / "pans-runtime" / f"products-{hashlib.sha256(facts.encode()).hexdigest()[:16]}.json"
+
+
+def _kept() -> Choice | None:
+    """Return the answer that was kept; None where there is none, or none that can be read."""
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        told = json.loads(_file().read_text(encoding="utf-8"))
+        choice = Choice(told["products"], told["limits"], [Trial(**trial) for trial in told["trials"]])
+        if choice.products in TYPES and choice.limits in LIMITS and choice.trials:
+            return choice
+    return None
+
+
+def _keep(choice: Choice) -> None:
+    """Write the answer whole or not at all; a folder that cannot be written costs each process the trial."""
+    path = _file()
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:
+            json.dump(asdict(choice), file)
+        os.replace(file.name, path)
