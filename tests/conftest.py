@@ -7,12 +7,18 @@ import signal
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
 from tree import ROOT
 
 UNCOMPILED = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 # `python -m pytest` puts the checkout on the path, and then `import runtime` would make a second copy of every class.
 sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
+
+
+# A busy machine makes an example slow, not wrong.
+hypothesis.settings.register_profile("pans", parent=hypothesis.settings.default, deadline=None)
+hypothesis.settings.load_profile("pans")
 
 
 def pytest_configure(config: pytest.Config) -> None:

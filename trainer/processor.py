@@ -64,6 +64,11 @@ class Choice:
     limits: dict[str, str]
     trials: list[Trial]
 
+    @property
+    def works(self) -> dict[str, float]:
+        """GFLOP/s of the types that work in that environment."""
+        return next(trial.gflops for trial in self.trials if trial.limits == self.limits)
+
     def words(self) -> str:
         """Return the choice in a few words, as a bundle's provenance has it."""
         limits = "".join(f", {name}={value}" for name, value in self.limits.items())
@@ -87,8 +92,7 @@ def settle() -> Choice | None:
     except PackageNotFoundError:
         return None
     os.environ.update(choice.limits)
-    rates = choice.trials[-1].gflops
-    note(f"pans: torch computes with {choice.words()} ({_rates(rates)})")
+    note(f"pans: torch computes with {choice.words()} ({_rates(choice.works)})")
     return choice
 
 
