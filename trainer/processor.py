@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -22,9 +23,15 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pans.runtime.cli import note, say
-from pans.runtime.commands.doctor_checks import Finding
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+    from pans.runtime.commands.doctor_checks import Finding
 
 # Environments that torch is tried with, until one computes everything. oneDNN and ATen read them at their first operation.
 LIMITS: tuple[dict[str, str], ...] = (
@@ -115,7 +122,11 @@ def attempt(limits: dict[str, str]) -> Trial:
         done = subprocess.run(
             started, env={**os.environ, **silence, **limits}, capture_output=True, text=True, timeout=PATIENCE_S
         )
-        ended = f"the process ended with {done.returncode}" if done.returncode >= 0 else f"signal {-done.returncode}"
+        ended = (
+            f"the process ended with {done.returncode}"
+            if done.returncode >= 0
+            else signal.Signals(-done.returncode).name
+        )
         printed = done.stdout
     except subprocess.TimeoutExpired as error:
         ended, printed = f"no answer within {PATIENCE_S:.0f} s", (error.stdout or b"").decode()
@@ -187,6 +198,8 @@ def _rate(products: str) -> float:
 
 def check_torch() -> Iterator[Finding]:
     """What torch announces, computes and takes here: a check of `pans doctor`."""
+    from pans.runtime.commands.doctor_checks import Finding
+
     choice = settle()
     if choice is None:
         yield Finding("torch", True, "not installed; only training needs it")
@@ -253,7 +266,12 @@ def _kept() -> Choice | None:
 
 
 def _keep(choice: Choice) -> None:
-    """Write the answer whole or not at all; a folder that cannot be written costs each process the trial."""
+    """Write the answer whole or not at all; a folder that cannot be written costs each process the trial.
+
+    Where nothing worked, as without memory, the next process tries again.
+    """
+    if not choice.works:
+        return
     path = _file()
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

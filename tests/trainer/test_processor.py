@@ -81,7 +81,7 @@ def test_refused_products_and_convolutions_are_found_out_once(tmp_path, how):
     ).iterdir()  # by the environment before and after the choice
     told = json.loads(kept.read_text())
     reasons = {reason for tried in told["trials"] for reason in tried["failed"].values()}
-    assert reasons == {"signal 4" if how == "die" else "RuntimeError: could not create a primitive"}
+    assert reasons == {"SIGILL" if how == "die" else "RuntimeError: could not create a primitive"}
     again = ran(env, "-c", SETTLE)
     assert again.stdout.strip() == answer
     assert "once per machine" not in again.stderr
