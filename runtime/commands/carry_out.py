@@ -106,17 +106,25 @@ def carry_out(args: argparse.Namespace, job: Job) -> int:
     """Run the job, say how it went and return the exit code."""
     from pans.runtime.report.words import closing_words
 
-    done = run_job(job, process_start_ns(), ends_process=True)
-    files = {"recording": str(done.recording), "report": str(done.report)}
-    payload = {**done.summary.as_json(), **files, "shots": job.shots, "seed": job.seed}
-    emit(args, payload, closing_words(done.summary, **files))
-    return _exit_code(done.summary)
+    def tell(done: Outcome) -> None:
+        files = {"recording": str(done.recording), "report": str(done.report)}
+        payload = {**done.summary.as_json(), **files, "shots": job.shots, "seed": job.seed}
+        emit(args, payload, closing_words(done.summary, **files))
+
+    return _exit_code(run_job(job, process_start_ns(), ends_process=True, tell=tell).summary)
 
 
-def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Outcome:
+def run_job(
+    job: Job,
+    started_ns: int = 0,
+    *,
+    ends_process: bool = False,
+    tell: Callable[[Outcome], None] = lambda done: None,
+) -> Outcome:
     """Run the job and leave its files; `started_ns` (time.perf_counter_ns) is when it was asked for, 0: now.
 
-    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py).
+    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py). `tell` gets the
+    outcome once the files are whole and before the link is closed, which may wait for a device or a child process.
     """
     check_run_files(job)
     continuous, watchdog = not (job.seconds or job.decisions), None
@@ -127,9 +135,12 @@ def run_job(job: Job, started_ns: int = 0, *, ends_process: bool = False) -> Out
             watchdog = watched.enter_context(Watchdog(continuous=continuous))
         try:
             # ports first: a busy one is refused before anything is compiled or opened
-            with _metrics_of(job) as metrics, _monitor_of(job) as monitor, compiled_beside() as compiled:
-                beside = _Beside(stop, watchdog, monitor, compiled, metrics)
-                return _run_job(job, started_ns or time.perf_counter_ns(), beside)
+            with _metrics_of(job) as metrics, ExitStack() as ending:
+                with _monitor_of(job) as monitor, compiled_beside() as compiled:
+                    beside = _Beside(stop, watchdog, monitor, compiled, metrics, ending)
+                    done = _run_job(job, started_ns or time.perf_counter_ns(), beside)
+                tell(done)
+                return done
         except PansError:
             raise
         except Exception as error:
@@ -146,6 +157,7 @@ class _Beside(NamedTuple):
     monitor: Monitor
     compiled: Callable[[], None]  # waits until the largest kernels are
     metrics: MetricsServer | None
+    ending: ExitStack  # what is closed when the outcome has been told
 
 
 @contextmanager
@@ -255,26 +267,26 @@ def _run_job(job: Job, started_ns: int, beside: _Beside) -> Outcome:
     for warning in [*ready.dark.warnings, *ready.law_warnings]:
         warn(warning)
     link = opening.result()
-    try:
-        with claimed(job) as job:
-            return _traced(job, ready, link, beside)
-    finally:
-        link.close()
+    beside.ending.callback(link.close)
+    with claimed(job) as job:
+        if job.trace is not None:
+            link = _traced(job, link, job.trace, beside)
+        return _recorded(job, ready, link, beside)
 
 
-def _traced(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcome:
-    """Run with a trace, if one is wanted; one that could not be written to its end is told, and ends nothing."""
+def _traced(job: Job, link: Link, path: Path, beside: _Beside) -> Link:
+    """Return `link` with a trace; one that could not be written to its end is told, and ends nothing."""
     from pans.runtime.link.trace import TracedLink
 
-    if job.trace is None:
-        return _recorded(job, ready, link, beside)
-    traced = TracedLink(link, job.trace, job.device, force=job.force)
-    try:
-        return _recorded(job, ready, traced, beside)
-    finally:
+    traced = TracedLink(link, path, job.device, force=job.force)
+
+    def close() -> None:
         traced.close()
         if traced.trouble:
-            say(f"pans: {job.trace}: the trace is not whole: {traced.trouble}")
+            say(f"pans: {path}: the trace is not whole: {traced.trouble}")
+
+    beside.ending.callback(close)
+    return traced
 
 
 def _recorded(job: Job, ready: _Prepared, link: Link, beside: _Beside) -> Outcome:
@@ -314,11 +326,17 @@ def _same_bundle(job: Job, ready: _Prepared) -> bytes:
 
 
 def _watched(
-    job: Job, ready: _Prepared, link: Link, recorder: AnyRecorder | None, recovery: Recovery | None, beside: _Beside
+    job: Job,
+    ready: _Prepared,
+    link: Link,
+    recorder: AnyRecorder | None,
+    recovery: Recovery | None,
+    beside: _Beside,
 ) -> RunResult:
     """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
     from pans.runtime.core.decision import Output
-    from pans.runtime.live import Observers, run_live
+    from pans.runtime.live import Observers
+    from pans.runtime.live.loop import running
     from pans.runtime.watch import Attendants
 
     dark, monitor = ready.dark, beside.monitor
@@ -341,9 +359,8 @@ def _watched(
             monitor.watch(run, output)
 
         observers = Observers(look, prepared, beside.stop, acts=False, uploaded=beside.compiled)
-        return run_live(
-            link, dark.profile, ready.bundle, ready.plan, ready.core, ready.config, recorder, recovery, observers
-        )
+        what = dark.profile, ready.bundle, ready.plan, ready.core, ready.config
+        return beside.ending.enter_context(running(link, *what, recorder, recovery, observers))
 
 
 def _facts(job: Job, ready: _Prepared, link: Link) -> dict[str, Any]:

@@ -81,7 +81,24 @@ def run_live(
     recovery: Recovery | None = None,
     observers: Observers = NO_OBSERVERS,
 ) -> RunResult:
-    """Run `plan` on the device behind `link` and let `core` decide until it is done; see the module's docstring.
+    """Run `plan` on the device behind `link`, let `core` decide until it is done, and close the link; see `running`."""
+    with running(link, profile, bundle, plan, core, config, recorder, recovery, observers) as result:
+        return result
+
+
+@contextmanager
+def running(
+    link: Link,
+    profile: Profile,
+    bundle: Bundle,
+    plan: Plan,
+    core: LiveCore,
+    config: RunConfig,
+    recorder: AnyRecorder | None = None,
+    recovery: Recovery | None = None,
+    observers: Observers = NO_OBSERVERS,
+) -> Iterator[RunResult]:
+    """Run `plan` as the module's docstring says; yield the result while the link is open, since closing it may take seconds.
 
     `recovery` says how to reconnect when the device is lost; without it the run ends there.
     """
@@ -102,7 +119,7 @@ def run_live(
         _warm_up(run, prompt=observers.acts and observers.watch is not None)
         with _granted(run):
             _light_on(run, recovery, prepare, observers)
-        return _result(run, profile)
+        yield _result(run, profile)
     finally:
         if run.compiled is not None:
             run.compiled.close()

@@ -123,6 +123,9 @@ def reconnect_run(run: LiveRun, error: LinkError, recovery: Recovery, prepare: C
     except LinkError as failure:
         run.lose_link(failure)
         return
+    except KeyboardInterrupt:
+        run.link_lost = True  # nothing is waited for at the end
+        raise
     run.reconnects += 1
     gc.collect()  # it is off while armed, and an old connection's objects name each other: here nobody waits
     outage_ms = (run.now_ns() - run.outage_ns) / NS_PER_MS

@@ -13,7 +13,7 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.plan import Plan
 from pans.runtime.instrument.channel_health import DarkReport
 from pans.runtime.live import RunResult
-from pans.runtime.live.continuous import DISK_NEARLY_FULL
+from pans.runtime.live.continuous import ASKED_TO_STOP, DISK_NEARLY_FULL, INTERRUPTED
 from pans.runtime.live.dark_run import DarkFigures
 from pans.runtime.live.flow_run import FlowFigures
 from pans.runtime.live.tally import TallyFigures
@@ -167,7 +167,9 @@ def find_faults(result: RunResult, expected_decisions: int, aborts_are_faults: b
     """Return one sentence for each way in which the run broke its promise; empty means PASS."""
     tally, timing, stream = result.tally, result.timing, result.stream
     faults = []
-    if result.link_lost or result.ended == DISK_NEARLY_FULL:
+    if result.link_lost and result.ended in (ASKED_TO_STOP, INTERRUPTED):
+        faults.append(f"the device was lost and had not been found again when the run was {result.ended}")
+    elif result.link_lost or result.ended == DISK_NEARLY_FULL:
         faults.append(result.ended)
     if result.reconnects:
         faults.append(f"the device was lost and found again {result.reconnects} times")
