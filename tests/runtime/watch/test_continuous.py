@@ -237,11 +237,11 @@ def test_the_state_names_only_what_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files that are read without a name")
-@pytest.mark.parametrize("parts", [[], ["--rotate-mb", "0.02"]])
+@pytest.mark.parametrize("parts", [[], ["--rotate-mb", "0.2"]])
 def test_a_run_whose_folder_is_deleted_keeps_its_recording(bundle_file: Path, tmp_path: Path, parts: list[str]) -> None:
     with _running(bundle_file, tmp_path, *parts) as process:
         _wait_for(lambda: _state(tmp_path).get("parts", 0) >= 3 if parts else _state(tmp_path).get("decisions", 0) > 50)
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        _wait_for(lambda: shutil.rmtree(tmp_path / "out", ignore_errors=True) or not (tmp_path / "out").exists())
         out, told = process.communicate(timeout=PATIENCE_S)
     summary, kept = json.loads(out), tmp_path / "out-kept"
     assert (process.returncode, summary["ended"], summary["verdict"]) == (1, RECORDING_DELETED, "FAIL")
