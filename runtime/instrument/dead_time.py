@@ -1,11 +1,11 @@
 """Dead time of a detector of which an exposure asks only whether it clicked: what is left of the mean when a click before blinds it.
 
-Nothing within an exposure can suppress its first click: what counts
-is the rest of the dead time that a detection of the exposure before, or of the pause between, carries over. The law is the stationary
-share of silent exposures, P0, under steady light. It is given as the *counted mean* -log P0, which takes the mean's place in a click
-law, and holds to 0.002 where exposures are of about equal light. Where dim and bright ones alternate, as in automata, it errs by up to
-`unequal_error`: at 30 photoelectrons 0.003 for a reach r of 0.03 exposures, 0.013 for 0.1 (paralysable: for 0.023, and 0.2). How exposures
-depend on each other is left out: after a silent one a gated, non-paralysable detector is awake, and its chance is 1 - exp(-mean).
+Nothing within an exposure can suppress its first click: what counts is the rest of the dead time that a detection
+of the exposure before, or of the pause between, carries over. The law is the stationary share of silent exposures, P0, under steady light.
+It is given as the *counted mean* -log P0, which takes the mean's place in a click law, and holds to 0.002 where exposures are of about
+equal light. Where dim and bright ones alternate, as in automata, it errs by up to `unequal_error`: at 30 photoelectrons 0.003 for a reach r
+of 0.028 exposures, 0.017 for 0.1 (paralysable: 0.003 for 0.020, 0.27 for 0.1). How exposures depend on each other
+is left out: after a silent one a gated, non-paralysable detector is awake, and its chance is 1 - exp(-mean).
 
 With the exposure as unit of time, mean m, dead time f, pause g, a = m f, and r = f - g the reach into the next exposure (gated; r = f
 where the detector stays on in the pause, or there is none):
@@ -100,8 +100,9 @@ def unequal_error(dead_time: DeadTime, brightest: float) -> float:
 
     The law takes each exposure to follow its like. Against that stand the two extremes: one behind a dark exposure, which begins awake, and
     one behind the brightest, of which detections fill the reach r before the next exposure with the density w = m / (1 + m f) (of photons,
-    where they paralyse). A seventh is added, a quarter where they paralyse, for what clicks of neighbouring exposures say of each other: up
-    to 0.003 this is never below what single events give.
+    where they paralyse). A third is added, more where they paralyse,
+    for what clicks of neighbouring exposures say of each other: up to 0.003 this is not below what
+    single events give (tests/runtime/detector/test_laws.py).
     """
     mean = np.append(np.geomspace(1e-3, max(brightest, 2e-3), 200), np.linspace(0, brightest, 200)[1:])
     silent, awake, reach = np.exp(-counted_mean(dead_time, mean)), np.exp(-mean), dead_time.reach
@@ -113,7 +114,7 @@ def unequal_error(dead_time: DeadTime, brightest: float) -> float:
         blinded = (np.expm1(mean * reach) / mean - reach) * brightest / (1 + brightest * dead_time.dead)
     after_bright = np.minimum(awake * (1 + blinded), 1.0)
     off = float(max((silent - awake).max(), (after_bright - silent).max()))
-    return (1.25 if dead_time.paralysable else 1.15) * off
+    return (1.6 if dead_time.paralysable else 1.35) * off
 
 
 @lru_cache(maxsize=64)

@@ -128,6 +128,10 @@ def _instrument(history: History) -> list[Row]:
     drift = picture.get("clock_drift_ppm")
     text = "not known yet" if drift is None else f"drift {drift:+.2f} ppm"
     rows.append(Row("instrument", "clock", f"{text}, uncertainty at most {picture['clock_uncertainty_us']:,.0f} us"))
+    if repeated := picture.get("repeated", 0):
+        differing = picture.get("repeats_differing", 0)
+        text = f"{repeated:,} messages, {differing:,} with other content"
+        rows.append(Row("instrument", "repeats", text, "bad" if differing else ""))
     if picture["contradictions"]:
         rows.append(Row("instrument", "contradictions", f"{picture['contradictions']:,} messages", "bad"))
     if picture["trouble"]:

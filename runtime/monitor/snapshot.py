@@ -92,6 +92,8 @@ class Snapshots:
             "gaps": stream.gaps,
             "late": run.timing.late,
             "reconnects": run.reconnects,
+            "repeated": stream.repeated,
+            "repeats_differing": stream.repeats_differing,
             "contradictions": sum(run.contradictions.values()) + sum(run.core.contradictions.values()),
         }
 

@@ -12,6 +12,7 @@ from typing import Any
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.intervals import Z_95
 from pans.runtime.record import Recording
+from pans.runtime.report.words import repeat_words
 from pans.runtime.safe_text import one_line
 
 from .page import Page
@@ -24,7 +25,7 @@ ADVICE = (
     ("messages lost", "Check the cable: only marks of objects were lost, no clicks."),
     ("lost and found again", "Check cable, power and hub. Decisions during an outage are missing."),
     ("was lost", "Check cable, power and hub; `pans devices` shows whether the device is there."),
-    ("contradict the evidence", "The device's messages do not fit the plan: check its firmware against docs/reference/protocol.md."),
+    ("contradict the evidence", "Messages do not fit the plan or each other: check the device's firmware (pans conform) and the link."),
     ("another pattern than planned", "Check the trigger between projector and detector: a pattern was skipped or shown twice."),
     ("named their state too late", "Let the device choose the pattern (`--drive device`), or give the loop a core of its own (`--core`)."),
     ("decisions abstained", "The flags in the decision log say why; “Events” below has the moments."),
@@ -119,7 +120,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
             p99, more = "not measured", "virtual time: the host took no time"
         found.append(("latency p99", p99, more))
     late, lost = summary.get("late", 0), summary.get("lost", 0)
-    found.append(("late", f"{late:,}", f"decisions; {lost:,} exposures lost"))
+    found.append(("late", f"{late:,}", f"decisions; {lost:,} exposures lost{repeat_words(summary.get('stream', {}))}"))
     dark = summary.get("dark")
     if isinstance(dark, Mapping) and dark.get("exposures"):
         more = f"95 % interval {dark['low']:.3g} to {dark['high']:.3g}, expected {dark['expected']:.3g}"

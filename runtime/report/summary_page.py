@@ -18,7 +18,7 @@ from pans.runtime.safe_text import markdown
 from pans.runtime.timing.page_faults import fault_words
 
 from .summary import Summary
-from .words import flow_rows, is_unresolved, objects_words, walk_rows
+from .words import flow_rows, is_unresolved, objects_words, repeat_words, walk_rows
 
 
 def write_markdown(
@@ -107,7 +107,7 @@ def _timing(summary: Summary) -> list[str]:
     )
     tail = [
         "",
-        f"- deadline {summary.deadline_us:.0f} us: {summary.late} late; {summary.lost} exposures lost{_repeats(summary.stream)}",
+        f"- deadline {summary.deadline_us:.0f} us: {summary.late} late; {summary.lost} exposures lost{repeat_words(summary.stream)}",
         f"- clock: uncertainty at most {summary.clock['worst_uncertainty_us']:.0f} us, "
         f"drift {summary.clock.get('drift_ppm', 0.0):.1f} ppm; slot jitter at most {summary.slot_jitter_us:.1f} us",
         f"- armed {summary.armed_after_s:.2f} s after the start; measured for {summary.seconds:.1f} s; ended: {markdown(summary.ended)}",
@@ -156,11 +156,3 @@ def _percent(value: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "unknown (the instrument does not know)" if value is None or math.isnan(value) else f"{value:.3f}"
-
-
-def _repeats(stream: Mapping[str, int]) -> str:
-    """Return how many messages came twice, "" without any; what differs is a contradiction, and a fault."""
-    more = {what: stream.get(f"repeats_{what}", 0) for what in ("differing", "unchecked")}
-    words = ", ".join(f"{count} {what}" for what, count in more.items() if count)
-    repeated = stream.get("repeated", 0)
-    return f"; {repeated} messages repeated or overtaken{f' ({words})' if words else ''}" if repeated else ""

@@ -160,6 +160,14 @@ def passage_words(passages: PassageFigures) -> list[str]:
     ]
 
 
+def repeat_words(stream: Mapping[str, int]) -> str:
+    """Return how many messages came twice, behind a semicolon, "" without any; what differs is a contradiction, and a fault."""
+    more = {what: stream.get(f"repeats_{what}", 0) for what in ("differing", "unchecked")}
+    words = ", ".join(f"{count} {what}" for what, count in more.items() if count)
+    repeated = stream.get("repeated", 0)
+    return f"; {repeated} messages repeated or overtaken{f' ({words})' if words else ''}" if repeated else ""
+
+
 def _share(share: Share) -> str:
     value, interval = share
     return "unknown" if value is None or interval is None else f"{value:.3%} ({interval[0]:.3%} to {interval[1]:.3%})"

@@ -76,10 +76,10 @@ def blinded() -> list[Setting]:
     """Alternating and random levels of light, dead time to the longest within the stated range; and equal light at any dead time."""
     rng, found = np.random.default_rng(2), []
     longest = {
-        (False, False): (0.0305, 0.171, 0.144),
-        (True, False): (0.0305, 0.054, 0.122),
-        (False, True): (0.023, 0.14, 0.127),
-        (True, True): (0.023, 0.044, 0.109),
+        (False, False): (0.0279, 0.166, 0.134),
+        (True, False): (0.0279, 0.049, 0.113),
+        (False, True): (0.0204, 0.137, 0.116),
+        (True, True): (0.0204, 0.039, 0.097),
     }
     for (free, paralysable), deads in longest.items():
         for dead, (pause, bright) in zip(deads, ((0.0, 30.0), (0.1, 8.0), (0.02, 1.0))):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from commands import json_of
+from commands import json_of, page_of, words_of
 
 from pans.firmware_sim.device.clock import DeviceClock
 from pans.firmware_sim.device.instrument import Instrument
@@ -190,6 +190,9 @@ def test_the_exit_code_and_each_file_tell(
     page = (tmp_path / "run" / "summary.md").read_text()
     assert f"; {told['stream']['repeated']} messages repeated or overtaken" in page
     assert (f"({n} differing)" in page, f"repeat {n}" in page) == (code != 0,) * 2
+    shown = words_of(page_of(tmp_path / "run" if parts else Path(told["recording"]), tmp_path))
+    assert f"; {told['stream']['repeated']} messages repeated or overtaken" in shown
+    assert (f"({n} differing)" in shown) == (code != 0)
     again = json_of(capsys, "replay", tmp_path / "run" if parts else told["recording"])
     found = again["parts"] if parts else [again]
     assert sum(part["contradictions"].get("repeat", 0) for part in found) == n

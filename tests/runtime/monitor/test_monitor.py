@@ -67,6 +67,17 @@ def test_a_month_takes_the_memory_of_an_hour_and_loses_no_decision() -> None:
     assert set(series(history)["accuracy"]) == {0.8}
 
 
+def test_repeated_messages_are_told_from_those_that_differ() -> None:
+    def told(**more: int) -> list[tuple[str, str]]:
+        history = History()
+        history.take(picture(1.0, **more))
+        return [(row.text, row.level) for row in rows_of(history) if row.name == "repeats"]
+
+    assert told() == []
+    assert told(repeated=7) == [("7 messages, 0 with other content", "")]
+    assert told(repeated=1200, repeats_differing=2) == [("1,200 messages, 2 with other content", "bad")]
+
+
 def test_quantiles_are_those_of_the_loop_s_histogram() -> None:
     total, rng = LatencyHistogram(), np.random.default_rng(4)
     for value in rng.lognormal(12, 1, 3000).astype(int).tolist():
