@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.tasks.registry import Task
 
 from .common import Decide, Measurement, Report, Trials, detect, measure, run_trials
@@ -36,8 +37,8 @@ def baseline_rows(
     started = time.perf_counter()
     for photons, n_readouts, done, extra in walk(task, options, levels, report):
         yield {
-            **asdict(done.measured()),
-            "first_200": asdict(done.measured(FIRST)),
+            **row_of(done.measured()),
+            "first_200": row_of(done.measured(FIRST)),
             "photons_asked": photons,
             "detector": options.detector,
             "brightness": options.brightness,

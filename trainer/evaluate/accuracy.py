@@ -9,7 +9,8 @@ The spread over repeated trials (shot noise) and the spread over objects (a diff
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +120,11 @@ class Measured:
     trials: int  # 0: exact, no trials were needed
     shots: int
     by_class: ByClass | None = None
+
+
+def row_of(measured: Any) -> dict[str, Any]:
+    """Return figures (Measured, or those of walks) as a row of a table: without the ones by class."""
+    return {name: value for name, value in asdict(measured).items() if name != "by_class"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

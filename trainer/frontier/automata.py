@@ -37,13 +37,14 @@ def automaton_row(
 
     With `start` the automaton in that bundle is trained on instead of one that grows.
     """
+    from pans.trainer.evaluate.accuracy import row_of
     from pans.trainer.export.automaton import measure_walks
 
     train_unless_kept(asked, path, task, budget, seed, start)
     bundle, digest = load_bundle(path)
     assert bundle.automaton is not None
     profile = load_profile(PROFILE)
-    whole, first = (asdict(measure_walks(bundle, task.test.first(count), profile)) for count in (None, FIRST_OBJECTS))
+    whole, first = (row_of(measure_walks(bundle, task.test.first(count), profile)) for count in (None, FIRST_OBJECTS))
     facts: Row = {"sha256": digest, "states": bundle.automaton.n_states, "patterns_shown": len(bundle.pattern_levels)}
     seconds = bundle.provenance.get("training_seconds")  # not known of one that was interrupted
     return facts | {"all": whole, FIRST: first, "exposures": whole["exposures_mean"], "training_seconds": seconds}

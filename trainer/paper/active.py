@@ -14,7 +14,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,14 @@ import numpy as np
 from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import replace_file
-from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Measured, evaluate_exactly, evaluate_sampled, light_of
+from pans.trainer.evaluate.accuracy import (
+    EXACT_OUTCOMES_MAX,
+    Measured,
+    evaluate_exactly,
+    evaluate_sampled,
+    light_of,
+    row_of,
+)
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Objects, Task, load_task
 from pans.trainer.verdicts import against, claim, sampling_error, training_spread
@@ -136,7 +143,7 @@ def measure_row(bundle_path: Path, task: Task, profile: Profile) -> dict[str, An
     """Return accuracy, clicks, photons and illumination at every number of shots, of the first 200 and of all test images."""
     bundle, _ = load_bundle(bundle_path)
     return {
-        part: {str(shots): asdict(_measured(bundle, profile, objects, shots)) for shots in SHOTS}
+        part: {str(shots): row_of(_measured(bundle, profile, objects, shots)) for shots in SHOTS}
         for part, objects in parts_of(task.test).items()
     }
 

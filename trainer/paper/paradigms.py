@@ -7,7 +7,7 @@ Owns the curves of the baselines over photons, their place in the cache folder, 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,6 +17,7 @@ from pans.trainer.baselines.compressive import clean_mlp, patterns
 from pans.trainer.baselines.nets import EpochOfFit
 from pans.trainer.baselines.options import METHODS, BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
+from pans.trainer.evaluate.accuracy import row_of
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.verdicts import against, claim
 
@@ -296,7 +297,7 @@ def sensed(asked: Asked, features: int, family: str, conv: bool, epochs: int) ->
     cells = []
     for photons in PHOTONS:
         done = run_trials(measurement, photons, "counting", at(photons, "counting"), trials=TRIALS, seed=0)
-        cells.append({"photons_asked": photons, **asdict(done.measured()), FIRST: asdict(done.measured(FIRST_OBJECTS))})
+        cells.append({"photons_asked": photons, **row_of(done.measured()), FIRST: row_of(done.measured(FIRST_OBJECTS))})
         asked.report(
             f"compressive, {family}, d_f = {features}, {photons:g} photons: {100 * cells[-1]['accuracy_mean']:.2f} %"
         )

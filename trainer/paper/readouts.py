@@ -7,7 +7,7 @@ frames, light and detection are those of the baselines, the decision is the exac
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import Measurement, Trials, detect, measure
-from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, sampled_shares
+from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, row_of, sampled_shares
 from pans.trainer.evaluate.tsne import tsne
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
@@ -264,7 +264,7 @@ def _judged(measurement: Measurement, lit: Any, frames: Any, photons: float) -> 
     decided = log_joint(measurement, frames, photons, "counting", floor=FLOOR).argmax(axis=1)
     right = (decided == measurement.test_labels)[None, :]
     clicks, given = (frames > 0).sum(axis=1).astype(np.float64), lit.sum(axis=1, dtype=np.float64)
-    return asdict(Trials(right, clicks, given, measurement.illumination(photons)).measured())
+    return row_of(Trials(right, clicks, given, measurement.illumination(photons)).measured())
 
 
 def _frame_row(photons: float, maps: Rows, curves: dict[str, Rows]) -> Row:

@@ -7,7 +7,6 @@ Owns the settings, the measuring and the pages `eta`, `dark-counts`, `confusion`
 from __future__ import annotations
 
 import importlib.resources
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from pans.trainer.evaluate.accuracy import (
     evaluate_exactly,
     evaluate_sampled,
     light_of,
+    row_of,
     sampled_shares,
 )
 from pans.trainer.tasks.registry import Objects, load_task
@@ -62,7 +62,7 @@ def measure_setting(bundle: Bundle, profile: Profile, test: Objects, sweep: str,
     eta, dark = setting if sweep == "eta" else 1.0, setting if sweep == "dark" else None
     for part, objects in parts_of(test).items():
         lit = light_of(bundle, profile, objects.images, eta=eta, dark=dark)
-        row[part] = asdict(_measured(bundle, lit, objects, int(setting) if sweep == "K" else 1))
+        row[part] = row_of(_measured(bundle, lit, objects, int(setting) if sweep == "K" else 1))
     return row
 
 

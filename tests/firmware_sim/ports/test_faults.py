@@ -327,7 +327,7 @@ def test_miscounted_clicks_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def wrong(*arguments: Any) -> Any:
         ended = original(*arguments)
-        arguments[6]["counts_crc"] ^= 1  # of the rows
+        arguments[2].rows["counts_crc"] ^= 1
         return ended
 
     monkeypatch.setattr(stream_kernels, "walk_messages", wrong)

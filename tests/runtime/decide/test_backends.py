@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,6 @@ def affine_bundle(d_f: int, classes: int, batch: Any = "n") -> tuple[Bundle, np.
     weights = rng.normal(size=(d_f, classes)).astype(np.float32)
     bias = rng.normal(size=classes).astype(np.float32)
     return made_bundle(d_f, classes, head_onnx=affine_head(weights, bias, batch)), weights, bias
-
-
-def replaced(old: Bundle, **changes: Any) -> Bundle:
-    return Bundle(**({item.name: getattr(old, item.name) for item in fields(old)} | changes))
 
 
 def all_clicks(d_f: int) -> np.ndarray:
@@ -171,7 +167,7 @@ def test_the_choice_of_the_back_end() -> None:
     for wrong in ({"backend": "onnx"}, {"shots": 2}, {"backend": "gpu"}, {"shots": 0}):
         with pytest.raises(UsageError):
             make_decider(only_table, **wrong)
-    only_head = replaced(both, table=None)
+    only_head = replace(both, table=None)
     assert make_decider(only_head, backend="onnx").name == "onnx"
     with pytest.raises(UsageError, match="no table"):
         make_decider(only_head, backend="table")
@@ -185,7 +181,7 @@ def test_golden_vectors_are_held_against_the_back_end(backend: str) -> None:
     scores = made.golden_scores.copy()
     scores[5, 1] += 1e-3
     with pytest.raises(DamagedFileError, match="golden vectors of the bundle: the scores of vector 5"):
-        make_decider(replaced(made, golden_scores=scores), backend=backend)
+        make_decider(replace(made, golden_scores=scores), backend=backend)
 
 
 def test_a_head_that_rolls_dice_is_refused() -> None:
@@ -270,7 +266,7 @@ def test_hostile_heads_are_refused_with_the_reason(kind: str, capfd: pytest.Capt
     model, reason = hostile_heads()[kind]
     good, _, _ = affine_bundle(2, 2)
     with pytest.raises(DamagedFileError, match=reason):
-        OnnxDecider(replaced(good, head_onnx=model))
+        OnnxDecider(replace(good, head_onnx=model))
     assert capfd.readouterr() == ("", "")
 
 

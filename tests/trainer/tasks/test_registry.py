@@ -170,7 +170,7 @@ def test_objects_that_would_run_code_are_refused(tmp_path):
 def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "own.npz", images=np.zeros((100, 100, 100), np.uint8), labels=np.zeros(100, int))
     monkeypatch.setattr(tasks, "IMAGES_MAX_BYTES", 100_000)
-    with pytest.raises(UsageError, match="unpacks to"):
+    with pytest.raises(DamagedFileError, match="bytes of arrays, allowed are 100000"):
         load_task(str(tmp_path / "own.npz"))
 
 
