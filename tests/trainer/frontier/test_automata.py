@@ -61,7 +61,10 @@ def test_an_automaton_is_trained_once_and_measured_from_its_bundle(halves, tmp_p
         raise AssertionError("trained again")
 
     monkeypatch.setattr(adaptive_train, "train_automaton", never)
-    assert automata.automaton_row(asked, path, halves, BUDGET, seed=0) == row
+    again = automata.automaton_row(asked, path, halves, BUDGET, seed=0)
+    for part in ("all", FIRST):  # measured anew, equal but for the last digits
+        assert again.pop(part) == pytest.approx(row[part], rel=1e-12)
+    assert again == {name: value for name, value in row.items() if name not in ("all", FIRST)}
     assert row["training_seconds"] > 0
     point = ways.Point("halves", ways.AUTOMATON, 2.0, tuple(BUDGET.items()))
     assert point.stem == "frontier-halves-automaton-2"
