@@ -225,7 +225,7 @@ def test_what_leaves_the_stated_range_is_warned_of() -> None:
     assert not law_warnings(free, 2.3, 8.0)  # 35 ns in 2.3 us
     (blind,) = law_warnings(replace(free, detector=replace(free.detector, dead_time_ns=230.0)), 2.3, 8.0)
     assert "dead_time_ns reaches 0.1 of an exposure" in blind
-    assert "off by up to 0.0079" in blind
+    assert "off by up to 0.0092" in blind
     (strong,) = law_warnings(changed("dmd-spad", afterpulse_probability=0.5, afterpulse_time_us=50.0), 50.0)
     assert "hold to 0.003 up to 0.3" in strong
     (together,) = law_warnings(
