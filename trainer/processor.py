@@ -202,7 +202,7 @@ def check_torch() -> Iterator[Finding]:
 
     choice = settle()
     if choice is None:
-        yield Finding("torch", True, "not installed; only training needs it")
+        yield Finding("torch's products", True, "torch is not installed; only training needs it")
         return
     first = choice.trials[0]
     works = "; ".join(
