@@ -1,8 +1,7 @@
-"""What every benchmark shares: rows, timing, the facts of the machine, the mark of the best trade-offs, the plot.
+"""What every benchmark shares: its options, timing, the facts of the machine, the mark of the best trade-offs, table and plot.
 
-Owns how things are measured and told; what is measured stands in decide.py, ingest.py, loop.py and link.py.
-Throughput is in CPU time of the measuring thread, which a busy machine changes little; latencies are in wall time, and the load is
-told with them. A row is a dict with a `name`; speed and error stand in the same row.
+Throughput is in CPU time of the measuring thread, which a busy machine changes little; latencies are in wall time, with the load beside
+them. A row is a dict with a `name`; speed and error stand in the same row.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ PACKAGES = ("numpy", "numba", "onnxruntime", "torch")
 
 @dataclass(frozen=True, slots=True)
 class BenchOptions:
-    """What a benchmark may be told; each takes what concerns it."""
+    """The command's options; each benchmark uses those that concern it."""
 
     bundles: tuple[Path, ...] = ()
     inputs: tuple[Path, ...] = ()

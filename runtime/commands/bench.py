@@ -20,7 +20,7 @@ from pans.runtime.guests import load_guest
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
-NAMES = ("decide", "link", "loop", "ingest", "turn", "sim")
+NAMES = ("decide", "link", "loop", "ingest", "turn")
 
 
 def _configure(parser: argparse.ArgumentParser) -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from automata import automaton_bundle, random_automaton
 from bundles import made_bundle
 from heads import head_bundle, onnx_chain, random_layers
 
-from pans.runtime.bench import decide as bench_decide
-from pans.runtime.bench import ingest as bench_ingest
-from pans.runtime.bench.c import FREE_FLAGS, CLoops, c_loops
-from pans.runtime.bench.decide import _bundle_rows, alone_row
+from pans.runtime.bench import decide, ingest, streams, turn
 from pans.runtime.bench.rows import (
     BenchOptions,
     Spent,
@@ -23,11 +22,15 @@ from pans.runtime.bench.rows import (
     table_text,
 )
 from pans.runtime.bundle.layers import quantise_head
+from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
+from pans.runtime.core.decision import DECISION_DTYPE
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.decide.mlp import SparseDecider
 from pans.runtime.turn.streaming import StreamCore
+from pans.runtime.turn.system import offered
 from pans.runtime.wire.framing import FrameDecoder
+
+compiled = pytest.mark.skipif(bool(offered()), reason="no compiled turn here")
 
 
 def test_the_best_trade_offs_are_marked() -> None:
@@ -40,55 +43,22 @@ def test_the_best_trade_offs_are_marked() -> None:
     assert [row.get("pareto") for row in rows] == [True, True, False, False, True, None]
 
 
-def test_percentiles_are_of_the_calls() -> None:
+def test_figures_are_of_the_calls_and_read_as_text() -> None:
     found = percentiles_us(np.arange(1, 100_001) * 1000)
-    assert found == {
-        "p50_us": 50_000.5,
-        "p99_us": 99_000.01,
-        "p999_us": 99_900.001,
-        "max_us": 100_000.0,
-        "calls": 100_000,
-    }
-
-
-def test_repeated_repeats() -> None:
+    assert (found["p50_us"], found["p999_us"], found["max_us"], found["calls"]) == (50_000.5, 99_900.001, 1e5, 100_000)
     calls: list[int] = []
     repeated(lambda: calls.append(1), 5)()
     assert len(calls) == 5
-
-
-def test_rows_read_as_text_and_facts_are_json() -> None:
     assert table_text([{"name": "a", "bench": "x", "ns": 1.23456, "n": 3_000_000}]) == "a  ns 1.235  n 3.000e+06"
     assert json.loads(json.dumps(machine_facts()))["cores"]
 
 
-def test_c_decides_as_our_kernel_does() -> None:
-    loops = c_loops()
-    if not isinstance(loops, CLoops):
-        pytest.skip(loops)
-    decider = SparseDecider(head_bundle(random_layers([10, 32, 7])))
-    counts = np.random.default_rng(0).integers(0, 2, (200, 10))
-    wanted = decider.decide_batch(counts, 1)
-    for loop in ("sparse_groups", "sparse_plain"):
-        assert (loops.sparse(loop, counts, *decider.layers, 7) == wanted).all()
-
-
-def test_single_decisions_are_timed_and_right() -> None:
-    decider = SparseDecider(head_bundle(random_layers([10, 32, 7])))
-    counts = np.random.default_rng(0).integers(0, 2, (200, 10))
-    row = alone_row(decider, counts, 1)
-    if "skipped" not in row:
-        assert row["checksum"] == decider.decide_batch(counts, 1).sum()
-        assert 0 <= row["clock_us"] <= row["p50_us"] <= row["max_us"]
-        assert row["calls"] == 200
-
-
 def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_decide, "SINGLE_CALLS", 400)
-    monkeypatch.setattr(bench_decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
+    monkeypatch.setattr(decide, "SINGLE_CALLS", 400)
+    monkeypatch.setattr(decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
     layers = random_layers([6, 16, 4])
     bundle = head_bundle(layers, int8_head=quantise_head(layers))
-    rows = {row["name"]: row for row in _bundle_rows(bundle, None, 300)}
+    rows = {row["name"]: row for row in decide.bundle_rows(bundle, None, 300)}
     assert rows["chain table"]["changed_percent"] == rows["chain sparse"]["changed_percent"] == 0
     assert 0 < rows["chain int8"]["score_error"] < 0.2
     assert rows["chain float64"]["score_error"] < 1e-5
@@ -96,8 +66,7 @@ def test_every_back_end_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
-    layers = random_layers([6, 16, 12])
+    monkeypatch.setattr(decide, "cpu_time", lambda work, repeats=1: (work(), Spent(1e-3, 1e-3, 1))[1])
     bundle = made_bundle(
         name="chain",
         task="pictures",
@@ -106,42 +75,84 @@ def test_a_picture_has_its_error_in_its_row(monkeypatch: pytest.MonkeyPatch) -> 
         levels=2,
         pattern_levels=np.eye(6, dtype=np.uint16),
         photons_per_level=1.0,
-        head_onnx=onnx_chain(layers),
+        head_onnx=onnx_chain(random_layers([6, 16, 12])),
         picture_shape=(3, 4),
     )
-    row = bench_decide._picture_row(bundle, 50)
+    row = decide.picture_row(bundle, 50)
     assert row["name"] == "chain picture of 12 pixels, onnx"
     assert 0 < row["score_error"] < 1e-5
 
 
+def test_rows_of_walks_have_their_checks() -> None:
+    bundle = automaton_bundle(random_automaton(3))
+    rows = [decide.walk_row(bundle, 2000), *ingest.stream_rows(bundle, quick=True)]
+    assert [row["changed_percent"] for row in rows] == [0.0] * 3
+    assert rows[0]["score_error"] == 0.0
+
+
+def test_a_decision_that_differs_is_reported() -> None:
+    wanted = np.zeros(4, DECISION_DTYPE)
+    found = wanted.copy()
+    found["label"][1] = 1
+    assert streams.percent_changed([found], wanted) == 25.0
+    assert streams.percent_changed([wanted[:2], wanted[2:]], wanted) == 0.0
+    assert streams.percent_changed([wanted[:3]], wanted) == 100.0
+
+
 def test_streams_have_the_frames_and_zeros_they_promise() -> None:
-    data, n_frames = bench_ingest._wire(0.9)
+    data, n_frames = ingest.wire_stream(0.9)
     frames = FrameDecoder().feed(data[: len(data) // 8])
     payload = np.frombuffer(b"".join(frame.payload[36:] for frame in frames), np.uint8)
-    assert n_frames == bench_ingest.STREAM_BYTES // bench_ingest.PAYLOAD_BYTES
+    assert n_frames == ingest.STREAM_BYTES // ingest.PAYLOAD_BYTES
     assert abs((payload == 0).mean() - 0.9) < 5 * (0.09 / len(payload)) ** 0.5
 
 
 @pytest.mark.parametrize("shots", [1, 3])
-def test_a_renumbered_stretch_continues_the_stream(monkeypatch: pytest.MonkeyPatch, shots: int) -> None:
-    monkeypatch.setattr(bench_ingest, "VISIT_FRAMES", 12)
-    monkeypatch.setattr(bench_ingest, "BLOCK_FRAMES", 5)
-    plan = bench_ingest.parallel_plan(4, shots)
+def test_parallel_visits_continue_the_stream(monkeypatch: pytest.MonkeyPatch, shots: int) -> None:
+    monkeypatch.setattr(streams, "VISIT_FRAMES", 12)
+    monkeypatch.setattr(streams, "BLOCK_FRAMES", 5)
+    plan = streams.parallel_plan(4, shots)
     decider = make_decider(
         head_bundle(random_layers([4, 5, 3])), shots=shots, backend="table" if shots == 1 else "sparse"
     )
-    stretch = bench_ingest._Renumbered(b"".join(bench_ingest.visits(plan, 0, 2, 0)), plan)
-    core = StreamCore(plan, decider, shots, 0, bench_ingest.SESSION)
+    core = StreamCore(plan, decider, shots, 0, streams.SESSION)
     messages = 1 + -(-plan.slots_per_cycle // 5)
     rows = 0
-    for start in (0, 2, 4):
-        rows += sum(len(batch.rows) for batch in core.feed(stretch.at(start, start * messages)))
+    for visit in (0, 2, 4):
+        data = b"".join(streams.parallel_visits(plan, visit, 2, visit * messages))
+        rows += sum(len(batch.rows) for batch in core.feed(data))
     counters = core.core.tracker.counters
     assert (rows, counters.exposures, counters.lost_exposures, counters.lost_messages) == (72 // shots, 84, 0, 0)
 
 
+@compiled
+def test_work_that_is_timed_decides_as_the_plain_core() -> None:
+    bundle, _ = load_bundle(BenchOptions().first_bundle)
+    flow = turn.flow_row(bundle, True)
+    assert flow["decisions"] == 100  # one every 500 of 400 blocks' frames
+    for row in (turn.block_row(streams.made_automaton(), True), turn.frame_row(bundle, True), flow):
+        assert row["changed_percent"] == 0.0, row["name"]
+
+
+@compiled
+@pytest.mark.parametrize("kind", turn.KINDS)
+def test_round_trips_are_decided_as_by_the_plain_core(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = turn.built_device(tmp_path)
+    if isinstance(device, str):
+        pytest.skip(device)
+    monkeypatch.setattr(turn, "ROUNDS", 1)
+    bundle = streams.made_automaton()
+    decider = make_decider(bundle)
+    plan = streams.host_driven(streams.sequential_plan(bundle, decider))
+    row = turn.trip_row(turn.Trips(kind, plan, decider, device, 300))
+    assert (row["changed_percent"], row["command_bytes"]) == (0.0, 38)
+    assert row["calls"] >= 270
+
+
 def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from pans.runtime.commands import bench as cmd_bench
+    from pans.runtime.commands import bench as command
 
     seen: list[BenchOptions] = []
 
@@ -149,26 +160,11 @@ def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: 
         seen.append(options)
         return [{"name": "a", "ns": np.float32(2)}]
 
-    monkeypatch.setattr(cmd_bench, "_find", lambda name: bench if name != "link" else None)
+    monkeypatch.setattr(command, "_find", lambda name: bench if name != "link" else None)
     assert main(["bench", "all", "--json", "--quick", "--frames", "7"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert [row["bench"] for row in found["rows"]] == ["decide", "loop", "ingest", "turn", "sim"]
+    assert [row["bench"] for row in found["rows"]] == ["decide", "loop", "ingest", "turn"]
     assert (seen[0].quick, seen[0].frames) == (True, 7)
     assert "processor" in found["machine"]
     with pytest.raises(SystemExit, match="2"):
         main(["bench", "loop", "--seconds", "0"])
-
-
-def test_the_simulators_benchmark_counts_wrong_bits() -> None:
-    from pans.firmware_sim.commands import bench_clicks as bench_sim
-
-    row = bench_sim._click_row("both", bench_sim.EFFECTS["+ afterpulsing and crosstalk"], quick=True)
-    assert (row["bits_wrong"], row["name"]) == (0, "SIMULATED clicks, both")
-
-
-def test_the_free_loops_leave_subnormal_numbers_alone():
-    loops = c_loops(FREE_FLAGS)
-    if not isinstance(loops, CLoops):
-        pytest.skip(loops)
-    assert np.float64(5e-324) * 1.0 > 0.0
-    assert np.array([1e-310]) / 2 > 0.0
