@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pans.runtime.errors import DamagedFileError
 
 from .onnx_check import HeadCost, check_head
-from .onnx_file import MODEL_MAX_BYTES
+from .onnx_model import MODEL_MAX_BYTES
 
 HEAD_MAX_BYTES = MODEL_MAX_BYTES
 _BATCH_ROWS = 65536

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .onnx_file import Node, read_model
+from .onnx_model import Node, read_model
 
 WEIGHT_MAX = 127
 STEP_MAX = 255

@@ -1,25 +1,34 @@
-"""May this ONNX head run at all? Answered from its bytes, before any session is made.
+"""A head's bytes in; what one decision of it costs out, or ValueError in words: checked before any onnxruntime session is made.
 
-Owns the bounds on what a head costs; never runs one. `check_head` reads the graph, follows the shapes through its operators and adds up
-what one decision costs. A head that passes has no loop, no branch and no size that depends on a value: its time and memory are those
-stated here, whatever its weights are. docs/reference/formats.md states the same bounds.
+Shapes are followed through the operators (https://onnx.ai/onnx/operators/). No loop, no branch, no size that depends on a click and no
+mixing of rows is let through, so that time and memory are those stated here, whatever the weights are. A rule may let through what
+onnxruntime refuses; for all else its shape is onnxruntime's. docs/reference/formats.md states the same bounds.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from .onnx_file import FLOAT, Model, Value, read_model
-from .onnx_layout import known_constant, outcome_of
-from .onnx_shapes import ROWS, Known, per_row, shape_text
+import numpy as np
+from numpy.typing import NDArray
+
+from .onnx_model import DTYPES, FLOAT, LIST_MAX, Model, Node, read_model
 
 OPSETS = (7, 30)  # operators before 7 broadcast by attributes; what onnxruntime does not know it refuses itself
 OPERATIONS_MAX = 1 << 27  # multiply-adds per decision, about 0.05 s on one core
 VALUES_MAX = 1 << 22  # of all intermediate results and workspace per decision: 16 MiB of float32
+VALUE_OPERATIONS = 8  # multiply-adds that take as long as one value of an element-wise operator, such as an exponential
+ROWS = 2_147_483_629  # stands for the number of decisions at once: a prime that no constant has room for
+Dims = tuple[int, ...]
+Tensor = NDArray[
+    Any
+]  # int64: few integers whose values are known; else only the shape counts, and nothing is allocated
 
 
-@dataclass(frozen=True, slots=True)
-class HeadCost:
+class HeadCost(NamedTuple):
     """What a checked head is: names of its ends, whether its batch is fixed to one row, and what one row costs."""
 
     input_name: str
@@ -34,48 +43,302 @@ def check_head(head_onnx: bytes, n_features: int, n_outputs: int) -> HeadCost:
     model = read_model(head_onnx)
     if not OPSETS[0] <= model.opset <= OPSETS[1]:
         raise ValueError(f"operator set {model.opset}, allowed: {OPSETS[0]} to {OPSETS[1]}")
-    source = _source(model, n_features)
-    known = {name: known_constant(values) for name, values in model.tensors.items()}
-    known[source.name] = Known((ROWS, n_features))
+    ends = model.inputs + model.outputs[:1]
+    if len(model.inputs) != 1 or len(ends) != 2 or {value.dtype for value in ends} != {FLOAT}:
+        found = ", ".join(f"{value.name!a:.40} of data type {value.dtype}" for value in ends[:5])
+        raise ValueError(f"the ends are {found}; allowed: one input and an output, tensor(float)")
+    source, result = ends
+    if len(source.shape) != 2 or source.shape[0] not in (None, 1) or source.shape[1] not in (None, n_features):
+        raise ValueError(f"the input has the shape {source.shape!s:.80}, allowed: (n or 1, {n_features})")
+    known, operations, values = shapes_of(model, n_features)
+    if result.name not in known or known[result.name].shape != (ROWS, n_outputs):
+        found = shape_text(known[result.name].shape) if result.name in known else "of nothing: no operator makes it"
+        raise ValueError(f"the output {result.name!a:.60} has the shape {found}, allowed: (n, {n_outputs})")
+    return HeadCost(source.name, result.name, source.shape[0] == 1, operations, values)
+
+
+def shapes_of(model: Model, n_features: int) -> tuple[dict[str, Tensor], int, int]:
+    """Return every tensor's shape, the multiply-adds and the values of one row; ValueError where they pass what is allowed."""
+    known = {name: _constant_of(values) for name, values in model.tensors.items()}
+    known[model.inputs[0].name] = _shaped((ROWS, n_features))
     operations, values = 0, n_features
     for node in model.nodes:
-        for name in node.inputs:
-            if name and name not in known:
-                raise ValueError(f"the operator {node.op} reads {name!a:.60} before it is made")
-        outcome = outcome_of(node, [known[name] if name else None for name in node.inputs], model.opset)
-        if node.outputs[0] in known:
-            raise ValueError(f"two values have the name {node.outputs[0]!a:.60}")
-        known[node.outputs[0]] = outcome.output
-        operations += outcome.operations
-        values += per_row(outcome.output.dims) + outcome.workspace
+        missing = [name for name in node.inputs if name and name not in known]
+        if missing or len(node.outputs) != 1 or node.outputs[0] in known:
+            ends = f"makes {node.outputs!s:.80} of {node.inputs!s:.80}"
+            raise ValueError(f"the operator {node.op!a:.60} {ends}, allowed: one new output, of what was made before")
+        call = _Call(node, [known.get(name) for name in node.inputs], model.opset)
+        known[node.outputs[0]] = output = _outcome(call)
+        operations += call.operations + VALUE_OPERATIONS * per_row(output.shape)
+        values += call.workspace + per_row(output.shape)
         if operations > OPERATIONS_MAX or values > VALUES_MAX:
             found = f"{operations} multiply-adds and {values} intermediate values per decision"
             raise ValueError(f"{found} at {node.op}, allowed: {OPERATIONS_MAX} and {VALUES_MAX}")
-    _demand_output(model.outputs[0], known, n_outputs)
-    fixed = source.shape is not None and source.shape[0] == 1
-    return HeadCost(source.name, model.outputs[0].name, fixed, operations, values)
+    return known, operations, values
 
 
-def _source(model: Model, n_features: int) -> Value:
-    """Return the one input, after checking what the model declares of its ends."""
-    if len(model.inputs) != 1 or not model.outputs:
-        names = ", ".join(f"{value.name!a:.40}" for value in model.inputs[:5])
-        found = f"{len(model.inputs)} inputs ({names}) and {len(model.outputs)} outputs"
-        raise ValueError(f"{found}, allowed: one input, an output")
-    source = model.inputs[0]
-    for value in (source, model.outputs[0]):
-        if value.dtype != FLOAT:
-            raise ValueError(f"{value.name!a:.60} is of data type {value.dtype}, allowed: tensor(float)")
-    shape = source.shape or ()
-    if len(shape) != 2 or shape[0] not in (None, 1) or shape[1] not in (None, n_features):
-        found = ", ".join("n" if size is None else str(size) for size in shape)
-        raise ValueError(f"the input has the shape ({found:.80}), allowed: (n or 1, {n_features})")
-    return source
+@dataclass(slots=True)
+class _Call:
+    """One operator, what is known of its inputs (None: left out), and what it costs per row beside one pass over its output."""
+
+    node: Node
+    inputs: list[Tensor | None]
+    opset: int
+    operations: int = 0
+    workspace: int = 0
+
+    def given(self, number: int) -> Tensor:
+        if number >= len(self.inputs) or (known := self.inputs[number]) is None:
+            raise ValueError(f"has no input {number}")
+        return known
+
+    def dims(self, number: int = 0) -> Dims:
+        return self.given(number).shape
+
+    def constant(self, number: int) -> Dims:
+        """The sizes of an input that must not depend on the clicks."""
+        if ROWS in self.dims(number):
+            raise ValueError(f"has an input {number} that depends on the clicks, allowed: a constant")
+        return self.dims(number)
+
+    def attribute(self, name: str, otherwise: Any) -> Any:
+        """An attribute of the type of `otherwise`, or that."""
+        value = self.node.attributes.get(name, otherwise)
+        if type(value) is not type(otherwise):
+            raise ValueError(f"has {name} {value!s:.60}, allowed: {type(otherwise).__name__}")
+        return value
+
+    def integers(self, name: str, number: int) -> Dims:
+        """Integers given as attribute `name` or, in later operator sets, as input `number`; () if in neither."""
+        if name in self.node.attributes or number >= len(self.inputs) or self.inputs[number] is None:
+            return tuple(self.attribute(name, ()))
+        values = self.given(number)
+        if values.dtype != np.int64 or (ROWS in values and name != "shape"):
+            raise ValueError(f"has {name} that are not a short constant")
+        return tuple(values.reshape(-1).tolist())
 
 
-def _demand_output(result: Value, known: dict[str, Known], n_outputs: int) -> None:
-    found = known.get(result.name)
-    if found is None:
-        raise ValueError(f"the output {result.name!a:.60} is made by no operator")
-    if found.dims != (ROWS, n_outputs):
-        raise ValueError(f"the output has the shape {shape_text(found.dims)}, allowed: (n, {n_outputs})")
+def per_row(dims: Dims) -> int:
+    """Return the number of values of one row."""
+    return math.prod(size for size in dims if size != ROWS)
+
+
+def shape_text(dims: Dims) -> str:
+    """Return sizes for a message, the rows as n."""
+    return f"({', '.join('n' if size == ROWS else str(size) for size in dims)})"[:80]
+
+
+def _shaped(dims: Dims) -> Tensor:
+    return np.ndarray(dims, np.int8, b"\0", strides=(0,) * len(dims))
+
+
+def _constant_of(values: Tensor) -> Tensor:
+    few = values.dtype.kind == "i" and values.size <= LIST_MAX and values.ndim < 2
+    return values.astype(np.int64) if few else _shaped(values.shape)
+
+
+def _outcome(call: _Call) -> Tensor:
+    """What the operator gives; ValueError, naming it, for one that is not allowed or does not fit."""
+    op, rows = call.node.op, any(known is not None and ROWS in known.shape for known in call.inputs)
+    if op not in _RULES:
+        raise ValueError(f"the operator {op!a:.60}, allowed: {', '.join(sorted(_RULES))}")
+    try:
+        found = _RULES[op](call)
+        dims = found if isinstance(found, tuple) else found.shape
+        if len(dims) > LIST_MAX or min(dims, default=1) < 1 or math.prod(dims) > 1 << 62:
+            raise ValueError(f"gives the shape {shape_text(dims)}, allowed: sizes of 1 and more, {VALUES_MAX} in all")
+        if ROWS in dims[1:] or (rows and op != "Shape" and dims[:1] != (ROWS,)):
+            raise ValueError(f"gives the shape {shape_text(dims)}, allowed: rows stay first, and apart")
+        return _shaped(found) if isinstance(found, tuple) else found
+    except (ValueError, IndexError, TypeError) as error:
+        raise ValueError(f"the operator {op} {error}") from None
+
+
+def _same(call: _Call) -> Tensor | Dims:
+    if call.attribute("training_mode", 0) or (call.node.op == "Dropout" and len(call.inputs) > 2):
+        raise ValueError("has training_mode, allowed: inference")
+    return call.given(0) if call.node.op == "Identity" else call.dims()
+
+
+def _along_axis(call: _Call) -> Dims:
+    dims, last = call.dims(), call.node.op == "LayerNormalization" or call.opset >= 13
+    if call.attribute("axis", -1 if last else 1) % len(dims) == 0 and ROWS in dims:
+        raise ValueError("works along the rows, allowed: within each")
+    return dims
+
+
+def _broadcast(call: _Call) -> Dims:
+    return np.broadcast_shapes(*(call.dims(number) for number in range(len(call.inputs))))
+
+
+def _cast(call: _Call) -> Tensor | Dims:
+    wanted = call.attribute("to", 0)
+    if wanted not in DTYPES:
+        raise ValueError(f"gives data type {wanted}, allowed: float, (u)int8, int32, int64")
+    return call.given(0) if wanted > 5 else call.dims()
+
+
+def _product(call: _Call) -> Dims:
+    left, right = call.dims(), call.constant(1)
+    if call.node.op == "Gemm":
+        left = left[::-1] if call.attribute("transA", 0) else left
+        right = right[::-1] if call.attribute("transB", 0) else right
+    if not left or len(right) not in (1, 2) or left[-1] != right[0]:
+        raise ValueError(f"multiplies {shape_text(left)} by {shape_text(right)}, which do not fit")
+    output = left[:-1] + right[1:]
+    call.operations = per_row(output) * right[0]
+    return output
+
+
+def _windows(call: _Call, sizes: Dims, kernel: Dims) -> Dims:
+    """How many windows of a convolution or pool fit, per axis; of a transposed convolution the size of its output."""
+    rank, how, up = len(kernel), call.attribute("auto_pad", "NOTSET"), call.attribute("ceil_mode", 0)
+    strides, dilations = call.attribute("strides", (1,) * rank), call.attribute("dilations", (1,) * rank)
+    pads, further = call.attribute("pads", (0,) * 2 * rank), call.attribute("output_padding", (0,) * rank)
+    if min(kernel + strides + dilations) < 1 or min(pads + further) < 0 or len(pads) != 2 * rank:
+        raise ValueError("has a kernel, strides or dilations below 1, or pads below 0")
+    if how not in ("NOTSET", "VALID", "SAME_UPPER", "SAME_LOWER", ""):
+        raise ValueError(f"has auto_pad {how!a:.60}")
+    if how == "VALID":
+        pads = (0,) * 2 * rank
+    found = []
+    for size, before, behind, k, stride, dilation, more in zip(
+        sizes, pads[:rank], pads[rank:], kernel, strides, dilations, further, strict=True
+    ):
+        reach = (k - 1) * dilation + 1
+        if before + behind > 2 * reach:
+            raise ValueError("has pads wider than its kernel")
+        count = (size + before + behind - reach + (stride - 1) * bool(up)) // stride + 1
+        if how.startswith("SAME"):
+            count = -(-size // stride)
+        elif up and (count - 1) * stride >= size + before:
+            count -= 1  # it would begin in the pad behind
+        transposed = (size - 1) * stride + reach + more - before - behind
+        found.append(transposed if call.node.op == "ConvTranspose" else count)
+    return tuple(found)
+
+
+def _conv(call: _Call) -> Dims:
+    dims, weights, groups = call.dims(), call.constant(1), call.attribute("group", 1)
+    turned, window = call.node.op == "ConvTranspose", math.prod(weights[2:])
+    outer, inner = (
+        weights[1::-1] if turned else weights[:2]
+    )  # channels out and in; the second axis has those of a group
+    if turned and (
+        call.attribute("auto_pad", "NOTSET") not in ("NOTSET", "") or "output_shape" in call.node.attributes
+    ):
+        raise ValueError("has auto_pad or output_shape, allowed: pads alone")
+    if (
+        groups < 1
+        or inner * (1 if turned else groups) != dims[1]
+        or call.attribute("kernel_shape", weights[2:]) != weights[2:]
+    ):
+        raise ValueError(
+            f"has weights {shape_text(weights)} in {groups} groups for {shape_text(dims)}, which do not fit"
+        )
+    channels = outer * groups if turned else outer
+    output = (dims[0], channels, *_windows(call, dims[2:], weights[2:]))
+    call.operations = per_row(dims if turned else output) * (outer if turned else inner) * window
+    places = math.prod(dims[2:]) * channels if turned else math.prod(output[2:]) * dims[1]
+    call.workspace = max(0, places) * window
+    return output
+
+
+def _pool(call: _Call) -> Dims:
+    dims, kernel = call.dims(), call.attribute("kernel_shape", ())
+    if call.node.op.startswith("Global"):
+        kernel, output = dims[2:], dims[:2] + (1,) * (len(dims) - 2)
+    else:
+        output = (*dims[:2], *_windows(call, dims[2:], kernel))
+    call.operations = per_row(output) * math.prod(kernel)
+    return output
+
+
+def _reduce(call: _Call) -> Dims:
+    dims, kept = call.dims(), call.attribute("keepdims", 1)
+    if call.attribute("noop_with_empty_axes", 0):
+        raise ValueError("has noop_with_empty_axes")
+    gone = {range(len(dims))[axis] for axis in call.integers("axes", 1) or range(len(dims))}
+    call.operations = VALUE_OPERATIONS * per_row(dims)
+    return tuple(1 if axis in gone else size for axis, size in enumerate(dims) if kept or axis not in gone)
+
+
+def _reshape(call: _Call) -> Dims:
+    dims, wanted = call.dims(), call.integers("shape", 1)
+    sizes = [dims[axis] if size == 0 and axis < len(dims) else size for axis, size in enumerate(wanted)]
+    if ROWS in dims and sizes[:1] in ([-1], [1]):  # 1 is right where a head has a fixed batch of one
+        sizes[0] = ROWS
+    total, rest = math.prod(dims), math.prod(size for size in sizes if size != -1)
+    if (
+        call.attribute("allowzero", 0)
+        or sizes.count(-1) > 1
+        or rest < 1
+        or total % rest
+        or (-1 not in sizes and total != rest)
+    ):
+        raise ValueError(f"gives the shape {shape_text(wanted)} to {shape_text(dims)}, which does not fit")
+    return tuple(total // rest if size == -1 else size for size in sizes)
+
+
+def _flatten(call: _Call) -> Dims:
+    dims, axis = call.dims(), call.attribute("axis", 1)
+    return math.prod(dims[:axis]), math.prod(dims[axis:])
+
+
+def _concat(call: _Call) -> Tensor | Dims:
+    parts = [call.given(number) for number in range(len(call.inputs))]
+    dims = list(parts[0].shape)
+    axis = range(len(dims))[call.attribute("axis", 0)]
+    if any(part.shape[:axis] + part.shape[axis + 1 :] != (*dims[:axis], *dims[axis + 1 :]) for part in parts):
+        raise ValueError("joins shapes that do not fit")
+    dims[axis] = sum(part.shape[axis] for part in parts)
+    return np.concatenate(parts) if all(part.dtype == np.int64 for part in parts) else tuple(dims)
+
+
+def _slice(call: _Call) -> Tensor:
+    values, starts, ends = call.given(0), call.integers("starts", 1), call.integers("ends", 2)
+    axes, steps = call.integers("axes", 3) or range(len(starts)), call.integers("steps", 4) or (1,) * len(starts)
+    for start, end, place, step in zip(starts, ends, axes, steps, strict=True):
+        axis = range(values.ndim)[place]
+        past = step < 0 and end < -values.shape[axis]
+        values = values[(slice(None),) * axis + (slice(start, None if past else end, step),)]
+    return values
+
+
+def _gather(call: _Call) -> Tensor | Dims:
+    values, index, axis = call.given(0), call.given(1), call.attribute("axis", 0)
+    if values.dtype == index.dtype == np.int64 and values.ndim == 1:
+        return np.take(values, index)
+    axis = range(values.ndim)[axis]
+    return values.shape[:axis] + call.constant(1) + values.shape[axis + 1 :]
+
+
+def _constant(call: _Call) -> Tensor:
+    (value,) = call.node.attributes.values()
+    return _constant_of(np.asarray(value))
+
+
+_RULES: Mapping[str, Callable[[_Call], Tensor | Dims]] = {
+    name: rule
+    for names, rule in (
+        ("Abs Ceil Celu Clip Elu Erf Exp Floor Gelu HardSigmoid HardSwish Identity LeakyRelu Log Mish Neg", _same),
+        ("Reciprocal Relu Round Selu Sigmoid Softplus Softsign Sqrt Tanh ThresholdedRelu", _same),
+        ("QuantizeLinear DequantizeLinear BatchNormalization Dropout", _same),
+        ("Add Sub Mul Div Max Min Pow PRelu Sum", _broadcast),
+        ("Gemm MatMul MatMulInteger", _product),
+        ("Conv ConvTranspose", _conv),
+        ("AveragePool MaxPool GlobalAveragePool GlobalMaxPool", _pool),
+        ("Softmax LogSoftmax LayerNormalization", _along_axis),
+        ("ReduceMax ReduceMean ReduceMin ReduceSum", _reduce),
+        *(("Cast", _cast), ("Reshape", _reshape), ("Flatten", _flatten), ("Concat", _concat), ("Slice", _slice)),
+        *(("Gather", _gather), ("Constant", _constant)),
+        ("Shape", lambda call: np.array(call.dims()[call.attribute("start", 0) : call.node.attributes.get("end")])),
+        ("Unsqueeze", lambda call: np.expand_dims(call.given(0), call.integers("axes", 1))),
+        ("Squeeze", lambda call: np.squeeze(call.given(0), call.integers("axes", 1) or None)),
+        (
+            "Transpose",
+            lambda call: np.transpose(call.given(0), call.attribute("perm", tuple(range(call.given(0).ndim))[::-1])),
+        ),
+    )
+    for name in names.split()
+}

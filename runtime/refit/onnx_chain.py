@@ -1,6 +1,6 @@
 """A chain of layers as an ONNX model, written without the onnx package: Gemm and Relu, one float32 input, one output.
 
-Owns the bytes (onnx.proto, as `bundle.onnx_protobuf` reads them) and the place of a log-linear correction in the layers; checks nothing:
+Owns the bytes (onnx.proto, as `bundle.onnx_model` reads them) and the place of a log-linear correction in the layers; checks nothing:
 a bundle holds every head against its golden vectors when it is made.
 """
 

