@@ -166,15 +166,15 @@ class BulkSteps:
         known = self._marks.objects[slots] == objects
         return np.where(known, self._marks.photons[slots], np.float32(np.nan))
 
-    def labelled(self, n: int, first: int = 0) -> Rows:
-        """Return `n` rows from `first` on; those that the kernel could not label from a table get their verdicts here, all at once."""
+    def labelled(self, n: int) -> Rows:
+        """Return the first `n` rows; those that the kernel could not label from a table get their verdicts here, all at once."""
         if self._numbered.numbers.size:
-            return self.decisions(slice(first, first + n)).rows
-        rows = self._rows[first : first + n]
+            return self.decisions(slice(0, n)).rows
+        rows = self._rows[:n]
         if self.tables.labels.size or not n:
             return rows
         whole = np.flatnonzero(rows["flags"] == 0)
-        labels, probabilities = _finite(*verdicts_of(self._decider, self._counts[first + whole], self._shots))
+        labels, probabilities = _finite(*verdicts_of(self._decider, self._counts[whole], self._shots))
         rows["label"][whole], rows["probability"][whole] = labels, probabilities
         silent = labels == NO_LABEL
         if silent.any():
@@ -186,7 +186,7 @@ class BulkSteps:
     def decisions(self, place: slice) -> RowDecisions:
         """Return the decisions at `place`, as `labelled` gives them; their rows are made when somebody asks for them, if that can be."""
         if not self._numbered.numbers.size:
-            return RowDecisions(self.labelled(place.stop - place.start, place.start))
+            return RowDecisions(self.labelled(place.stop))
         decided = self._verdicts, self._numbered.numbers[place], self._numbered.runs[place]
 
         def rows_of(first: int, stop: int) -> Rows:
@@ -210,9 +210,9 @@ class BulkSteps:
         )
         state[kernels.JITTER] = min(core.jitter_ticks, _LARGEST)
 
-    def store(self, reported: npt.NDArray[np.int64] | None = None) -> None:
-        """Copy what the kernel did back: its state, or what that was when it `reported`."""
-        core, state = self.core, (self._state if reported is None else reported).tolist()
+    def store(self) -> None:
+        """Copy what the kernel did back."""
+        core, state = self.core, self._state.tolist()
         if state[place.MESSAGES] or state[kernels.N_ROWS]:
             core.tracker.advance(
                 (state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]),

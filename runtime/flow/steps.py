@@ -32,8 +32,7 @@ from .settings import WATCHED_FRAMES
 
 I64 = npt.NDArray[np.int64]
 
-PARTS = 4  # of the memory for decisions: a call that goes on fills one after the other (turn/banks.py)
-ROWS_MORE = 512  # of a part, beside those of a block
+ROWS_MORE = 2048  # decisions of one call, beside those of a block
 MOST_BLOCKS = 4096  # whose empty frames have not been told yet: as many as the turn keeps times of (turn/rings.py)
 LEAVE, N_PASSAGE, N_EDGES = 3, 5, 5  # of core.decision.Passage, in its order; of kernels.count_edges
 _LARGEST = (1 << 62) - 1
@@ -47,7 +46,7 @@ class FlowSteps:
         self.core, decider = core, core.decider
         self.decides = True
         self.block_rows = plan.block_exposures + 1
-        n, n_rows = decider.n_features, PARTS * (self.block_rows + ROWS_MORE)
+        n, n_rows = decider.n_features, self.block_rows + ROWS_MORE
         gated = np.zeros(decider.n_classes, np.uint8)
         gated[sorted(core.gated)] = 1
         # np.full touches what it makes; np.zeros would leave that to the first use, a fault of a page each
@@ -73,9 +72,9 @@ class FlowSteps:
         """Follow the stream of `session` from where the core stands."""
         self.walk.state[kernels.SESSION] = session
 
-    def labelled(self, n: int, first: int = 0) -> npt.NDArray[np.void]:
-        """Return `n` rows from `first` on."""
-        return self.walk.rows[first : first + n]
+    def labelled(self, n: int) -> npt.NDArray[np.void]:
+        """Return the first `n` rows."""
+        return self.walk.rows[:n]
 
     def load(self) -> None:
         """Copy what the core and its tracker know into the kernel's state."""
@@ -93,10 +92,9 @@ class FlowSteps:
         state[columns.WATCH_AT] = core.watched_frames + WATCHED_FRAMES if core.watches_empty else 1 << 62
         core.lend(state)
 
-    def store(self, reported: I64 | None = None) -> None:
-        """Copy what the kernel did back: its state, or what that was when it `reported`."""
-        core, columns_of = self.core, self.walk.state if reported is None else reported
-        state = columns_of.tolist()
+    def store(self) -> None:
+        """Copy what the kernel did back."""
+        core, state = self.core, self.walk.state.tolist()
         if state[place.MESSAGES]:
             position = state[place.NEXT_SEQ], state[place.NEXT_EXPOSURE]
             core.tracker.advance(position, state[place.MESSAGES], state[place.EXPOSURES])
@@ -107,9 +105,9 @@ class FlowSteps:
         core.n_passages = state[columns.OBJECTS]
         core.take_back(state)
 
-    def told(self, reported: I64) -> list[list[int]]:
-        """Return what the empty field gave and has not been settled, up to what was `reported`: rows of `FlowWalk.empty`."""
-        first, self._told = self._told, int(reported[columns.TOLD])
+    def told(self) -> list[list[int]]:
+        """Return what the empty field gave and has not been settled: rows of `FlowWalk.empty`."""
+        first, self._told = self._told, int(self.walk.state[columns.TOLD])
         return self.walk.empty[np.arange(first, self._told) % MOST_BLOCKS].tolist()
 
     def pulses(self, rows: slice) -> list[Action]:

@@ -52,7 +52,7 @@ TURN_NS = 20_000_000  # a call comes back at least so often: signals, the watchd
 
 
 class CompiledTurns:
-    """The compiled turns of `run`, across reconnections: `attach` before each ARM, then `turn` again and again.
+    """The compiled turns of `run`, across reconnections: `prepare` before each ARM, then `turn` again and again.
 
     With `prompt`, a call ends behind the first bytes that gave a decision, for a watcher that acts.
     """
@@ -76,34 +76,12 @@ class CompiledTurns:
         self._asked = False  # what Python sent of a call is about to be answered
         self.settled: Callable[[Turn, Output], None] | None = None  # told after each call that brought messages
 
-    @property
-    def goes_on(self) -> bool:
-        """See Turns: a call is over when `turn` is."""
-        return False
-
-    @property
-    def lives(self) -> bool:
-        """See Turns."""
-        return True
-
-    @property
-    def page_faults(self) -> dict[str, int]:
-        """See Turns: those of the run's thread are the run's."""
-        return {}
-
-    def attach(self) -> None:
-        """Be ready for ARM."""
-        self.prepare()
-
-    def halt(self) -> None:
-        """Nothing goes on."""
-
     def leave_off(self) -> int:
-        """Return 0: the session knows what was sent."""
-        return 0
-
-    def close(self) -> None:
-        """Nothing is left."""
+        """Let a call that is under way end, from any thread; return the id of the command that follows those that it has sent."""
+        if self._turn is None:
+            return 0
+        self._turn.stop()
+        return int(self._turn.control[ring.NEXT_ID])
 
     def prepare(self) -> None:
         """Lend the run's present connection to the compiled turn, once; kernels are compiled or loaded."""
@@ -172,10 +150,10 @@ class CompiledTurns:
         return outputs
 
     def last(self, poll_s: float) -> list[Arrived]:
-        """See Turns: what comes behind STOP is as urgent as before; no state is named any more."""
+        """Take a turn while the device stops; return what is left to Python. No state is named any more."""
         if self._attached is not self._run.connection:  # a new one, broken off before it was armed
             return self._run.connection.pump(poll_s)
-        CompiledTurns.turn(self, poll_s)
+        self.turn(poll_s)
         return []
 
     # -- before a call -------------------------------------------------------------------------------------------------
@@ -295,7 +273,7 @@ class CompiledTurns:
         connection.delivered += counts.messages
         connection.answers += counts.answers
         run.taken_here += counts.messages
-        if turn.reported[ring.DRIVES] and (counts.shows or counts.answers):
+        if turn.control[ring.DRIVES] and (counts.shows or counts.answers):
             self._settle_commands(turn)
         if counts.messages > counts.steps:
             self._settle_marks(turn)
@@ -324,7 +302,7 @@ class CompiledTurns:
 
     def _settle_commands(self, turn: Turn) -> None:
         """Bring the session and the driver to where the kernel has them."""
-        run, control, shows = self._run, turn.reported, turn.shows
+        run, control, shows = self._run, turn.control, turn.shows
         first = int(control[ring.NEXT_ID]) - len(shows)
         open_since = max(int(control[ring.OLDEST_ID]), first)
         sent = [(number, turn.bytes_of(shows[number - first])) for number in range(open_since, first + len(shows))]

@@ -15,16 +15,14 @@ from pans.runtime.instrument.calibration import MAX_AGE_H
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from pans.runtime.core.decision import Output, RowDecisions
+    from pans.runtime.core.decision import Output
     from pans.runtime.core.follower import Place
     from pans.runtime.instrument.channel_health import DarkReport
-    from pans.runtime.link.connection import Arrived
     from pans.runtime.timing.ledger import TimingLedger
-    from pans.runtime.turn import Turn
     from pans.runtime.wire.frame import Messages
     from pans.runtime.wire.messages import Frame, Mark
     from pans.runtime.wire.tracker import StreamTracker
@@ -144,40 +142,3 @@ class LiveCore(Protocol):
     def cycles_left(self, n_cycles: int) -> int: ...
 
     def part(self) -> Place | None: ...
-
-
-class Turns(Protocol):
-    """What takes a live run's turns in the place of Python's (compiled.CompiledTurns, lasting.LastingTurns).
-
-    `prepare` once a connection is there, `attach` before each ARM; `turn` waits, decides and answers, and returns what came of it.
-    `settled` is told after each call that brought messages. Where the turns go on in another thread (`goes_on`), core, session and
-    driver are behind them; `halt` ends that, and all are where the turns have come. `lives`: whether they do. `leave_off` ends it from
-    any thread and returns the id of the next command, 0: the session knows it. `last` is a turn while the device stops, which none that
-    goes on follows; it returns what is left to Python. `close` once, at the end. `none` are no decisions, of the kind that `turn` gives.
-    """
-
-    settled: Callable[[Turn, Output], None] | None
-    none: RowDecisions
-
-    @property
-    def goes_on(self) -> bool: ...
-
-    @property
-    def lives(self) -> bool: ...
-
-    @property
-    def page_faults(self) -> dict[str, int]: ...
-
-    def prepare(self) -> None: ...
-
-    def attach(self) -> None: ...
-
-    def turn(self, poll_s: float) -> list[Output]: ...
-
-    def last(self, poll_s: float) -> list[Arrived]: ...
-
-    def halt(self) -> None: ...
-
-    def leave_off(self) -> int: ...
-
-    def close(self) -> None: ...

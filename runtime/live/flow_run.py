@@ -1,6 +1,6 @@
 """A run with passing objects: core and gates joined, what compiled turns brought of it, and what came of it all.
 
-Owns the actuator while the run lasts, what is settled of a flow behind a compiled turn (compiled.py, lasting.py own the rest of these), and
+Owns the actuator while the run lasts, what is settled of a flow behind a compiled turn (compiled.py owns the rest of it), and
 the flow's part of the summary; the order of a run is loop.py's.
 """
 
@@ -25,7 +25,6 @@ from pans.runtime.wire.schema import HEADER
 
 from .compiled import CompiledTurns
 from .gates import Actuator
-from .lasting import LastingTurns
 from .second_device import SecondInstrument
 
 if TYPE_CHECKING:
@@ -96,13 +95,15 @@ class FlowRun:
 # -- behind compiled turns -------------------------------------------------------------------------------------------------
 
 
-class _FlowSettling(CompiledTurns):
+class FlowTurns(CompiledTurns):
     """What is settled of a flow: block by block where something came, in the order in which Python's turn would have seen it.
 
-    A pulse is sent here, once its decision is on record.
+    A pulse is sent here, once its decision is on record: a block that asks for one ends the kernel's call.
     """
 
-    _lent: FlowSteps | None = None
+    def __init__(self, run: LiveRun, core: FlowCore, *, prompt: bool) -> None:
+        super().__init__(run, core, prompt=prompt)
+        self._lent: FlowSteps | None = None
 
     def _steps(self, nonce: int) -> FlowSteps:
         if self._lent is None:
@@ -133,9 +134,6 @@ class _FlowSettling(CompiledTurns):
             run.gates.take(pulses)
             run.pulse()
 
-    def _look_ahead_for_pulses(self, turn: Turn) -> None:
-        """Pulses of what has come meanwhile do not wait until all before it is settled."""
-
     def _settle_blocks(self, turn: Turn, outputs: list[Output]) -> None:
         run, blocks = self._run, turn.blocks
         if run.connection.link.virtual:
@@ -144,44 +142,10 @@ class _FlowSettling(CompiledTurns):
             if output is not None:
                 arrival_ns, decoded_ns, decided_ns = blocks[block, : ring.DECIDED + 1].tolist()
                 run.book(output, (arrival_ns, decoded_ns, decided_ns), outputs, kept=True)
-            self._look_ahead_for_pulses(turn)
         try:
             run.take([])
         except LinkError as error:  # met while pulses were sent
             self._error = self._error or error
-
-
-class FlowTurns(_FlowSettling):
-    """The compiled turns of a flow, one call after the other; where pulses are asked for, a call ends with the first bytes."""
-
-    def __init__(self, run: LiveRun, core: FlowCore, *, prompt: bool) -> None:
-        super().__init__(run, core, prompt=prompt or bool(core.gated))
-
-
-class LastingFlowTurns(_FlowSettling, LastingTurns):
-    """The compiled turns of a flow in a thread of their own; what asks for a pulse wakes the run's thread at once."""
-
-    def __init__(self, run: LiveRun, core: FlowCore) -> None:
-        super().__init__(run, core)
-        self._prompt = self._wakes = bool(core.gated)
-        self._early = 0  # banks behind that which is settled that are recorded already
-        self._recorded = False  # whether that one is
-
-    def _settle(self, turn: Turn, outputs: list[Output]) -> None:
-        self._recorded = self._early > 0
-        self._early -= self._recorded
-        super()._settle(turn, outputs)
-
-    def _record(self, turn: Turn) -> None:
-        if not self._recorded:
-            super()._record(turn)
-
-    def _look_ahead_for_pulses(self, turn: Turn) -> None:
-        call = self._call
-        while self._wakes and call is not None and call.published > self._early + 1:
-            self._early += 1
-            with turn.shown_ahead(self._early):
-                super()._record(turn)
 
 
 def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
@@ -190,8 +154,8 @@ def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
     assert isinstance(steps, FlowSteps)
     core = steps.core
     by_block = core.guard is not None and not core.watches_empty  # it wants to see every block
-    behind, first_row, row = _blocks_behind(turn), turn.place.start, 0
-    empty = {told[0]: told for told in steps.told(turn.state)}
+    behind, row = _blocks_behind(turn), 0
+    empty = {told[0]: told for told in steps.told()}
     marks = _marks_of(turn)
     decided = np.diff(blocks[:, ring.ROWS], prepend=0) > 0
     some = decided | np.isin(behind, list(empty)) | by_block
@@ -208,7 +172,7 @@ def settled_blocks(turn: Turn) -> Iterator[tuple[int, Output | None]]:
             continue
         frames = decode_frames(_payload(turn, place - 1)) if by_block else None
         following = int(behind[block])
-        rows = slice(first_row + row, first_row + stop)
+        rows = slice(row, stop)
         yield block, steps.settle(rows, following, end_tick, empty.get(following), frames)
         row = stop
     while marks:
@@ -225,7 +189,7 @@ def _blocks_behind(turn: Turn) -> npt.NDArray[np.int64]:
 
 def _marks_of(turn: Turn) -> list[tuple[int, Mark]]:
     """Return the marks of a call, the first one last, each with its place among the ring's messages."""
-    places = np.flatnonzero(turn.messages[:, ring.WHAT] == int(MessageType.MARK)) + turn.first.messages
+    places = np.flatnonzero(turn.messages[:, ring.WHAT] == int(MessageType.MARK))
     return [(place, decode_mark(_payload(turn, place))) for place in places[::-1].tolist()]
 
 

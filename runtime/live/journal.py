@@ -7,7 +7,6 @@ recorder only the list is kept.
 from __future__ import annotations
 
 import logging
-import time
 from collections import Counter
 from typing import Any
 
@@ -18,8 +17,6 @@ from pans.runtime.logs import log_event
 from pans.runtime.record import AnyRecorder
 from pans.runtime.wire.messages import Opcode
 from pans.runtime.wire.session import Refusal
-
-from .config import Turns
 
 MAX_EVENTS = 1000  # of the summary; the recording has them all
 MAX_OF_A_KIND = 200  # so that many late decisions leave room for their verdicts
@@ -102,25 +99,8 @@ class Reconciled:
     ended: str
     link_lost: bool
     taken_here: int  # messages of the present connection that the core was given, or came before ARM
-    compiled: Turns | None  # where they are taken in the place of Python's
-    turned_s: float
     armed: Connection | None = None  # the connection whose session was sent ARM last
     _counted: Connection | None = None
-
-    def beat(self) -> None:
-        """Give a sign of life: the loop turns, and turns that go on in another thread do too."""
-        if self.compiled is None or self.compiled.lives:
-            self.turned_s = time.monotonic()
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether turns go on in another thread, so that core and session are behind them."""
-        return self.compiled is not None and self.compiled.goes_on
-
-    def halt(self) -> None:
-        """End turns that go on in another thread: core, session and recording are where these have come."""
-        if self.compiled is not None:
-            self.compiled.halt()
 
     def lose_link(self, error: LinkError) -> None:
         """End the run because the link is gone; what was decided so far stands."""

@@ -43,14 +43,13 @@ class Lateness:
         self._patience_ns = pause_ns + max(deadline_ns // 2, LEAST_SLACK_NS)
         self._asked = True  # the device, in the silence under way
         self._damaged = 0
-        self.loop_thread: int | None = None  # where blocks are waited for in another thread than the run's
         if recorder is not None and not link.virtual:
             recorder.watch_write = self._wrote
 
     def attach(self, connection: Connection, start_ns: int) -> None:
         """Take evidence from `connection` from here on; its exposures begin at `start_ns`."""
         connection.evidence = self.evidence
-        self.evidence.watch([connection.reader.thread_id], self.loop_thread)
+        self.evidence.watch([connection.reader.thread_id])
         self.block_ns, self._asked, self._damaged = start_ns, False, 0
 
     def close(self) -> None:

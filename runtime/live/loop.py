@@ -40,9 +40,8 @@ from pans.runtime.turn.eligible import excluded
 from pans.runtime.wire.session import ArmTooLate
 
 from .compiled import CompiledTurns
-from .config import AUTO, COMPILED, PYTHON, RunConfig, RunResult, TurnChoice, Turns
+from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice
 from .continuous import INTERRUPTED, REFUSED, Stop
-from .lasting import LastingTurns
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
 
@@ -121,8 +120,6 @@ def running(
             _light_on(run, recovery, prepare, observers)
         yield _result(run, profile)
     finally:
-        if run.compiled is not None:
-            run.compiled.close()
         run.connection.close()
 
 
@@ -167,27 +164,21 @@ def _light_on(
         run.drop_recorder()
         raise
     finally:  # whatever went wrong: light off first
-        try:
-            run.halt()
-        finally:
-            apart = {} if run.compiled is None else run.compiled.page_faults
-            run.page_faults = apart or counts.since()
-            run.stop()
+        run.page_faults = counts.since()
+        run.stop()
 
 
-def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> Turns:
-    """Return the compiled turns of `core`; with `prompt` a watcher acts. A call that goes on reads a descriptor itself."""
-    link = run.connection.link
-    lasts = not link.virtual and not prompt and descriptor_of(link) is not None
+def _compiled_turns(run: LiveRun, core: LiveCore, *, prompt: bool) -> CompiledTurns:
+    """Return the compiled turns of `core`; with `prompt` a watcher acts."""
     if isinstance(core, Core):
         core.leave_steps()
-        return LastingTurns(run, core) if lasts else CompiledTurns(run, core, prompt=prompt)
+        return CompiledTurns(run, core, prompt=prompt)
     from pans.runtime.flow.core import FlowCore
 
-    from .flow_run import FlowTurns, LastingFlowTurns
+    from .flow_run import FlowTurns
 
     assert isinstance(core, FlowCore)  # nothing else is eligible
-    return LastingFlowTurns(run, core) if lasts else FlowTurns(run, core, prompt=prompt)
+    return FlowTurns(run, core, prompt=prompt)
 
 
 def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoice:
@@ -195,8 +186,6 @@ def choose_turn(wanted: str, core: Any, link: Link, *, drives: bool) -> TurnChoi
     why = "asked for" if wanted == PYTHON else excluded(core, link, drives=drives)
     if wanted == COMPILED and why:
         raise UsageError(f"--turn compiled: {why}", remedy="--turn auto takes Python's turn here")
-    if not why and wanted == AUTO and not link.virtual and getattr(core, "gated", None):
-        why = "pulses that decisions ask for leave sooner from it"  # docs/measurements/flow.md has both
     if why:
         return TurnChoice(PYTHON, why)
     if link.virtual:
@@ -243,7 +232,6 @@ def _until_ended(
             stop.polled = False
         except LinkError as error:
             stop.polled = False
-            run.halt()
             if isinstance(error, ArmTooLate) and run.arm_later():
                 continue
             if isinstance(error, DeviceError) and refusals.again(run, error):

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
@@ -29,12 +29,15 @@ from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
 from .config import LiveCore as LiveCore
-from .config import RunConfig, TurnChoice, Turns
+from .config import RunConfig, TurnChoice
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
 from .journal import Journal, Reconciled
 from .lateness import Lateness
 from .tally import RunTally
+
+if TYPE_CHECKING:
+    from .compiled import CompiledTurns
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
@@ -92,7 +95,7 @@ class LiveRun(Reconciled):
         self._idle = True  # nothing has come in it
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self.turn_choice = TurnChoice()
-        self.compiled: Turns | None = None  # where they are taken in the place of Python's
+        self.compiled: CompiledTurns | None = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._fruitless = self._decided = 0
@@ -127,7 +130,7 @@ class LiveRun(Reconciled):
         n_cycles = self.core.cycles_left(self.config.n_cycles) if self.config.n_cycles else 0
         self.journal.session(self.connection)
         if self.compiled is not None:
-            self.compiled.attach()
+            self.compiled.prepare()
         self.taken_here, self.armed = self.connection.delivered, self.connection
         now_ns, start_tick = self._start()
         self.settle(self.core.begin(start_tick, n_cycles))
@@ -231,7 +234,7 @@ class LiveRun(Reconciled):
 
     def turn(self, watch: Watcher | None) -> None:
         """Wait for bytes, decide on them, do what is due; sets `ended` when the run is over."""
-        self.beat()
+        self.turned_s = time.monotonic()
         looked_ns = self.now_ns()
         poll_s = self.lateness.poll_s(looked_ns)
         self._watch, self._idle = watch, True
@@ -420,7 +423,7 @@ class LiveRun(Reconciled):
             return
         for event in recorder.keeper.news():
             self.journal.note(**event)
-        if recorder.wants_part and not self.goes_on and (place := self.core.part()) is not None:
+        if recorder.wants_part and (place := self.core.part()) is not None:
             recorder.next_part(place.facts(), self._setup, now_ns)
             recorder.add_clock(self.connection.known_clock().history())
             self.journal.session(self.connection)

@@ -1,8 +1,7 @@
 """The turn as one compiled call: wait, read, resynchronise, check, decide, name the next state, keep what came.
 
-Owns the order of these and why a call ends; bytes are wire/kernels.py's, messages core/stream_kernels.py's, commands shows.py's, banks
-of the rings banks.py's. It goes on by itself with all that is ordinary; what is not it leaves, untouched and in its place, to the caller.
-Never allocates.
+It continues by itself with all that is ordinary and leaves the rest, untouched and in its place, to the caller. Bytes are decoded by
+wire/kernels.py, messages taken by core/stream_kernels.py, commands written by shows.py. It never allocates.
 """
 
 from __future__ import annotations
@@ -13,24 +12,19 @@ from pans.runtime.core import stream_kernels as core
 from pans.runtime.timing.evidence import OVERSLEPT_NS
 from pans.runtime.wire import kernels as wire
 from pans.runtime.wire import walk as stream
-from pans.runtime.wire.bare import bare, copy_span, load4, load8
-from pans.runtime.wire.fields import MAX_LEASE_MS
+from pans.runtime.wire.bare import bare, copy_span, load4
 from pans.runtime.wire.inner import inner, outer
-from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, STRUCTS, DeviceState, MessageType
+from pans.runtime.wire.schema import MAX_FRAME_BYTES, SCHEMA, MessageType
 
 from . import rings as ring
-from .banks import LOOK_EVERY_NS, enter_bank, is_used, publish
 from .kinds import answer, take_message
-from .shared import load
 from .shows import IS_ODD, IS_REFUSED, take_ack
-from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for, write_now
+from .system import AGAIN, INTERRUPTED, now_ns, read_now, wait_for
 
 READ_BYTES = 1 << 16  # at once, as link/serial.py
 LEAST_WAIT_NS = 200_000
 QUIET_NS = 5_000_000
-_ACK, _PONG, _STATUS = int(MessageType.ACK), int(MessageType.PONG), int(MessageType.STATUS)
-_STATUS_BYTES = STRUCTS["STATUS"].size
-_ARMED, _RUNNING = int(DeviceState.ARMED), int(DeviceState.RUNNING)
+_ACK = int(MessageType.ACK)
 _U = np.uint64
 _LIMIT, _SCHEMA = np.int64(MAX_FRAME_BYTES), np.int64(SCHEMA)  # plain numbers are types of their own to the compiler
 
@@ -46,27 +40,21 @@ def turn(fed, reads, decoder, walk, drive, rings, control, scratch):  # type: ig
     """
     decoder, walk, drive, rings = bare(decoder), bare(walk), bare(drive), bare(rings)
     fed, reads, control, scratch = bare(fed), bare(reads), bare(control), bare(scratch)
-    _begin(walk, rings, control)
+    _begin(walk, control)
     began_ns, shows = (
         np.int64(-1),
         np.int64(-1),
     )  # before the first read: neither the clock nor what was shown is looked at
     while True:
         ended = take_bodies(decoder, walk, drive, rings, control, scratch)
-        if ended == ring.FULL and control[ring.LASTING] and publish(walk, rings, control, now_ns(scratch)):
-            continue
         if ended == ring.ALL_TAKEN and reads.shape[0]:
             if control[ring.NEXT_READ] == reads.shape[0]:
                 return ended
-            if control[ring.N_ARRIVALS] == control[ring.ROOM_ARRIVALS]:
+            if control[ring.N_ARRIVALS] == rings.arrivals.size:
                 return ring.FULL
             _next_read(fed, reads, decoder, control)
-        elif ended != ring.ALL_TAKEN or not control[ring.READS]:
+        elif ended != ring.ALL_TAKEN or not control[ring.READS] or control[ring.URGENT]:
             return ended
-        elif control[ring.LASTING]:
-            ended = _go_on_awaiting(decoder, walk, rings, control, scratch)
-            if ended != ring.ALL_TAKEN:
-                return ended
         else:
             if began_ns < 0:
                 began_ns = np.int64(now_ns(scratch))
@@ -93,7 +81,7 @@ def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no
         over = overdue or control[ring.N_MESSAGES] >= control[ring.BUDGET]
         if control[ring.STOP] or (over and control[ring.N_ARRIVALS]):
             return ring.DUE
-        if _is_out_of_notes(control):
+        if control[ring.N_ARRIVALS] == rings.arrivals.size or control[ring.N_NOTES] == rings.notes.shape[0]:
             return ring.FULL
         awake = now < began_ns + control[ring.EAGER_NS]
         if not awake:
@@ -116,46 +104,6 @@ def _await_bytes(decoder, rings, control, began_ns, scratch):  # type: ignore[no
 
 
 @inner
-def _go_on_awaiting(decoder, walk, rings, control, scratch):  # type: ignore[no-untyped-def]
-    """Of a call that goes on: read as soon as something is there, publish in between; ALL_TAKEN when it is decoded, or why it ends."""
-    while True:
-        if load(control, ring.STOP):
-            return ring.DUE
-        control[ring.BEAT] += 1
-        now, used = now_ns(scratch), is_used(control)
-        full, urgent = _is_out_of_notes(control), control[ring.URGENT] and control[ring.WAKE_FD] >= 0
-        if full or (used and (urgent or now >= control[ring.PUBLISH_NS])):
-            used = not publish(walk, rings, control, now)
-            if used and full:
-                return ring.FULL
-            if used:  # the other thread is behind: later, or when there is no room
-                control[ring.PUBLISH_NS] = now + LEAST_WAIT_NS
-        if urgent and not used:
-            control[ring.URGENT] = 0
-            write_now(control[ring.WAKE_FD], rings.kept, 0, 1)
-        until = now + LOOK_EVERY_NS
-        if used:
-            until = min(until, control[ring.PUBLISH_NS])
-        ready = wait_for(control[ring.FD], until - now, np.bool_(False), scratch)
-        _note_wait(rings.notes, control, now, until, now_ns(scratch))
-        if ready < 0 and ready != -INTERRUPTED:  # signals are the other thread's
-            return _failed(control, ready)
-        if ready <= 0:
-            continue
-        found = _read(decoder, control, scratch)
-        if found > 0:
-            return ring.ALL_TAKEN
-        if found != -AGAIN and found != -INTERRUPTED:
-            return _failed(control, found)
-
-
-@inner
-def _is_out_of_notes(control):  # type: ignore[no-untyped-def]
-    """Whether another arrival or another wait could not be kept."""
-    return control[ring.N_ARRIVALS] == control[ring.ROOM_ARRIVALS] or control[ring.N_NOTES] == control[ring.ROOM_NOTES]
-
-
-@inner
 def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
     """Decode the next of the reads that were made elsewhere."""
     size, at = reads[control[ring.NEXT_READ], 0], control[ring.READ_AT]
@@ -168,12 +116,12 @@ def _next_read(fed, reads, decoder, control):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _begin(walk, rings, control):  # type: ignore[no-untyped-def]
+def _begin(walk, control):  # type: ignore[no-untyped-def]
     """Nothing has come in this call yet."""
     for column in range(ring.ERRNO, ring.N_CONTROL):
         control[column] = 0
-    control[ring.FIRST_ID] = control[ring.NEXT_ID]
-    enter_bank(walk, rings, control, np.int64(0), ring.N_BANKS if control[ring.LASTING] else 1)
+    control[ring.FIRST_ID], control[ring.URGENT] = control[ring.NEXT_ID], 0
+    walk.state[core.N_ROWS] = 0
 
 
 @inner
@@ -209,7 +157,7 @@ def _failed(control, found):  # type: ignore[no-untyped-def]
 def _note_wait(notes, control, began, asked, ended):  # type: ignore[no-untyped-def]
     """Keep a wait for bytes; one that follows at once on a wait that ended in time is the same one (timing/evidence.py)."""
     n = control[ring.N_NOTES]
-    if n > control[ring.FROM_NOTES]:
+    if n:
         before = notes[n - 1]
         if before[2] - before[1] < OVERSLEPT_NS and began - min(before[1], before[2]) < control[ring.FLOOR_NS]:
             before[1], before[2] = asked, ended
@@ -235,17 +183,8 @@ def take_bodies(decoder, walk, drive, rings, control, scratch):  # type: ignore[
     buffer, bodies = decoder.buffer, decoder.bodies
     while control[ring.PLACE] < control[ring.N_BODIES]:
         start, stop = bodies[control[ring.PLACE], 0], bodies[control[ring.PLACE], 1]
-        if not _has_room(walk, control, stop - start):
+        if not _has_room(walk, rings, control, stop - start):
             return ring.FULL
-        if buffer[start] < stream.CLICKS and control[ring.LASTING] and _is_aside(buffer, start, stop, walk, control):
-            spans, count = rings.answers, ring.N_ANSWERS
-            if buffer[start] == _STATUS:
-                spans, count = rings.messages, ring.N_MESSAGES
-            _keep(buffer, start, stop, rings.kept, spans, count, control)
-            control[ring.PLACE] += 1
-            if buffer[start] == _ACK:
-                control[ring.URGENT] = 1  # more may be sent
-            continue
         if buffer[start] == _ACK and control[ring.DRIVES]:
             if load_session(buffer, start) != walk.state[core.SESSION]:
                 return ring.ODD
@@ -287,37 +226,15 @@ def load_session(buffer, start):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_aside(buffer, start, stop, walk, control):  # type: ignore[no-untyped-def]
-    """Whether a message is kept for the caller while the call goes on: its answer to a probe or a command, or a STATUS of every day.
-
-    What such a STATUS says of the stream depends on nothing that comes before or behind it.
-    """
-    if stop - start < stream.BODY_HEADER or load_session(buffer, start) != walk.state[core.SESSION]:
-        return False
-    if buffer[start] == _PONG:
-        return True
-    if buffer[start] == _ACK:
-        return not control[ring.DRIVES]
-    if buffer[start] != _STATUS or not control[ring.OPEN] or stop - start != stream.BODY_HEADER + _STATUS_BYTES:
-        return False
-    at = _U(start + stream.BODY_HEADER)
-    state = load4(buffer, at)  # reason and the reserved bytes above it are 0
-    believable = load8(buffer, at + _U(12)) < stream.LARGEST and load8(buffer, at + _U(20)) < stream.LARGEST
+def _has_room(walk, rings, control, size):  # type: ignore[no-untyped-def]
+    """Whether another body of `size` bytes, what it answers and all its decisions fit into the rings."""
     return (
-        (state == _U(_ARMED) or state == _U(_RUNNING)) and believable and load4(buffer, at + _U(4)) <= _U(MAX_LEASE_MS)
-    )
-
-
-@inner
-def _has_room(walk, control, size):  # type: ignore[no-untyped-def]
-    """Whether another body of `size` bytes, what it answers and all its decisions fit into the bank."""
-    return (
-        control[ring.KEPT] + size + ring.SHOW_BYTES <= control[ring.ROOM_KEPT]
-        and control[ring.N_STEPS] < control[ring.ROOM_STEPS]
-        and control[ring.N_MESSAGES] < control[ring.ROOM_MESSAGES]
-        and control[ring.N_ANSWERS] < control[ring.ROOM_ANSWERS]
-        and control[ring.N_SHOWS] < control[ring.ROOM_SHOWS]
-        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= control[ring.ROOM_ROWS]
+        control[ring.KEPT] + size + ring.SHOW_BYTES <= rings.kept.size
+        and control[ring.N_STEPS] < rings.steps.shape[0]
+        and control[ring.N_MESSAGES] < rings.messages.shape[0]
+        and control[ring.N_ANSWERS] < rings.answers.shape[0]
+        and control[ring.N_SHOWS] < rings.shows.shape[0]
+        and walk.state[core.N_ROWS] + control[ring.BLOCK_ROWS] <= walk.rows.size
     )
 
 
@@ -340,7 +257,7 @@ def _put_step(walk, steps, control, decoded_ns, decided_ns, recorded_ns):  # typ
     step = steps[control[ring.N_STEPS]]
     step[ring.ARRIVAL], step[ring.DECODED] = control[ring.ARRIVAL_NS], decoded_ns
     step[ring.DECIDED], step[ring.RECORDED] = decided_ns, recorded_ns
-    step[ring.END_TICK], step[ring.ROWS] = walk.state[core.LAST_TICK], walk.state[core.N_ROWS] - control[ring.FROM_ROWS]
+    step[ring.END_TICK], step[ring.ROWS] = walk.state[core.LAST_TICK], walk.state[core.N_ROWS]
     step[ring.MESSAGES], step[ring.SHOWS] = control[ring.N_MESSAGES], control[ring.N_SHOWS]
     control[ring.N_STEPS] += 1
     control[ring.BLOCK_NS] = control[ring.ARRIVAL_NS]

@@ -26,20 +26,11 @@ STOP = 11  # a flag that anybody may set: the call ends
 PLACE, N_BODIES, ARRIVAL_NS, BLOCK_NS, NEXT_ID, OLDEST_ID, OLDEST_NS, SENT_EXPOSURE, SENT_STATE = range(12, 21)
 # of bytes that were read elsewhere: the next read, and where it begins
 NEXT_READ, READ_AT = range(21, 23)
-# the id of the first command that this call may send
-FIRST_ID = 23
-# of a call that goes on (banks.py): whether it does; how many banks it has published, and how many of these the caller has taken; how
-# often it has looked around; who writes to the descriptor (0: nobody); when the bank under way is published
-LASTING, HEAD, TAIL, BEAT, WRITES, PUBLISH_NS = range(24, 30)
-# the bank under way: where it begins, in rows, bytes and waits, and where each ring's part of it ends
-FROM_ROWS, FROM_KEPT, FROM_NOTES = range(30, 33)
-ROOM_STEPS, ROOM_MESSAGES, ROOM_ANSWERS, ROOM_SHOWS, ROOM_NOTES, ROOM_ARRIVALS, ROOM_KEPT, ROOM_ROWS = range(33, 41)
-# of a call that goes on: whether the bank under way is to be published at once, and a descriptor to which a byte is written when it has
-# been (-1: none), for pulses that decisions ask for and answers to them
-URGENT, WAKE_FD = range(41, 43)
+# the id of the first command that this call may send; whether a pulse is asked for, so that the call ends with the bytes read so far
+FIRST_ID, URGENT = range(23, 25)
 # what a call reports: errno, bytes of the last command that were not sent, when anything of the session came last, and up to where each
 # ring is used
-ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(43, 54)
+ERRNO, UNSENT, HEARD_NS, N_STEPS, N_MESSAGES, N_ANSWERS, N_SHOWS, N_NOTES, N_ARRIVALS, KEPT, N_CONTROL = range(25, 36)
 
 # steps, int64 (n, N_STEP): one for each block
 ARRIVAL, DECODED, DECIDED, RECORDED, END_TICK, ROWS, MESSAGES, SHOWS, N_STEP = range(9)
@@ -54,7 +45,6 @@ WHY = ("all taken", "due", "full", "odd", "gone", "signalled", "broken")
 LARGEST_BODY = HEADER.size + MAX_PAYLOAD_BYTES
 KEPT_BYTES = 1 << 20
 MANY = 4096  # messages of one call: no more objects than marks are remembered (stream_kernels.MARK_SLOTS)
-N_BANKS = 4  # equal parts of every ring, of a call that goes on: one is filled while others are taken
 SHOW_BYTES = 64  # a SHOW command on the wire is shorter
 
 
@@ -68,8 +58,6 @@ class Rings(NamedTuple):
     shows: I64
     notes: I64  # (n, 4): waits for bytes: began, asked until, ended
     arrivals: I64
-    heads: I64  # (N_BANKS, N_CONTROL): what `control` was when each bank was published
-    states: I64  # (N_BANKS, n): what the state of the walk was
 
 
 class Decoder(NamedTuple):
@@ -94,13 +82,12 @@ class Drive(NamedTuple):
     sizes: I64
 
 
-def make_rings(n_state: int) -> Rings:
-    """Return rings in memory that has been touched; the state of the walk has `n_state` columns."""
+def make_rings() -> Rings:
+    """Return rings in memory that has been touched."""
     kept: U8 = np.full(KEPT_BYTES, 1, np.uint8)
     messages, answers, shows, notes = (np.full((MANY, 4), 1, np.int64) for _ in range(4))
-    heads, states = np.full((N_BANKS, N_CONTROL), 0, np.int64), np.full((N_BANKS, n_state), 0, np.int64)
     steps, arrivals = np.full((MANY, N_STEP), 1, np.int64), np.full(MANY, 1, np.int64)
-    return Rings(kept, steps, messages, answers, shows, notes, arrivals, heads, states)
+    return Rings(kept, steps, messages, answers, shows, notes, arrivals)
 
 
 def no_drive() -> Drive:

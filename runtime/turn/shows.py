@@ -17,7 +17,6 @@ from pans.runtime.wire.schema import HEADER, MAX_ACK_TEXT_BYTES, SCHEMA, STRUCTS
 from pans.runtime.wire.session import COMMAND_WINDOW
 
 from . import rings as ring
-from .shared import load, store, take
 from .system import AGAIN, INTERRUPTED, now_ns, wait_for, write_now
 
 ACK_BYTES = STRUCTS["ACK"].size
@@ -25,7 +24,6 @@ ID_AT, EXPOSURE_AT = HEADER.size, HEADER.size + STRUCTS["COMMAND"].size
 TAIL_AT = EXPOSURE_AT + 8
 IS_ODD, IS_DONE, IS_REFUSED = range(3)  # what `take_ack` says of an acknowledgement
 WRITE_WAIT_NS = 20_000_000  # for room; what then is left, the caller sends
-HOLD_WAIT_NS = 20_000  # while the other thread writes a frame of its own
 _U = np.uint64
 
 
@@ -93,12 +91,7 @@ def send_show(walk, drive, rings, control, scratch):  # type: ignore[no-untyped-
         return True  # what waits for acknowledgements comes late: the next walk is named in time
     begin = control[ring.KEPT]
     end = put_show(drive, control[ring.NEXT_ID], exposure, state, rings.kept, begin)
-    if control[ring.LASTING]:
-        while not take(control, ring.WRITES) and not load(control, ring.STOP):
-            wait_for(np.int64(-1), np.int64(HOLD_WAIT_NS), np.bool_(False), scratch)
     sent = _send(control, rings.kept, begin, end, scratch)
-    if control[ring.LASTING]:
-        store(control, ring.WRITES, 0)
     left_ns = now_ns(scratch)
     control[ring.SENT_EXPOSURE], control[ring.SENT_STATE] = exposure, state
     control[ring.NEXT_ID] += 1

@@ -49,7 +49,6 @@ from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.turn import kernels, shows, system
 from pans.runtime.turn import rings as ring
 from pans.runtime.turn.engine import Limits, Turn
-from pans.runtime.turn.lasting import LastingCall
 from pans.runtime.turn.streaming import StreamCore
 from pans.runtime.wire.automata import unpack_show
 from pans.runtime.wire.bulk import BulkDecoder
@@ -121,7 +120,7 @@ def test_a_run_at_real_pace(mode: str, listen: str, tmp_path: Path) -> None:
 def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its time when it is made: a wait before it is sent would count as its way to the device."""
     told: list[str] = []
-    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (LastingCall, "wait")):
+    for owner, name in ((HostSession, "probe"), (Connection, "flush"), (Turn, "run")):
         original = getattr(owner, name)
 
         def noted(*arguments: Any, name: str = name, original: Any = original) -> Any:
@@ -134,7 +133,7 @@ def test_a_probe_of_the_clock_leaves_at_once(tmp_path: Path, monkeypatch: pytest
     setup = Served("sequential", "tcp:127.0.0.1:0")
     recorded(setup, open_link(setup.url), tmp_path / "a.pansrec", "compiled")
     setup.close()
-    armed = told.index("wait")
+    armed = told.index("run")
     assert told[armed:].count("probe") > 0
     assert [told[at + 1] for at, what in enumerate(told) if what == "probe" and at > armed] == ["flush"] * told[
         armed:
