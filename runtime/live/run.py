@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pans.runtime.core.decision import Output
 from pans.runtime.core.plan import Plan
@@ -35,9 +35,6 @@ from .gates import GateQueue
 from .journal import Journal, Reconciled
 from .lateness import Lateness
 from .tally import RunTally
-
-if TYPE_CHECKING:
-    from .compiled import CompiledTurns
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 PROBE_EVERY_NS = 97 * NS_PER_MS  # odd on purpose: nothing in the loop has this period or a multiple of it
@@ -95,7 +92,7 @@ class LiveRun(Reconciled):
         self._idle = True  # nothing has come in it
         self._broken: LinkError | None = None  # met while acting, kept until all that has arrived is decided
         self.turn_choice = TurnChoice()
-        self.compiled: CompiledTurns | None = None  # where they are taken in the place of Python's
+        self.compiled: Any = None  # where they are taken in the place of Python's
         self._setup: list[bytes] = []  # what each part of the recording must repeat
         self._started_ns = started_ns
         self._fruitless = self._decided = 0
