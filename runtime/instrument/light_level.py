@@ -1,16 +1,13 @@
-"""Is the light still what was calibrated? Change detection on the mean number of clicks per decision.
+"""Change detection on the mean number of clicks per decision, against the level at the beginning of the run.
 
-Owns sums of clicks and their comparison with the run's own beginning, whose level the calibration states; never knows the
-objects, so that a change of their mixture looks like a change of light, and the words say so. Nothing is decided by it.
+`LightWatch.take` receives the clicks of decisions and returns what has changed. A different mixture of objects looks like a change of
+light, and the words say so. How much of a change of efficiency reaches the clicks depends on the patterns: nearly all of it where an
+exposure clicks seldom, almost none where exposures are either dark or saturated (docs/how-to/calibrate.md has figures).
 
-How much of a change of efficiency is seen in the clicks depends on the patterns: nearly all of it where an exposure clicks
-seldom, next to nothing where objects make it either dark or saturated (docs/how-to/calibrate.md has figures).
-
-Clicks are added up over batches of decisions, so that the spread between objects is measured and not assumed. The first batches
-give mean m and standard deviation s, until m is known to BASELINE_ERROR; then a two-sided CUSUM (Page 1954) sums the deviation
-beyond half the change looked for. Its threshold follows from the stated batches between false alarms by Siegmund's
-approximation (Sequential Analysis, 1985), with the drift made smaller by twice the error of m: the price of a mean that is an
-estimate.
+Clicks are summed over batches of decisions, so that the spread between objects is measured and not assumed. The first batches give
+mean m and standard deviation s, until m is known to BASELINE_ERROR; then a two-sided CUSUM (Page 1954) sums the deviation beyond half
+the change looked for. Its threshold follows from the stated batches between false alarms by Siegmund's approximation (Sequential
+Analysis, 1985), with the drift reduced by twice the error of m, because the mean is an estimate.
 """
 
 from __future__ import annotations
@@ -47,77 +44,34 @@ class Baseline:
 
 
 class LightWatch:
-    """Follows the clicks of decisions; `take` returns words when the mean has changed, once for each direction."""
+    """Follows the clicks of decisions and reports each lasting change of their mean once."""
 
     def __init__(self, batch: int = BATCH, arl_batches: float = ARL_BATCHES) -> None:
         self.batch, self.arl_batches = batch, arl_batches
         self.baseline: Baseline | None = None
         self.found: list[dict[str, Any]] = []
         self.decisions = 0
-        self._clicks = self._in_batch = 0
-        self._n, self._sum, self._squares = 0, 0, 0
-        self._low = self._high = 0.0  # sums of the falls and of the rises
+        self._unfinished = np.zeros(0, np.int64)  # clicks of the decisions since the last whole batch
+        self._learnt = 0, 0, 0  # batches of the baseline, their clicks and the sum of squares
+        self._sums = {"fall": 0.0, "rise": 0.0}
         self._since = {"fall": (0, 0, 0), "rise": (0, 0, 0)}  # decisions, batches and clicks when the sum last was 0
         self._batches = self._total = 0
-        self._order = np.arange(1, dtype=np.uint32)
 
-    def take(self, clicks: int) -> str:
-        """Take one decision's clicks; return a sentence when a change has been found, else ""."""
-        self.decisions += 1
-        self._clicks += clicks
-        self._in_batch += 1
-        if self._in_batch < self.batch:
-            return ""
-        total, self._clicks, self._in_batch = self._clicks, 0, 0
-        if self.baseline is None:
-            self._learn(total)
-            return ""
-        return self._compare(total, self.baseline)
-
-    def take_many(
-        self, rows: npt.NDArray[np.void], left_out: int, numbers: npt.NDArray[np.uint32] | None = None
-    ) -> list[dict[str, Any]]:
-        """Take many decisions, rows (n,) with fields `clicks` and `flags`, but those with one of the flags `left_out`: as `take` of each.
-
-        With `numbers` uint32 (m,), the decisions are rows[numbers]. Returns what was found.
-        """
-        from . import light_kernels as kernels  # numba is loaded only by who takes many at once
-
-        numbers = self._in_order(len(rows)) if numbers is None else numbers
-        known, at, levels = len(self.found), 0, np.empty(kernels.N_LEVELS)
-        levels[kernels.ERROR :] = BASELINE_ERROR, BASELINE_LEAST, BASELINE_MOST
-        while True:
-            base, sums = self.baseline, (self._n, self._sum, self._squares)
-            since = (*self._since["fall"], *self._since["rise"])
-            batch = (self.decisions, self._clicks, self._in_batch)
-            counts = np.array([*batch, *sums, self._batches, self._total, *since, self.batch], np.int64)
-            levels[: kernels.ERROR] = (
-                self._low,
-                self._high,
-                *((math.nan, 0.0, 0.0) if base is None else (base.mean, base.slack, base.threshold)),
-            )
-            at, why = kernels.take_clicks(rows, numbers, np.uint32(left_out), at, counts, levels)
-            self._go_on(counts.tolist(), levels.tolist())
-            if why == kernels.LEARNT:
-                self._learnt()
-            elif why != kernels.ALL_TAKEN:
-                assert base is not None
-                self._tell("fall" if why == kernels.FELL else "rise", base)
+    def take(self, clicks: npt.ArrayLike) -> list[dict[str, Any]]:
+        """Take the clicks of decisions, whole numbers (n,), in the order of time; return the changes found with them."""
+        known, begun = len(self.found), self.decisions - len(self._unfinished)
+        waiting = np.append(self._unfinished, np.asarray(clicks, np.int64))
+        whole = len(waiting) // self.batch * self.batch
+        for total in waiting[:whole].reshape(-1, self.batch).sum(axis=1).tolist():
+            begun += self.batch
+            self.decisions = begun
+            if self.baseline is None:
+                self._learn(total)
             else:
-                return self.found[known:]
-
-    def _in_order(self, n: int) -> npt.NDArray[np.uint32]:
-        """Return 0 to n - 1."""
-        if n > len(self._order):
-            self._order = np.arange(max(n, 2 * len(self._order)), dtype=np.uint32)
-        return self._order[:n]
-
-    def _go_on(self, counts: list[int], levels: list[float]) -> None:
-        self.decisions, self._clicks, self._in_batch, self._n, self._sum, self._squares, self._batches, self._total = (
-            counts[:8]
-        )
-        self._since = {"fall": (counts[8], counts[9], counts[10]), "rise": (counts[11], counts[12], counts[13])}
-        self._low, self._high = levels[:2]
+                self._compare(total, self.baseline)
+        self._unfinished = waiting[whole:].copy()
+        self.decisions = begun + len(self._unfinished)
+        return self.found[known:]
 
     def report(self) -> dict[str, Any]:
         """What is known: the baseline, how long a change of the clicks by STATED_CHANGE takes to be found, and what was found."""
@@ -132,32 +86,31 @@ class LightWatch:
         }
 
     def _learn(self, total: int) -> None:
-        self._n, self._sum, self._squares = self._n + 1, self._sum + total, self._squares + total * total
-        if self._n >= BASELINE_LEAST:
-            self._learnt()
-
-    def _learnt(self) -> None:
-        """Make the baseline, if its mean is known well enough."""
-        mean = self._sum / self._n
-        variance = (self._squares - self._sum * mean) / (self._n - 1)
+        """Add a batch to the baseline, which is made when its mean is known well enough."""
+        n, clicks, squares = self._learnt
+        self._learnt = n, clicks, squares = n + 1, clicks + total, squares + total * total
+        if n < BASELINE_LEAST:
+            return
+        mean = clicks / n
+        variance = (squares - clicks * mean) / (n - 1)
         deviation = math.sqrt(max(variance, mean, 1.0))
-        error = deviation / math.sqrt(self._n)
-        if mean > 0 and (error <= BASELINE_ERROR * mean or self._n >= BASELINE_MOST):
+        error = deviation / math.sqrt(n)
+        if mean > 0 and (error <= BASELINE_ERROR * mean or n >= BASELINE_MOST):
             self.baseline = make_baseline(mean, deviation, error, self.arl_batches)
-            self._since = {side: (self.decisions, 0, 0) for side in self._since}
+            self._since = dict.fromkeys(self._since, (self.decisions, self._batches, self._total))
 
-    def _compare(self, total: int, base: Baseline) -> str:
+    def _compare(self, total: int, base: Baseline) -> None:
         self._batches, self._total = self._batches + 1, self._total + total
-        self._low = max(0.0, self._low + base.mean - total - base.slack)
-        self._high = max(0.0, self._high + total - base.mean - base.slack)
-        for side, value in (("fall", self._low), ("rise", self._high)):
-            if value == 0.0:
+        for side, sign in (("fall", -1), ("rise", 1)):
+            self._sums[side] = max(0.0, self._sums[side] + sign * (total - base.mean) - base.slack)
+            if self._sums[side] == 0.0:
                 self._since[side] = (self.decisions, self._batches, self._total)
-            elif value >= base.threshold:
-                return self._tell(side, base)
-        return ""
+            elif self._sums[side] >= base.threshold:
+                self._report_change(side, base)
+                return
 
-    def _tell(self, side: str, base: Baseline) -> str:
+    def _report_change(self, side: str, base: Baseline) -> None:
+        """Note the change, and begin a new baseline: from here on clicks are compared with the new mean."""
         decisions, batches, clicks = self._since[side]
         ratio = (self._total - clicks) / ((self._batches - batches) * base.mean)
         words = (
@@ -167,9 +120,8 @@ class LightWatch:
         self.found.append(
             {"side": side, "ratio": ratio, "decision": self.decisions, "since": decisions, "words": words}
         )
-        self.baseline, self._n, self._sum, self._squares = None, 0, 0, 0  # from here on against the new mean
-        self._low = self._high = 0.0
-        return words
+        self.baseline, self._learnt = None, (0, 0, 0)
+        self._sums = dict.fromkeys(self._sums, 0.0)
 
 
 def make_baseline(mean: float, deviation: float, error: float, arl_batches: float) -> Baseline:

@@ -6,14 +6,16 @@ from the recording's header (`recorded_guard`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.core.dark_guard import DarkGuard, recorded_guard
-from pans.runtime.core.decision import DecisionFlag, NumberedDecisions, Output, RowDecisions
+from pans.runtime.core.decision import Decision, DecisionFlag, NumberedDecisions, Output, RowDecisions
 from pans.runtime.core.plan import Plan
 from pans.runtime.detector import afterpulses_of
 from pans.runtime.errors import UsageError
@@ -120,8 +122,6 @@ class DarkRun:
 
     def check_device(self, run: LiveRun) -> None:
         """Before arming: is this the device that was calibrated? ConfigError if not."""
-        if run.compiled is not None:
-            self._look_at(run.compiled.none)  # compiles or loads its kernel
         if self.calibration is not None:
             find_objections(self.calibration, self.profile, self.serial_of(run))
         for warning in self.warnings:
@@ -142,21 +142,8 @@ class DarkRun:
         guard = getattr(run.core, "guard", None)
         if guard is not None and guard.health.present:
             return
-        many = cast(object, output.decisions)
-        if isinstance(many, RowDecisions):
-            for found in self._look_at(many):
-                run.journal.note("light_changed", **found)
-            return
-        for decision in output.decisions:
-            if not decision.flags & NOT_MEASURED:
-                words = self.light.take(decision.clicks)
-                if words:
-                    run.journal.note("light_changed", **self.light.found[-1])
-
-    def _look_at(self, many: RowDecisions) -> list[dict[str, Any]]:
-        if isinstance(many, NumberedDecisions):  # all measured
-            return self.light.take_many(many.verdicts, 0, many.numbers)
-        return self.light.take_many(many.rows, int(NOT_MEASURED))
+        for found in self.light.take(_measured_clicks(output.decisions)):
+            run.journal.note("light_changed", **found)
 
     def figures(self, dark: DarkReport | None = None) -> DarkFigures:
         """Return calibration, its warnings and the light for a run's summary; data that contradict the calibration are faults.
@@ -187,3 +174,13 @@ class DarkRun:
         return [
             f"the calibration contradicts the dark counts: it says {said}, this run had {clicks} clicks in {exposures}"
         ]
+
+
+def _measured_clicks(decisions: object) -> NDArray[np.integer]:
+    """Return the clicks of the decisions that were measured as planned."""
+    if isinstance(decisions, NumberedDecisions):  # all measured
+        return np.asarray(decisions.verdicts["clicks"][decisions.numbers])
+    if isinstance(decisions, RowDecisions):
+        return np.asarray(decisions.rows["clicks"][decisions.rows["flags"] & np.uint32(NOT_MEASURED) == 0])
+    several = cast(Iterable[Decision], decisions)
+    return np.array([one.clicks for one in several if not one.flags & NOT_MEASURED], np.int64)

@@ -71,7 +71,6 @@ def compile_numbered() -> None:
     from pans.runtime.core.decision import DECISION_DTYPE, RUN_DTYPE, VERDICT_DTYPE, NumberedDecisions
     from pans.runtime.core.stream_arrays import MarkArrays
     from pans.runtime.core.stream_kernels import write_rows
-    from pans.runtime.instrument.light_level import LightWatch
     from pans.runtime.live.tally import RunTally
     from pans.runtime.record.log import LogEncoder
 
@@ -80,7 +79,6 @@ def compile_numbered() -> None:
     none = NumberedDecisions(*decided, lambda first, stop: rows)
     write_rows(*decided, 0, 0, rows)
     LogEncoder().prepare(none)
-    LightWatch().take_many(none.verdicts, 0, numbers)
     marks = MarkArrays(np.zeros(2, np.int64), np.zeros(2, np.int16), np.zeros(2, np.float32))
     RunTally(2, 1).warm_up(marks, 1, none)
 
@@ -145,17 +143,14 @@ def compile_settling() -> None:
     """What is done with what a call of the compiled turn has brought."""
     import numpy as np
 
-    from pans.runtime.core.decision import DECISION_DTYPE
     from pans.runtime.core.stream_arrays import MarkArrays
-    from pans.runtime.instrument.light_level import LightWatch
     from pans.runtime.live.tally import RunTally
     from pans.runtime.record.format import TIMING_RUN_DTYPE
     from pans.runtime.timing.ledger import TimingLedger
     from pans.runtime.turn import rings, settling
     from pans.runtime.turn.kernels import unpack_blocks
 
-    rows, whole, real = np.zeros(0, DECISION_DTYPE), np.zeros(2, np.int64), np.zeros(2)
-    LightWatch().take_many(rows, 0)
+    whole, real = np.zeros(2, np.int64), np.zeros(2)
     RunTally(2, 1).warm_up(MarkArrays(whole, np.zeros(2, np.int16), np.zeros(2, np.float32)), 1)
     histograms = tuple(histogram.numbers for histogram in TimingLedger(1).histograms)
     judged, marked = np.zeros(settling.N_JUDGED, np.int64), np.zeros((1, settling.N_MARKED), np.int64)

@@ -34,7 +34,7 @@ def test_dark_counts_beyond_the_calibration_are_a_fault(clicks: int, contradicts
 def test_a_state_of_the_detector_is_no_change_of_light(present: list[str]) -> None:
     dark: Any = DarkRun(small_setup()[0], None, "warn", [])
     dark.light = MagicMock()
-    dark.light.take.return_value = ""
+    dark.light.take.return_value = []
     run, output = MagicMock(), MagicMock(decisions=[MagicMock(flags=0, clicks=4)])
     run.core.guard.health.present = present
     dark.look(run, output)
