@@ -59,11 +59,10 @@ def test_threshold_is_siegmunds() -> None:
     assert (math.exp(2 * drift * b) - 2 * drift * b - 1) / (2 * drift**2) / 2 == pytest.approx(1e4, rel=1e-6)
     rng, lengths = np.random.default_rng(3), []
     for _ in range(60):
-        steps, low, high, n = 100.0 * rng.standard_normal(60_000), 0.0, 0.0, 0
-        for n, x in enumerate(steps.tolist(), 1):
+        low = high = n = 0.0
+        while max(low, high) < base.threshold:
+            x, n = 100.0 * rng.standard_normal(), n + 1
             low, high = max(0.0, low - x - base.slack), max(0.0, high + x - base.slack)
-            if max(low, high) >= base.threshold:
-                break
         lengths.append(n)
     assert 0.55e4 < np.mean(lengths) < 1.8e4
 
