@@ -85,7 +85,7 @@ def binomial_tail(clicks: int, exposures: int, probability: float) -> float:
 
 def beta_quantile(probability: float, a: float, b: float) -> float:
     """Return the x with I_x(a, b) = `probability`, by bisection of the logit: right to 1e-12 also at 1e-12."""
-    high = _bisect(lambda t: beta_cdf(1.0 / (1.0 + math.exp(-t)), a, b) - probability, -80.0, 36.0)
+    high = bisect(lambda t: beta_cdf(1.0 / (1.0 + math.exp(-t)), a, b) - probability, -80.0, 36.0)
     return 1.0 / (1.0 + math.exp(-high))
 
 
@@ -109,10 +109,11 @@ def chi2_tail(value: float, degrees: float) -> float:
 def chi2_quantile(probability: float, degrees: float) -> float:
     """Return the value that a chi-square variable of `degrees` degrees of freedom stays below with `probability`."""
     top = degrees + 20.0 * math.sqrt(2.0 * degrees) + 200.0
-    return _bisect(lambda value: (1.0 - chi2_tail(value, degrees)) - probability, 0.0, top)
+    return bisect(lambda value: (1.0 - chi2_tail(value, degrees)) - probability, 0.0, top)
 
 
-def _bisect(rising: Callable[[float], float], low: float, high: float) -> float:
+def bisect(rising: Callable[[float], float], low: float, high: float) -> float:
+    """Return where `rising` passes 0 between `low` and `high`, to the last digit and from above."""
     for _ in range(200):
         middle = 0.5 * (low + high)
         if middle in (low, high):

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pans.firmware_sim.options import option
 from pans.firmware_sim.scene.detector_kernels import click_thresholds, plain_words
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, stream_key
-from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings
-from pans.runtime.instrument.cusum_design import design_cusum
+from pans.runtime.instrument.cusum import ChannelWatch, WatchSettings, design_cusum
 from pans.runtime.intervals import wilson_interval
 
 from . import Report, Trial, rows_report

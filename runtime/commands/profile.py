@@ -1,7 +1,4 @@
-"""`pans profile`: list, show and check hardware profiles, and begin a new one from a commented template.
-
-Owns the command's arguments and answers; the template is profile_template.py's, the rules are profile_schema.py's.
-"""
+"""`pans profile`: list, show and check hardware profiles, and begin a new one from a commented template."""
 
 from __future__ import annotations
 
@@ -90,8 +87,7 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _new(args: argparse.Namespace) -> int:
-    from pans.runtime.instrument.profile import parse_profile, shipped_profiles
-    from pans.runtime.instrument.profile_template import profile_template
+    from pans.runtime.instrument.profile import parse_profile, profile_template, shipped_profiles
     from pans.runtime.outputs import check_outputs, write_file
 
     path, base = Path(_only_name(args, "pans profile new my-lab.toml")), args.base or DEFAULT_BASE

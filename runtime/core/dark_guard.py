@@ -77,9 +77,9 @@ class DarkGuard:
         """Which slots of a cycle are dark."""
         return self._dark_slot
 
-    def warm_up(self, *, empty: bool = False) -> None:
-        """Compile or load the kernels, before arming; with `empty` that of `take_empty` too."""
-        self.watch.warm_up(counts=empty)
+    def warm_up(self) -> None:
+        """Compile or load the kernels, before arming."""
+        self.watch.warm_up()
         if self.lit is not None:
             self.lit.warm_up()
 

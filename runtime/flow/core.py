@@ -175,7 +175,7 @@ class FlowCore(Follower):
         self.decider.decide(np.zeros(len(spare), np.int64), self.shots)
         self._walk(Messages(np.zeros(8, np.uint8), np.zeros((0, 2), np.int64)), 0)
         if self.guard is not None:
-            self.guard.warm_up(empty=True)
+            self.guard.warm_up()
 
     # -- what the follower asks for ------------------------------------------------------------------------------------
 

@@ -155,6 +155,7 @@ class Key:
     required: bool = True
     infinite: bool = False  # inf is a meaning, not a mistake
     choices: tuple[str, ...] = ()
+    meaning: str = ""
 
     def fits(self, value: Any) -> bool:
         """Whether the type is right: a boolean is no number, a whole number is one."""

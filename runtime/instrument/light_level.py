@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pans.runtime.intervals import bisect
+
 CHANGE = 0.06  # of the clicks, relative, looked for
 BATCH = 50  # decisions
 BASELINE_ERROR = 0.0075  # of the mean
@@ -130,10 +132,9 @@ def make_baseline(mean: float, deviation: float, error: float, arl_batches: floa
     """
     slack = 0.5 * CHANGE * mean
     drift = max(slack - 2.0 * error, 0.2 * slack) / deviation
-    low, high = 0.0, 1e4
-    for _ in range(200):  # Siegmund: ARL of one side = (exp(2 d b) - 2 d b - 1) / (2 d^2), b = threshold + 1.166
-        middle = 0.5 * (low + high)
-        exponent = 2.0 * drift * (middle + _OVERSHOOT)
-        arl = math.inf if exponent > 600 else (math.exp(exponent) - exponent - 1.0) / (2.0 * drift**2)
-        low, high = (middle, high) if arl < 2.0 * arl_batches else (low, middle)
-    return Baseline(mean, deviation, slack, high * deviation)
+
+    def excess(boundary: float) -> float:  # Siegmund: ARL of one side = (exp(x) - x - 1) / (2 d^2), x = 2 d (b + 1.166)
+        x = 2.0 * drift * (boundary + _OVERSHOOT)
+        return (math.inf if x > 600 else (math.exp(x) - x - 1.0) / (2.0 * drift**2)) - 2.0 * arl_batches
+
+    return Baseline(mean, deviation, slack, bisect(excess, 0.0, 1e4) * deviation)

@@ -162,18 +162,15 @@ def compile_settling() -> None:
 
 def compile_flow() -> None:
     """The steps of objects in flow."""
-    import numpy as np
 
     from pans.runtime.decide.backends import make_decider
     from pans.runtime.flow.make import plan_flow
     from pans.runtime.flow.settings import read_flow
     from pans.runtime.flow.steps import FlowSteps
-    from pans.runtime.instrument.cusum import ChannelWatch
     from pans.runtime.instrument.profile import load_profile
     from pans.runtime.turn.engine import Turn
     from pans.runtime.wire.bulk import BulkDecoder
 
-    ChannelWatch(1, np.full(1, 0.01)).warm_up(counts=True)
     profile, bundle = load_profile(PARALLEL_PROFILE), _four_patterns()
     decider = make_decider(bundle)
     for kind in ("cells", "tape"):

@@ -1,11 +1,9 @@
-"""Profiles: the shipped ones are complete and possible, and a wrong line is named with its place and its remedy."""
+"""Profiles: the shipped ones are complete, a wrong line is named with its place and remedy, a template has every key."""
 
-import contextlib
 import dataclasses
 import hashlib
 import math
 import re
-import time
 import tomllib
 from pathlib import Path
 
@@ -17,7 +15,14 @@ from tree import ROOT
 
 from pans.runtime.errors import ConfigError
 from pans.runtime.instrument.checked_toml import key_positions, position_of, read_toml
-from pans.runtime.instrument.profile import MAX_PROFILE_BYTES, load_profile, parse_profile, shipped_profiles
+from pans.runtime.instrument.profile import (
+    MAX_PROFILE_BYTES,
+    load_profile,
+    parse_profile,
+    profile_template,
+    shipped_profiles,
+)
+from pans.runtime.instrument.profile_schema import SCHEMA
 
 GOOD = """\
 [profile]
@@ -120,35 +125,22 @@ def test_only_contrast_may_be_infinite():
     [
         ("profile.mode", 'mode = "serial"', ['must be "sequential" or "parallel"', 'found the text "serial"']),
         ("profile.name", 'name = "../up"', ["letters, digits", "../up"]),
-        ("profile.name", 'name = ""', ["text in quotes, not empty"]),
         ("profile.measure", 'measure = "detector.dark_rate_hz"', ["list of keys"]),
         ("profile.measure", 'measure = ["detector.dead_time_ns"]', ["not a key of this profile"]),
         ("projector.kind", "kind = 3", ["text in quotes", "found 3"]),
         ("projector.levels", "levels = 1", ["a whole number from 2 to 65536", "found 1"]),
-        ("projector.levels", "levels = 65537", ["a whole number from 2 to 65536"]),
-        ("projector.levels", "levels = 16.0", ["a whole number", "found 16.0"]),
         ("projector.levels", "levels = true", ["a whole number", "found the boolean true"]),
         ("projector.width_px", "width_px = " + "9" * 400, ["an enormous whole number"]),
-        ("projector.pattern_memory", "pattern_memory = 65536", ["from 1 to 65535"]),
         ("projector.pattern_rate_max_hz", "pattern_rate_max_hz = 0", ["above 0", "found 0"]),
-        ("projector.peak_photoelectrons_hz", "peak_photoelectrons_hz = -1.0", ["above 0", "found -1.0"]),
         ("projector.pixel_pitch_um", 'pixel_pitch_um = "50"', ["a number", 'the text "50"']),
         ("object.contrast", "contrast = 1.0", ["above 1 and at most", "or inf"]),
         ("object.contrast", "contrast = nan", ["found nan"]),
         ("detector.efficiency", "efficiency = 0", ["above 0 and at most 1", "found 0"]),
-        ("detector.efficiency", "efficiency = 68", ["above 0 and at most 1", "found 68"]),
-        ("detector.efficiency", "efficiency = nan", ["found nan"]),
-        ("detector.efficiency", "efficiency = false", ["found the boolean false"]),
         ("detector.dark_rate_hz", "dark_rate_hz = -0.1", ["from 0 to", "found -0.1"]),
-        ("detector.dark_rate_hz", "dark_rate_hz = inf", ["found inf"]),
-        ("detector.dark_rate_hz", "dark_rate_hz = [1.0]", ["found a list"]),
-        ("detector.channels", "channels = true", ["a whole number", "found the boolean true"]),
         ("detector.efficiency", "efficiency = true", ["a number", "found the boolean true"]),
         ("detector.channels", "channels = 5", ["must be from 1 to 4 in sequential mode", "found 5"]),
         ("exposure.min_us", "min_us = 2000.0", ["at most exposure.max_us = 1000", "found 2000"]),
         ("exposure.min_us", "min_us = 9.0", ["at least 10 ticks = 10 us", "found 9"]),
-        ("exposure.readout_us", "readout_us = -1", ["from 0 to"]),
-        ("clock.tick_hz", "tick_hz = 999", ["from 1000 to 10000000000", "found 999"]),
         ("clock.tick_hz", "tick_hz = 1e6", ["a whole number", "found 1000000.0"]),
         ("timing.lease_ms", "lease_ms = 1", ["above timing.decision_deadline_us = 1 ms", "found 1"]),
         ("timing.lease_ms", "lease_ms = 1979-05-27", ["found a date"]),
@@ -173,7 +165,7 @@ def test_a_wrong_value_is_named_with_its_place(key, line, words):
         ("dead_time_ns = 110001", ["at most exposure.min_us + exposure.readout_us = 110000 ns", "found 110001"]),
         ('dead_time_kind = "extended"', ['must be "non-paralysable" or "paralysable"', 'found the text "extended"']),
         ("afterpulse_time_us = 0.0", ["above 0"]),
-        ("afterpulse_time_us = 5.0", ["afterpulse_probability must be above 0", "found 0"]),
+        ("afterpulse_time_us = 5.0", ["needs afterpulse_probability above 0", "found 0"]),
         ("crosstalk_further = [0.01]", ["at most 0 numbers", "1 channels, found 1"]),
         ("crosstalk_further = [2.0]", ["a list of numbers from 0 to 1"]),
         ("crosstalk_further = 0.01", ["a list of numbers from 0 to 1, found 0.01"]),
@@ -240,8 +232,7 @@ def test_a_missing_key_is_named(key):
 
 
 def test_description_and_measure_may_be_missing():
-    text = edited("profile.description", "", edited("profile.measure", ""))
-    assert parse_profile(text, "lab.toml").measure == ()
+    assert parse_profile(edited("profile.description", "", edited("profile.measure", "")), "lab.toml").measure == ()
 
 
 @pytest.mark.parametrize("section", ["profile", "projector", "detector", "exposure", "clock", "timing"])
@@ -314,10 +305,6 @@ def test_an_unknown_name_lists_the_shipped_profiles():
         load_profile("oled-qcmso")
     assert "did you mean oled-qcmos?" in caught.value.remedy
     assert caught.value.exit_code == 2
-
-
-def test_four_profiles_are_shipped():
-    assert set(shipped_profiles()) >= {"oled-qcmos", "dmd-spad", "wdm-snspd", "ideal"}
 
 
 @pytest.mark.parametrize("name", shipped_profiles())
@@ -410,16 +397,9 @@ def test_any_text_is_read_or_refused_and_positions_cover_every_table(text):
     assert {path[0] for path in found if path} == set(tables)
 
 
-@pytest.mark.parametrize(
-    "unit",
-    ["k{} = 1\n", "[[a]]\nx = {}\n", "[s{}]\nx = 1\n", "a.b.c{}.d = 1\n", 'k{} = """x"""\n', "a.", "[", "# {}\n"],
-)
-def test_reading_takes_time_in_proportion_to_the_size(unit: str) -> None:
-    text = "".join(unit.format(number) for number in range(256 * 1024 // len(unit)))
-    started = time.process_time()
-    with contextlib.suppress(ConfigError):
-        read_toml(text, "long.toml")
-    assert time.process_time() - started < 2.0  # about 0.2; where each key counted the lines before it, 24
+def test_a_key_of_too_many_parts_is_refused_before_it_takes_minutes() -> None:
+    with pytest.raises(ConfigError, match=r"long\.toml:2:1: .*100 dots"):
+        read_toml("x = 1\n" + "a." * 100_000, "long.toml")
 
 
 OPTICS = """
@@ -491,3 +471,26 @@ def test_a_flat_field_stands_in_a_file_beside_the_profile(tmp_path: Path) -> Non
     np.savez(tmp_path / "flat.npz", flat=2 * flat)
     with pytest.raises(ConfigError, match="flat has the mean 2"):
         load_profile(path).imaging()
+
+
+@pytest.mark.parametrize("base", shipped_profiles())
+def test_a_template_has_the_figures_of_its_base(base: str) -> None:
+    made, shipped = parse_profile(profile_template("my-lab", base), "my-lab.toml"), load_profile(base)
+    own = {"name", "description", "measure", "sources", "text"}
+    for field in dataclasses.fields(shipped):
+        if field.name not in own:
+            assert getattr(made, field.name) == getattr(shipped, field.name), field.name
+    assert (made.name, made.sources) == ("my-lab", {})
+
+
+def test_a_template_explains_every_key_with_its_allowed_values() -> None:
+    lines = profile_template("my-lab", "oled-qcmos").split("\n")
+    keys = [at for at, line in enumerate(lines) if re.match(r"(# )?[a-z_]+ =", line) and not line.startswith("measure")]
+    assert len(keys) == sum(len(keys) for keys in SCHEMA.values())
+    for at in keys:
+        assert re.fullmatch(r"# .+ \[.+\]", lines[at - 1]), lines[at]
+
+
+def test_a_text_cannot_leave_its_quotes() -> None:
+    with pytest.raises(ConfigError, match=r"profile\.name must be"):
+        parse_profile(profile_template('x"\n[clock]\\', "ideal"), "x.toml")
