@@ -10,12 +10,11 @@ from pathlib import Path
 
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.imaging import NO_BLEACHING
-from pans.trainer.commands.evaluate_dose import curve_words
+from pans.trainer.commands.evaluate import dose_curve_words
 from pans.trainer.evaluate.dose import dose_curve
-from pans.trainer.evaluate.dose_picture import draw_dose
 from pans.trainer.evaluate.held_out import Conditions, held_out_of
-from pans.trainer.export.ordering import information_order
-from pans.trainer.export.reorder import reordered
+from pans.trainer.evaluate.pictures import draw_dose
+from pans.trainer.export.ordering import information_order, reordered
 
 if __name__ == "__main__":
     objects = int(sys.argv[1]) if len(sys.argv) > 1 else None
@@ -29,5 +28,5 @@ if __name__ == "__main__":
     drawn = {}
     for name, (bundle, judged_on) in bundles.items():
         drawn[name] = dose_curve(bundle, judged_on, Conditions())
-        print(curve_words(name, len(judged_on.objects), NO_BLEACHING, drawn[name]))
+        print(dose_curve_words(name, len(judged_on.objects), NO_BLEACHING, drawn[name]))
     print(draw_dose(Path(__file__).parent, drawn, force=True))

@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 from pans.runtime.bundle.model import load_bundle
-from pans.trainer.commands.evaluate_optics import curve_words
+from pans.trainer.commands.evaluate import optics_curve_words
 from pans.trainer.evaluate.held_out import Conditions, held_out_of, imaging_on
 from pans.trainer.evaluate.optics import misalignment_curves
-from pans.trainer.evaluate.optics_picture import draw_optics
+from pans.trainer.evaluate.pictures import draw_optics
 
 OBJECTS = 2000
 
@@ -23,5 +23,5 @@ if __name__ == "__main__":
         held_out = held_out_of(bundle, None, OBJECTS, None, Conditions())
         about = imaging_on(held_out, Conditions())
         drawn[bundle.name] = misalignment_curves(bundle, held_out, about)
-        print(curve_words(bundle.name, OBJECTS, about, drawn[bundle.name]))
+        print(optics_curve_words(bundle.name, OBJECTS, about, drawn[bundle.name]))
     print(draw_optics(Path(__file__).parent, drawn, force=True))

@@ -38,8 +38,7 @@ def random_machine(seed: int = 0, bits: bool = False, shared: bool = False) -> A
     """Three levels of 1, 2 and 3 states on 5 pixels, four classes; a leaf behind level 0, two behind level 1, five behind level 2."""
     import torch
 
-    from pans.trainer.adaptive.light import Bits, Grey
-    from pans.trainer.adaptive.machine import Level, Machine
+    from pans.trainer.adaptive.machine import Bits, Grey, Level, Machine
 
     random = torch.Generator().manual_seed(seed)
     successors = [[[0], [1]], [[2, 0], [1, 4]], [[0, 2, 4], [1, 3, 0]]]

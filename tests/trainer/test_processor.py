@@ -97,7 +97,8 @@ def test_training_and_convolutions_run_where_torch_refuses(tmp_path):
     assert "products" in said
     assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in said
     assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE_BF16" in load_bundle(out)[0].provenance["trained_with"]
-    convolve = "from pans.trainer.baselines.nets import FrameNet; import torch; FrameNet((28, 28), 10)(torch.rand(3, 784)).sum().backward()"
+    convolve = "from pans.trainer.baselines.networks import FrameNet; import torch; "
+    convolve += "FrameNet((28, 28), 10)(torch.rand(3, 784)).sum().backward()"
     ran(env, "-c", convolve)
 
 

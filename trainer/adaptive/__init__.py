@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .figures import Progress
     from .options import AutomatonOptions, check_automaton_options
     from .train import TrainedAutomaton, train_automaton
+    from .tune import Progress
 
 __all__ = ["AutomatonOptions", "Progress", "TrainedAutomaton", "check_automaton_options", "train_automaton"]
 

@@ -20,9 +20,8 @@ from pans.runtime.imaging import Tolerance
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
 from pans.trainer.model.imaging import DrawnOptics
-from pans.trainer.tasks.distort import DISTORT_STREAM, distorted
+from pans.trainer.tasks.changes import DISTORT_STREAM, distorted, shifted
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.tasks.shifts import shifted
 
 HELD_BACK_PART = 12  # one in 12 training objects, the last ones
 ORDER_STREAM = 0xA07

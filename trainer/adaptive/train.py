@@ -24,17 +24,26 @@ from pans.runtime.bundle.model import Bundle
 from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator, product_dtype
-from pans.trainer.model.afterpulses import trained_through
+from pans.trainer.model.detection import trained_through
 from pans.trainer.model.exposure import exposure_us_of, top_limits
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.checkpoint import read_checkpoint, write_checkpoint
 from pans.trainer.train.teacher import Taught, read_targets, soft_targets, write_targets
 
-from .figures import Figures, Progress, figures, masses, mean_objects
-from .finished import Finished, bit_grid, dwell_steps, finished, meet_budget, set_top, to_grid
+from .finish import (
+    Finished,
+    Posteriors,
+    bit_grid,
+    calibrated,
+    dwell_steps,
+    finished,
+    meet_budget,
+    node_counts,
+    set_top,
+    to_grid,
+)
 from .grow import GrowOptions, Growth
-from .light import Bits, Grey, as_bits
-from .machine import COUNT_FLOOR, Machine, Sight, forward
+from .machine import COUNT_FLOOR, Bits, Grey, Machine, Sight, as_bits, forward, machine_from, machine_of, machine_state
 from .objects import Augmentation, Block, TrainingObjects
 from .options import (
     AutomatonOptions,
@@ -48,11 +57,8 @@ from .options import (
     with_defaults,
 )
 from .outcomes import by_row, law_of
-from .posteriors import Posteriors, calibrated, node_counts
-from .reroute import reroute
-from .share import choose_patterns, share_patterns
-from .state import machine_from, machine_of, machine_state
-from .tune import Price, Tuning
+from .sweeps import choose_patterns, reroute, share_patterns
+from .tune import Figures, Price, Progress, Tuning, figures, masses, mean_objects
 
 KEPT_EVERY = 8  # levels: a checkpoint holds all patterns
 REACH_BLOCKS = 3  # of objects, by which it is judged how often a state is reached

@@ -89,7 +89,7 @@ def _patterns(task: Task, options: BaselineOptions, report: Report) -> tuple[Mea
 
     patterns, facts = None, {}
     if options.paradigm == "compressive":
-        from .compressive import patterns as fixed_patterns
+        from .networks import patterns as fixed_patterns
 
         patterns = fixed_patterns(options.patterns, options.features, task.image_shape, options.seed)
         facts = {"patterns": options.patterns}
@@ -130,8 +130,7 @@ def _information(measurement: Measurement, photons: float, floor: float, options
 
 
 def _network(measurement: Measurement, options: BaselineOptions, facts: dict[str, Any], report: Report) -> At:
-    from .compressive import aware_mlp, clean_mlp
-    from .direct import aware_cnn, clean_cnn
+    from .networks import aware_cnn, aware_mlp, clean_cnn, clean_mlp
 
     shared: dict[str, Any] = {"seed": options.seed, "report": report}
     if options.epochs:
@@ -147,18 +146,18 @@ def _network(measurement: Measurement, options: BaselineOptions, facts: dict[str
 
 
 def _end_to_end(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
-    from .e2e import EPOCHS, measured_by, train_conventionally
+    from .end_to_end import EPOCHS, patterns_measured, train_conventionally
 
     bits = options.bits if options.method == "qat" else None
     model = train_conventionally(
         task, options.features, seed=options.seed, bits=bits, epochs=options.epochs or EPOCHS, report=report
     )
-    measurement, of_level = measured_by(model, task, options.brightness)
+    measurement, of_level = patterns_measured(model, task, options.brightness)
     return measurement, lambda photons: (of_level(photons, options.detector), {"bits": bits})
 
 
 def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Measurement, At]:
-    from .hadamard import EPOCHS, pair_net, pairs
+    from .networks import EPOCHS, pair_net, pairs
 
     measurement = measure(task, pairs(options.features, task.image_shape), options.brightness)
     shared: dict[str, Any] = {"seed": options.seed, "dark": options.dark, "report": report}
@@ -168,11 +167,11 @@ def _hadamard(task: Task, options: BaselineOptions, report: Report) -> tuple[Mea
 
 def _masks(task: Task, options: BaselineOptions, report: Report) -> AtLevel:
     """Masks are trained anew for every level: the measurement is of the level too."""
-    from .fsi import EPOCHS, FsiOptions, measured_by, train_masks
+    from .end_to_end import EPOCHS, FsiOptions, masks_measured, train_masks
 
     def at(photons: float) -> tuple[Measurement, Decide, dict[str, Any]]:
         how = FsiOptions(options.features, photons, options.seed, options.epochs or EPOCHS, options.method == "pca")
         model = train_masks(task, replace(how, detector=options.detector, dark=options.dark), report)
-        return *measured_by(model, task, options.brightness), {}
+        return *masks_measured(model, task, options.brightness), {}
 
     return at

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .recipe import Recipe, choose_encoder, choose_training, class_warnings, warnings_of
-    from .variations import Choice, choose_variation
+    from .recipe import Choice, Recipe, choose_encoder, choose_training, choose_variation, class_warnings, warnings_of
 
 __all__ = ["Choice", "Recipe", "choose_encoder", "choose_training", "choose_variation", "class_warnings", "warnings_of"]
 

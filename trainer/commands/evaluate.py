@@ -2,6 +2,16 @@
 
 Owns the arguments and how the answer looks; the figures come from the package evaluate. All of them are SIMULATED through a profile. A
 bundle that returns pictures is judged by SSIM and mean squared error.
+
+`pans evaluate --dose-cap` and `--bleach`: what a bundle decides when an object may receive only so much light.
+
+Owns the two answers: of one cap, and accuracy against dose (`--dose-cap curve`). The figures come from the package evaluate; all of
+them are SIMULATED.
+
+`pans evaluate --optics`: what a bundle decides where the table is not perfect.
+
+Owns the two answers beside that of one given table: means over drawn tables (`--draws`), and accuracy against each misalignment
+(`--optics tolerance`). The figures come from the package evaluate; all of them are SIMULATED.
 """
 
 from __future__ import annotations
@@ -22,18 +32,31 @@ from pans.runtime.outputs import check_outputs
 from pans.runtime.safe_text import one_line
 
 from .arguments import add_data_dir, needing, usage_errors, warn_of_laws
-from .evaluate_dose import add_dose, bleaching_given, evaluate_dose, is_dosed
-from .evaluate_optics import add_optics, evaluate_tables, one_table, several_tables
-
-RECALLS_SHOWN = 10
-LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
-MADE = 1e-3  # of the light: beyond what W in float32 is off by
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
     from pans.trainer.evaluate.accuracy import Measured, MeasuredPictures
     from pans.trainer.evaluate.held_out import Conditions, HeldOut
     from pans.trainer.evaluate.walks import MeasuredWalks
+from collections.abc import Sequence
+
+from pans.runtime.bundle.model import Bundle
+from pans.runtime.imaging import NO_BLEACHING, Bleaching, bleaching_of
+from pans.runtime.ranges import Range
+
+from .arguments import shown_course
+
+if TYPE_CHECKING:
+    from pans.trainer.evaluate.held_out import Conditions, HeldOut
+from pans.runtime.imaging import Imaging, Tolerance, imaging_of, tolerance_of
+
+if TYPE_CHECKING:
+    from pans.trainer.evaluate.held_out import Conditions, HeldOut
+    from pans.trainer.evaluate.optics import OverOptics
+
+RECALLS_SHOWN = 10
+LEAST_PHOTONS = 0.01  # per decision: below, nothing can be compared
+MADE = 1e-3  # of the light: beyond what W in float32 is off by
 
 
 PICTURE_FILES = (
@@ -45,6 +68,9 @@ PICTURE_FILES = (
     "optics.png",
     "dose.png",
 )
+CURVE_WORD = "curve"
+DOSE_CAP = Range(1e-9, 1e15)
+CURVES_WORD = "tolerance"
 
 
 def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -100,7 +126,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         walks_on,
     )
     from pans.trainer.evaluate.walks import measured_walks, walk_payload
-    from pans.trainer.tasks.remembered import remembered_task
+    from pans.trainer.tasks.registry import remembered_task
 
     _check_numbers(args)
     if args.pictures is not None:
@@ -351,3 +377,244 @@ EVALUATE = Command(
         "pans evaluate parts.pans --dose-cap curve --bleach 40",
     ),
 )
+
+
+def dose_cap(text: str) -> float | str:
+    """Return what `--dose-cap` stands for: a number, or the word for a curve."""
+    return CURVE_WORD if text == CURVE_WORD else float(DOSE_CAP.option(text))
+
+
+def add_dose(parser: argparse.ArgumentParser) -> None:
+    """Add --dose-cap and --bleach to `pans evaluate`."""
+    parser.add_argument(
+        "--dose-cap",
+        type=dose_cap,
+        metavar="N|curve",
+        help="no object receives more than N photoelectrons of illumination; curve: accuracy against dose",
+    )
+    parser.add_argument(
+        "--bleach",
+        metavar="D0[:mixed]",
+        help="objects bleach: 1/e of a pixel's light is left after D0 photoelectrons of illumination; mixed: after that mean of all pixels",
+    )
+
+
+def bleaching_given(args: argparse.Namespace) -> Bleaching:
+    """Return the law of `--bleach`; ValueError for one that cannot be."""
+    return NO_BLEACHING if args.bleach is None else bleaching_of(args.bleach)
+
+
+def is_dosed(args: argparse.Namespace) -> bool:
+    """Whether a cap or bleaching is asked for; UsageError for what contradicts it."""
+    asked = args.dose_cap is not None or args.bleach is not None
+    if asked and args.shots != 1:
+        raise UsageError("--dose-cap and --bleach are of one shot", remedy="leave --shots out")
+    if asked and args.draws is not None:
+        raise UsageError("--draws has no --dose-cap and no --bleach", remedy="--optics takes one table beside them")
+    if args.dose_cap == CURVE_WORD and (args.trials is not None or args.exact):
+        raise UsageError("--dose-cap curve takes as few trials as can be", remedy="leave --trials and --exact out")
+    return asked
+
+
+def evaluate_dose(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    """Return the answer for a cap, for samples that bleach, or for both: as JSON and in words."""
+    make = _curve if args.dose_cap == CURVE_WORD else _one
+    payload, words = make(args, bundle, held_out, conditions)
+    return payload | {"bleaching": conditions.bleaching.spelled() or None}, words
+
+
+def _one(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    from pans.trainer.evaluate.dose import Capped, Knowledge, figures_of, trial_error, within_cap
+
+    if args.exact and bundle.automaton is not None and args.bleach is not None:
+        raise UsageError(
+            "--exact: what is left of a bleached sample depends on the walk, and walks are sampled",
+            remedy="use --trials",
+        )
+    found = Capped(bundle, 0.0, bundle.n_features, None)
+    if args.dose_cap is not None:
+        found = within_cap(bundle, args.dose_cap, held_out, Knowledge(bundle, held_out), args.eta)
+    measured = asdict(figures_of(found, held_out, conditions, args.trials))
+    measured["accuracy_se_trials"] = trial_error(measured)
+    capped = {} if args.dose_cap is None else found.facts()
+    words = [dose_words(measured, conditions.bleaching)]
+    if capped:
+        words.append(f"  dose cap {found.cap:g}: at most {found.exposures_most} exposures")
+    return measured | capped, "\n".join(words)
+
+
+def dose_words(measured: Mapping[str, Any], bleaching: Bleaching) -> str:
+    """Return the figures of one cap or sample in words."""
+    how = f"{measured['trials']} trials" if measured["trials"] else "exact expectation"
+    accuracy, spread, error = (
+        100 * (measured[name] or 0.0) for name in ("accuracy_mean", "accuracy_std", "accuracy_se_objects")
+    )
+    return (
+        f"SIMULATED accuracy {accuracy:.2f} %  ({measured['objects']} objects, {how}, {bleaching.words()})\n"
+        f"  spread over trials      {spread:.2f} points (error of the mean {100 * measured['accuracy_se_trials']:.2f})\n"
+        f"  error from the objects  {error:.2f} points\n"
+        f"  clicks {measured['clicks_mean']:.3f}   photons {measured['photons_mean']:.2f}   "
+        f"illumination {measured['illumination']:.1f}"
+    )
+
+
+def _curve(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    from pans.trainer.evaluate.dose import dose_curve
+
+    with shown_course("caps") as show:
+        points = dose_curve(bundle, held_out, conditions, lambda n, of: show(f"cap {n} of {of}", n, n, of, n == of))
+    payload: dict[str, Any] = {"objects": len(held_out.objects), "curve": points}
+    if args.pictures is not None:
+        with needing("--pictures", "plot"):
+            from pans.trainer.evaluate.pictures import draw_dose
+
+            payload["pictures"] = [str(draw_dose(args.pictures, {bundle.name: points}, force=args.force))]
+    return payload, dose_curve_words(bundle.name, len(held_out.objects), conditions.bleaching, points)
+
+
+_ROWS = (
+    ("dose cap", "dose_cap", 1.0, ".6g"),
+    ("accuracy (%)", "accuracy_mean", 100.0, ".2f"),
+    ("  unbleached", "accuracy_unbleached", 100.0, ".2f"),
+    ("  spread over trials", "accuracy_std", 100.0, ".2f"),
+    ("  error from objects", "accuracy_se_objects", 100.0, ".2f"),
+    ("clicks", "clicks_mean", 1.0, ".3f"),
+    ("photons", "photons_mean", 1.0, ".2f"),
+    ("illumination", "illumination", 1.0, ".1f"),
+)
+
+
+def dose_curve_words(name: str, objects: int, bleaching: Bleaching, points: Sequence[Mapping[str, Any]]) -> str:
+    """Return accuracy against dose as a small table."""
+    lines = [f"SIMULATED accuracy of {name} against dose, {objects} objects, {bleaching.words()}"]
+    for label, key, factor, form in _ROWS:
+        values = [point[key] for point in points]
+        if any(value is not None for value in values):
+            cells = ("-" if value is None else format(factor * value, form) for value in values)
+            lines.append(f"  {label:21s}" + "".join(f"{cell:>9s}" for cell in cells))
+    return "\n".join(lines)
+
+
+def add_optics(parser: argparse.ArgumentParser) -> None:
+    """Add --optics and --draws to `pans evaluate`."""
+    parser.add_argument(
+        "--optics",
+        metavar="SPEC",
+        help="where objects stand on the pattern grid, like shift=0.7,0.3:rotate=1.5:psf=0.7:black=0.002; tolerance: a curve of each",
+    )
+    parser.add_argument(
+        "--draws",
+        type=int,
+        metavar="N",
+        help="mean over N tables drawn within --optics, read as a tolerance, or within that of the bundle's training",
+    )
+
+
+def several_tables(args: argparse.Namespace) -> bool:
+    """Whether more than one table is asked for; UsageError for options that contradict each other."""
+    if args.draws is not None and not 1 <= args.draws <= 100_000:
+        raise UsageError(f"--draws is {args.draws}, allowed: 1 to 100000")
+    if args.draws is not None and args.optics == CURVES_WORD:
+        raise UsageError("--draws takes a tolerance, not --optics tolerance", remedy="leave one of them out")
+    several = args.draws is not None or args.optics == CURVES_WORD
+    if several and (args.trials is not None or args.shots != 1):
+        raise UsageError(
+            "--draws and --optics tolerance are exact, of one shot", remedy="leave --trials and --shots out"
+        )
+    return several
+
+
+def one_table(text: str | None) -> Imaging | None:
+    """Return the optics of `--optics` for one table; None: as the profile states."""
+    return None if text is None else imaging_of(text)
+
+
+def evaluate_tables(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    """Return the answer for several tables, as JSON and in words."""
+    make = _curves if args.optics == CURVES_WORD else _drawn
+    return make(args, bundle, held_out, conditions)
+
+
+def _drawn(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    from pans.trainer.evaluate.optics import drawn_tables, over_optics
+
+    tolerance = _tolerance(args.optics, bundle)
+    tables = drawn_tables(tolerance, args.draws, args.seed)
+    with shown_course("tables") as show:
+        found = over_optics(
+            bundle, held_out, tables, conditions, lambda n, of: show(f"table {n} of {of}", n, n, of, n == of)
+        )
+    return {"optics": tolerance.as_dict(), **asdict(found)}, over_words(
+        found, f"tables drawn within {tolerance.words()}"
+    )
+
+
+def _tolerance(text: str | None, bundle: Bundle) -> Tolerance:
+    told = text or _trained_through(bundle)
+    if told is None:
+        raise UsageError(
+            f"--draws: {bundle.name} was trained on perfect optics, and no tolerance is given",
+            remedy="--optics shift=1:rotate=2:psf=0.5..0.8:black=0.002, say",
+        )
+    return tolerance_of(told)
+
+
+def _trained_through(bundle: Bundle) -> str | None:
+    options = bundle.provenance.get("options")
+    told = options.get("optics") if isinstance(options, Mapping) else None
+    return told if isinstance(told, str) else None
+
+
+def over_words(found: OverOptics, which: str) -> str:
+    """Return means over several tables in words."""
+    return (
+        f"SIMULATED accuracy {100 * found.accuracy_mean:.2f} %  ({found.objects} objects, {found.tables} {which})\n"
+        f"  spread over tables      {100 * found.accuracy_std_optics:.2f} points (error of the mean"
+        f" {100 * found.accuracy_se_optics:.2f}), worst table {100 * found.accuracy_worst:.2f} %\n"
+        f"  error from the objects  {100 * found.accuracy_se_objects:.2f} points\n"
+        f"  clicks {found.clicks_mean:.3f}   photons {found.photons_mean:.2f}   illumination {found.illumination:.1f}"
+    )
+
+
+def _curves(
+    args: argparse.Namespace, bundle: Bundle, held_out: HeldOut, conditions: Conditions
+) -> tuple[dict[str, Any], str]:
+    from pans.trainer.evaluate.held_out import imaging_on
+    from pans.trainer.evaluate.optics import misalignment_curves
+
+    about = imaging_on(held_out, conditions)
+    with shown_course("tables") as show:
+        curves = misalignment_curves(
+            bundle, held_out, about, conditions, lambda n, of: show(f"table {n} of {of}", n, n, of, n == of)
+        )
+    payload: dict[str, Any] = {"about": about.numbers(), "objects": len(held_out.objects), "curves": curves}
+    if args.pictures is not None:
+        with needing("--pictures", "plot"):
+            from pans.trainer.evaluate.pictures import draw_optics
+
+            payload["pictures"] = [str(draw_optics(args.pictures, {bundle.name: curves}, force=args.force))]
+    return payload, optics_curve_words(bundle.name, len(held_out.objects), about, curves)
+
+
+def optics_curve_words(
+    name: str, objects: int, about: Imaging, curves: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> str:
+    """Return the curves as a small table."""
+    lines = [
+        f"SIMULATED accuracy of {name} (%), {objects} objects, exact expectation, one misalignment beside {about.words()}"
+    ]
+    for key, points in curves.items():
+        lines.append(f"  {key:13s}" + "".join(f"{point['value']:>9g}" for point in points))
+        lines.append(f"  {'':13s}" + "".join(f"{100 * (point['accuracy_mean'] or 0.0):>9.2f}" for point in points))
+        lines.append(f"  {'photons':13s}" + "".join(f"{point['photons_mean']:>9.2f}" for point in points))
+    return "\n".join(lines)

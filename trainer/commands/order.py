@@ -16,7 +16,7 @@ from pans.runtime.errors import UsageError
 from pans.runtime.outputs import check_outputs
 
 from .arguments import add_data_dir, needing, usage_errors
-from .evaluate_dose import DOSE_CAP, bleaching_given
+from .evaluate import DOSE_CAP, bleaching_given
 
 if TYPE_CHECKING:
     from pans.runtime.bundle.model import Bundle
@@ -48,9 +48,9 @@ def _configure(parser: argparse.ArgumentParser) -> None:
 
 def _order(args: argparse.Namespace) -> int:
     from pans.runtime.bundle.model import bundle_path, load_bundle, write_bundle
+    from pans.trainer.evaluate.dose import of_first, patterns_within, training_readings
     from pans.trainer.evaluate.held_out import Conditions, held_out_of, trained_bleaching
-    from pans.trainer.evaluate.shown import of_first, patterns_within, training_readings
-    from pans.trainer.tasks.remembered import remembered_task
+    from pans.trainer.tasks.registry import remembered_task
 
     check_outputs([args.out], inputs=[args.bundle, args.task, args.profile], force=args.force)
     if args.by == "none" and args.dose_cap is None:
@@ -97,8 +97,7 @@ def _order(args: argparse.Namespace) -> int:
 
 
 def _by(way: str, bundle: Bundle, held_out: Any, bleaching: Any) -> tuple[Bundle, Order]:
-    from pans.trainer.export.ordering import information_order
-    from pans.trainer.export.reorder import order_facts, reordered
+    from pans.trainer.export.ordering import information_order, order_facts, reordered
 
     order = information_order(bundle, held_out.profile, held_out.task.train, by=way, bleaching=bleaching)
     with needing("a head in eight bits", "train"):

@@ -26,8 +26,7 @@ from pans.trainer.options import (
     plain_options,
 )
 
-from .arguments import interruptible, needing, stated_tolerance, torch_with, usage_errors, warn_of_laws
-from .course import shown_course
+from .arguments import interruptible, needing, shown_course, stated_tolerance, torch_with, usage_errors, warn_of_laws
 from .evaluate import passive_light, warn_of_majority, words_of
 from .train_arguments import AS_GIVEN, AUTOMATON, DEFAULT_PROFILE, OF_AUTOMATA, configure_train
 from .train_own import as_given, choose, finish, is_own, set_encoder
@@ -118,7 +117,7 @@ def check_files(args: argparse.Namespace, checkpoint: Path) -> None:
     check_outputs([args.out], inputs=inputs, force=args.force)
     check_outputs([checkpoint], inputs=[*inputs, args.out], force=True)
     if args.history is not None:
-        from .course import HISTORY_FILES
+        from .arguments import HISTORY_FILES
 
         outputs = [args.history / name for name in HISTORY_FILES]
         check_outputs(outputs, inputs=inputs, force=args.force, makes_folders=True)
@@ -190,8 +189,7 @@ def _export(
     args: argparse.Namespace, task: Task, profile: Profile, trained: Trained, seconds: float, chosen: dict[str, Any]
 ) -> Exported:
     from pans.trainer.export.writer import export_trained
-    from pans.trainer.tasks.registry import task_names
-    from pans.trainer.tasks.remembered import path_from
+    from pans.trainer.tasks.registry import path_from, task_names
 
     provenance = {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,

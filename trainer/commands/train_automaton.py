@@ -16,16 +16,15 @@ from typing import TYPE_CHECKING, Any
 from pans.runtime.cli import EXIT_FINE, EXIT_INTERRUPTED, emit, say
 from pans.runtime.errors import UsageError
 
-from .arguments import needing, stated_tolerance, torch_with, usage_errors, warn_of_laws
-from .course import shown_course
+from .arguments import needing, shown_course, stated_tolerance, torch_with, usage_errors, warn_of_laws
 from .evaluate import class_words, warn_of_majority
 from .train_own import After, as_given, choose, finish
 
 if TYPE_CHECKING:
     from pans.runtime.instrument.profile import Profile
-    from pans.trainer.adaptive.figures import Progress
     from pans.trainer.adaptive.options import AutomatonOptions
     from pans.trainer.adaptive.train import TrainedAutomaton
+    from pans.trainer.adaptive.tune import Progress
     from pans.trainer.export.automaton import ExportedAutomaton, WalkFigures
 
 DEFAULT_PROFILE = "ideal"
@@ -169,8 +168,7 @@ def _export(
     args: argparse.Namespace, trained: TrainedAutomaton, task: Any, profile: Any, seconds: float, chosen: dict[str, Any]
 ) -> ExportedAutomaton:
     from pans.trainer.export.automaton import export_automaton
-    from pans.trainer.tasks.registry import task_names
-    from pans.trainer.tasks.remembered import path_from
+    from pans.trainer.tasks.registry import path_from, task_names
 
     provenance = {
         "task_argument": args.task if args.task in task_names() else Path(args.task).name,

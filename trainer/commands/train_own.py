@@ -70,8 +70,8 @@ def as_given(args: argparse.Namespace, task: Task) -> Chosen:
 def choose(args: argparse.Namespace, task: Task, profile: Profile) -> Chosen:
     """Choose what the options leave open, say what and why, warn, and return the task with its varied copies."""
     from pans.trainer.choose import choose_training, choose_variation, warnings_of
-    from pans.trainer.choose.variations import Choice
-    from pans.trainer.tasks.variation import Variation, enlarged
+    from pans.trainer.choose.recipe import Choice
+    from pans.trainer.tasks.changes import Variation, enlarged
 
     given = any(getattr(args, name) for name in CHANGES)
     say(f"{task.name}: {len(task.train)} images to train on, {len(task.test)} held out, {len(task.classes)} classes")

@@ -28,8 +28,7 @@ from pans.runtime.instrument.count_law import CountLaw, cannot_count, cannot_rea
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 
-from .chain import Chain
-from .numbers import Numbers, vector_chances
+from .readings import Chain, Numbers, vector_chances
 
 EXACT_OUTCOMES_MAX = 1 << 20  # count vectors that an exact evaluation may enumerate
 MAJORITY_SE = 2.0  # standard errors that a sensor must be above the largest class

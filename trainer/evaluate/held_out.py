@@ -13,8 +13,7 @@ from pans.runtime.bundle.model import Bundle, bundle_path, load_bundle
 from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, Imaging, bleaching_of
 from pans.runtime.instrument.profile import Profile, load_profile
-from pans.trainer.tasks.registry import Objects, Task, load_task
-from pans.trainer.tasks.remembered import remembered_task
+from pans.trainer.tasks.registry import Objects, Task, load_task, remembered_task
 
 from .accuracy import (
     AS_IT_IS,

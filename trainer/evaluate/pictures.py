@@ -1,10 +1,24 @@
 """Pictures of what a bundle does (`pans evaluate --pictures DIR`): confusion, a map of its clicks, patterns, reliability.
 
 Owns which pictures there are and what is on them; the measuring is accuracy.py's. All are SIMULATED, and say so.
+
+t-SNE maps of readouts in two dimensions, for pictures only (scikit-learn, extra `plot`).
+
+Distances on a map mean nothing beyond near and far. The same features and seed give the same map.
+
+The picture of `pans evaluate --dose-cap curve`: accuracy against the illumination that an object receives.
+
+Owns what is on it; the figures are dose.py's. SIMULATED, and says so.
+
+The picture of `pans evaluate --optics tolerance`: accuracy against each misalignment by itself.
+
+Owns what is on it; the figures are optics.py's. SIMULATED, and says so.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +35,24 @@ from pans.trainer.figures import new_figure, save_figure
 from pans.trainer.tasks.registry import Objects
 
 from .accuracy import Light
-from .tsne import tsne
 from .walks import Walks, calibration_bins, confusion_of, measured_walks
 
 MAPPED_OBJECTS = 600
 SHOWN_PICTURES = 8
 LEAST_SHARE = 1e-4  # of the decisions, for a point of the reliability diagram: exact expectations have bins of 1e-10
+OBJECTS_MAX = 2000  # the method is exact: several matrices of n x n
+PERPLEXITY = 30.0  # the default of van der Maaten and Hinton's code (2008)
+
+F64 = NDArray[np.float64]
+MARKERS = ("o", "s", "^", "D", "v", "P")
+Points = Sequence[Mapping[str, Any]]
+AXES = {
+    "shift_px": "shift to the right and down (pixels)",
+    "rotation_deg": "rotation (degrees)",
+    "psf_px": "blur, standard deviation (pixels)",
+    "black": "light of a dark pixel / full pixel",
+}
+Curves = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
 def write_pictures(
@@ -143,5 +169,86 @@ def _given_back(
         for axis in axes[:, column]:
             axis.set_axis_off()
     figure.suptitle(f"{bundle.name}: true above, given back below, K = {shots} (SIMULATED)", fontsize=9)
+    save_figure(figure, path, force=force)
+    return path
+
+
+def tsne(features: NDArray[np.floating], *, perplexity: float = PERPLEXITY, seed: int = 0) -> F64:
+    """Return positions, float64 (n, 2), of `features` (n, d); ValueError for too few or too many points.
+
+    The map starts from the principal components, so that it does not depend on where random points fall; a little noise on top
+    lets equal features part.
+    """
+    from sklearn.manifold import TSNE
+
+    n = len(features)
+    if features.ndim != 2 or not 3 * perplexity < n <= OBJECTS_MAX:
+        raise ValueError(
+            f"{n} points, allowed for a map at perplexity {perplexity:g}: {int(3 * perplexity) + 1} to {OBJECTS_MAX}"
+        )
+    centred = features.astype(np.float64) - features.mean(axis=0, dtype=np.float64)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    start = np.zeros((n, 2))
+    start[:, : len(axes)] = centred @ axes.T
+    start *= 1e-4 / max(float(start.std()), 1e-12)  # the size that scikit-learn gives its own starts
+    start += np.random.default_rng(seed).normal(0, 1e-5, start.shape)
+    placed = TSNE(perplexity=perplexity, init=start, method="exact", random_state=seed).fit_transform(centred)
+    return np.asarray(placed, np.float64)
+
+
+def draw_dose(folder: Path, curves: Mapping[str, Points], *, force: bool = False) -> Path:
+    """Write dose.png into `folder`, a curve by name of each bundle or sample, and return its path.
+
+    Left against illumination, right against the photons that come back. Bars are the error from trials and objects together.
+    """
+    make_folder(folder)
+    figure, axes = new_figure(width=10.0, height=4.0, panels=2)
+    for axis, key in zip(axes, ("illumination", "photons_mean")):
+        for marker, (name, points) in zip(MARKERS * len(curves), curves.items()):
+            axis.errorbar(
+                [point[key] for point in points],
+                [100 * (point["accuracy_mean"] or 0.0) for point in points],
+                yerr=[100 * _error(point) for point in points],
+                marker=marker,
+                markersize=4,
+                linewidth=1,
+                capsize=2,
+                label=name,
+            )
+        axis.set_ylim(0, 100)
+        axis.grid(alpha=0.3)
+    axes[0].set_xlabel("illumination of an object (photoelectrons, mean)")
+    axes[1].set_xlabel("photoelectrons detected (mean)")
+    axes[0].set_ylabel("accuracy (%), SIMULATED")
+    axes[0].legend(fontsize=8, loc="lower right")
+    path = folder / "dose.png"
+    save_figure(figure, path, force=force)
+    return path
+
+
+def _error(point: Mapping[str, Any]) -> float:
+    return math.hypot(point["accuracy_se_objects"] or 0.0, point["accuracy_se_trials"])
+
+
+def draw_optics(folder: Path, bundles: Mapping[str, Curves], *, force: bool = False) -> Path:
+    """Write optics.png into `folder`, the curves of every bundle by name, and return its path."""
+    make_folder(folder)
+    figure, axes = new_figure(width=11.0, height=3.2, panels=len(AXES))
+    for axis, (name, label) in zip(axes, AXES.items()):
+        for marker, (bundle, curves) in zip(MARKERS * len(bundles), bundles.items()):
+            points = curves[name]
+            axis.plot(
+                [point["value"] for point in points],
+                [100 * (point["accuracy_mean"] or 0.0) for point in points],
+                marker=marker,
+                markersize=4,
+                label=bundle,
+            )
+        axis.set_xlabel(label)
+        axis.set_ylim(0, 100)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("accuracy (%), SIMULATED")
+    axes[0].legend(fontsize=8, loc="lower left")
+    path = folder / "optics.png"
     save_figure(figure, path, force=force)
     return path

@@ -2,6 +2,10 @@
 
 Owns the figures of `pans evaluate` for automata; the sums over walks are runtime's `decide.expectation`. Clicks, photons, illumination and
 exposures are always reported together. SIMULATED figures: the click law of the profile, no instrument.
+
+Objects that bleach while an automaton walks: what each still gives depends on the patterns of its own walk.
+
+Owns the state of the samples during sampled walks; the law is `pans.runtime.imaging.bleaching`, the walks are walks.py's. SIMULATED.
 """
 
 from __future__ import annotations
@@ -20,13 +24,12 @@ from pans.runtime.decide.automaton import leaf_verdicts
 from pans.runtime.decide.expectation import ExpectedWalk, expected_walk, pattern_light
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses, afterpulses_of
-from pans.runtime.imaging import Bleaching, Imaging, met
+from pans.runtime.imaging import Bleaching, Imaging, mean_left, met
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
 
 from .accuracy import AS_IT_IS, ByClass, Conditions, among_classes, demand_sequence, exposure_of, outcome_law_of
-from .bleached import BLEACHED_AT_ONCE, BleachedObjects
 
 CALIBRATION_BINS = 15  # of equal width over the probability: as Guo et al., ICML 2017
 FIRST_OBJECTS = 200  # the paper's objects: judged beside all of them
@@ -35,6 +38,7 @@ _LEAF_NUMBERS = 1 << 22  # objects times leaves at once
 _LIGHT_NUMBERS = 1 << 22
 
 F64 = NDArray[np.float64]
+BLEACHED_AT_ONCE = 512  # objects, whose pixels stand in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,3 +409,33 @@ def walk_payload(walks: Walks) -> dict[str, Any]:
         del first["expected_calibration_error"]  # of so few objects it is mostly noise
     bins = [asdict(one) for one in calibration_bins(walks)]
     return {"exposures_longest": walks.automaton.n_slots, "calibration": bins, f"first_{FIRST_OBJECTS}": first}
+
+
+class BleachedObjects:
+    """Objects (n, pixels) of transmission `seen` under the states of an automaton; `patterns` times `scale` are the light."""
+
+    def __init__(
+        self, automaton: Automaton, patterns: NDArray[Any], seen: NDArray[Any], scale: float, law: Bleaching
+    ) -> None:
+        self.n = len(seen)
+        self._automaton, self._patterns, self._scale, self._law = automaton, patterns, scale, law
+        self._first = np.asarray(seen, np.float64)
+        self._left = self._first.copy()
+
+    def fresh(self) -> None:
+        """Begin with objects that no light has met."""
+        self._left[:] = self._first
+
+    def photoelectrons(self, rows: NDArray[np.int64], states: NDArray[np.int64]) -> F64:
+        """Show `states` (k,) to the objects `rows` (k,): return the photoelectrons expected (k,), and bleach what was lit."""
+        which, of_row = np.unique(states, return_inverse=True)
+        shown = self._automaton.pattern[which]
+        share = self._automaton.dwell[which] / self._automaton.dwell_steps
+        light = self._patterns[shown].astype(np.float64) * (self._scale * share)[:, None]
+        dose = self._law.doses(light)
+        acts, stays = light * mean_left(dose), np.exp(-dose)
+        left = self._left[rows]
+        found = np.einsum("kp,kp->k", left, acts[of_row])
+        left *= stays[of_row]
+        self._left[rows] = left
+        return np.asarray(found)

@@ -28,8 +28,7 @@ from pans.trainer.evaluate.accuracy import ByClass, Conditions, outcome_law_of
 from pans.trainer.evaluate.walks import FIRST_OBJECTS, MeasuredWalks, expected_figures, measured_walks, walks_of
 from pans.trainer.tasks.registry import Objects, Task
 
-from .tolerance import with_tolerance
-from .writer import origin, programs
+from .writer import origin, programs, with_tolerance
 
 COMPARED_OBJECTS = 100
 TOLERANCE = 1e-5  # of chances and of relative light: posteriors are stored in float32

@@ -4,25 +4,33 @@ A reading is a click or none, or a photon number; a word is one of each pattern.
 4096 words, of 12 patterns that click, all of them are summed over training objects, so that the information of the objects' mixture is
 exact; beyond, words are sampled from it and the last reading of each is summed over. Before samples that bleach, a pattern's readings are
 those that the patterns chosen before it leave.
+
+A bundle whose patterns are shown in another order: tables, heads and golden vectors go with them.
+
+Owns the permutation of every back end; which order is ordering.py's. The bundle is made anew, so that all its golden vectors are
+computed and its table is held against its head. It decides on the same readings of the same patterns as before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.bundle.model import Bundle
+from pans.runtime.bundle.layers import Int8Head, Layer, read_layers
+from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left, met
 from pans.runtime.instrument.click_law import click_probability, object_transmission
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import Profile
+from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of
+from pans.trainer.evaluate.dose import demand_fixed_patterns
 from pans.trainer.evaluate.information import mutual_information_bits
-from pans.trainer.evaluate.numbers import vector_chances
-from pans.trainer.evaluate.shown import demand_fixed_patterns
+from pans.trainer.evaluate.readings import vector_chances
 from pans.trainer.tasks.registry import Objects
 
 EXACT_WORDS_MAX = 1 << 12  # per object
@@ -179,3 +187,65 @@ def _entropy(rows: F64) -> F64:
     share = np.divide(rows, total, out=np.zeros_like(rows), where=total > 0)
     logs = np.log2(share, out=np.zeros_like(share), where=share > 0)
     return np.asarray(-(share * logs).sum(axis=-1))
+
+
+def reordered(bundle: Bundle, order: Sequence[int], facts: Mapping[str, Any]) -> Bundle:
+    """Return `bundle` with pattern `order[i]` as its pattern i, and `facts` beside its provenance.
+
+    ValueError for what is no order of its patterns, for a bundle without fixed patterns, and for a head that is no plain chain of layers.
+    """
+    places = [int(place) for place in order]
+    demand_fixed_patterns(bundle)
+    if sorted(places) != list(range(bundle.n_features)):
+        raise ValueError(f"{places[:20]} is no order of {bundle.n_features} patterns")
+    return make_bundle(
+        name=bundle.name,
+        task=bundle.task,
+        classes=bundle.classes,
+        image_shape=bundle.image_shape,
+        optics=Shown(bundle.levels, bundle.pattern_levels[places], bundle.photons_per_level),
+        provenance={**bundle.provenance, **facts},
+        back_end=_back_end(bundle, places),
+    )
+
+
+def order_facts(order: Order, bundle: Bundle) -> dict[str, Any]:
+    """Return what a bundle says of its order; pattern numbers are those of `bundle`, as it was before."""
+    told = bundle.provenance.get("order")
+    first = list(order.patterns)
+    if isinstance(told, Mapping) and isinstance(told.get("patterns"), Sequence):
+        first = [int(told["patterns"][place]) for place in order.patterns]  # of the bundle as it was trained
+    bits = [round(value, 5) for value in order.bits]
+    return {"order": {"by": order.by, "patterns": first, "bits": bits, "objects": order.objects, "exact": order.exact}}
+
+
+def _back_end(bundle: Bundle, places: list[int]) -> BackEnd:
+    outcomes = bundle.largest + 1
+    table = None if bundle.table is None else bundle.table[_old_rows(places, outcomes)]
+    if bundle.head_onnx is None:
+        return BackEnd(table=table, outcomes=outcomes)
+    layers = read_layers(bundle.head_onnx, bundle.n_features, bundle.n_classes)
+    if layers is None:
+        raise ValueError(
+            f"the head of {bundle.name} is no plain chain of layers (Gemm, Relu), which alone can be reordered"
+        )
+    first = Layer(np.ascontiguousarray(layers[0].weights[places]), layers[0].bias, layers[0].relu)
+    int8 = None if bundle.int8_head is None else _int8(bundle.int8_head, places)
+    quantised = None
+    if int8 is not None and bundle.int8_onnx is not None:
+        from .onnx_heads import int8_onnx  # and the package onnx, which nothing else here needs
+
+        quantised = int8_onnx(int8)
+    return BackEnd(chain_onnx((first, *layers[1:])), table, int8, quantised, outcomes)
+
+
+def _old_rows(places: list[int], outcomes: int) -> NDArray[np.int64]:
+    """The row of the old table for each of the new one: digit i was that of pattern places[i]."""
+    word = np.arange(outcomes ** len(places), dtype=np.int64)
+    return np.asarray(sum(word // outcomes**new % outcomes * outcomes**old for new, old in enumerate(places)), np.int64)
+
+
+def _int8(head: Int8Head, places: list[int]) -> Int8Head:
+    n_in, n_out = (int(size) for size in head.sizes[:2])
+    first = head.weights[: n_in * n_out].reshape(n_in, n_out)[places].ravel()
+    return Int8Head(head.sizes, np.concatenate([first, head.weights[n_in * n_out :]]), head.affine)

@@ -1,4 +1,8 @@
-"""From a trained model to a bundle, and the proof that the bundle decides as the model does.
+"""What a bundle tolerates of the optics: accuracy within the tolerance that it was trained through, and at its edge.
+
+Owns these facts of a bundle; the figures are evaluate/optics.py's. Exact expectations over the first held-out objects, SIMULATED.
+
+From a trained model to a bundle, and the proof that the bundle decides as the model does.
 
 Owns the bundle's facts and the comparison; never trains. `export` writes the file, reads it back and raises when a score or a
 decision of the file differs from the torch model.
@@ -8,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +27,23 @@ from pans.runtime.bundle.model import BackEnd, Bundle, Shown, load_bundle, make_
 from pans.runtime.bundle.optics import Analyser
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError, as_usage_error
+from pans.runtime.imaging import tolerance_of
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.outputs import whole_file
 from pans.trainer.device import CHOICE
+from pans.trainer.evaluate.held_out import Conditions, HeldOut
+from pans.trainer.evaluate.optics import OverOptics, drawn_tables, over_optics
 from pans.trainer.model.encoders import ActiveIllumination
 from pans.trainer.model.heads import Decoders, Heads
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.data import encoder_input, full_scale_photoelectrons
 from pans.trainer.train.loop import Trained
 
-from .int8_onnx import int8_onnx
-from .onnx_heads import DEAD_VARIANCE, head_onnx
-from .ordering import information_order
-from .reorder import order_facts, reordered
-from .tolerance import with_tolerance
+from .onnx_heads import DEAD_VARIANCE, head_onnx, int8_onnx
+from .ordering import information_order, order_facts, reordered
 
+JUDGED_OBJECTS = 2000
+DRAWN_TABLES = 16
 ALL_WORDS_MAX = 1 << 12  # a bundle holds a table up to here too
 RANDOM_WORDS = 10_000  # beyond it
 COMPARED_OBJECTS = 200
@@ -46,6 +52,40 @@ F64 = NDArray[np.float64]
 
 
 Ordering = Callable[[Bundle], tuple[list[int], Mapping[str, Any]]]  # patterns in order, and facts of it
+
+
+def with_tolerance(bundle: Bundle, task: Task, profile: Profile, optics: str | None, dark: float | None) -> Bundle:
+    """Return `bundle` with the fact `tolerates`, where it was trained through `optics`; else as it is.
+
+    `within` is over tables drawn uniformly, `edge` over the corners of shift and rotation at the widest blur and lightest black.
+    """
+    if optics is None or bundle.picture_shape is not None:
+        return bundle
+    tolerance = tolerance_of(optics)
+    held_out = HeldOut(task, task.test.first(JUDGED_OBJECTS), profile)
+    told = Conditions(dark=dark)
+    tables = {
+        "middle": [tolerance.middle],
+        "within": drawn_tables(tolerance, DRAWN_TABLES, 0),
+        "edge": tolerance.edges(),
+    }
+    found = {name: _rounded(over_optics(bundle, held_out, which, told)) for name, which in tables.items()}
+    fact = {"optics": optics, "words": tolerance.words(), "simulated": True, **found}
+    return replace(bundle, provenance={**bundle.provenance, "tolerates": fact})
+
+
+def _rounded(found: OverOptics) -> dict[str, Any]:
+    return {
+        "accuracy": round(found.accuracy_mean, 5),
+        "accuracy_std_optics": round(found.accuracy_std_optics, 5),
+        "accuracy_se_objects": round(found.accuracy_se_objects, 5),
+        "accuracy_worst": round(found.accuracy_worst, 5),
+        "clicks": round(found.clicks_mean, 4),
+        "photons": round(found.photons_mean, 4),
+        "illumination": round(found.illumination, 3),
+        "objects": found.objects,
+        "tables": found.tables,
+    }
 
 
 @dataclass(frozen=True, slots=True)

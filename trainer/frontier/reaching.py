@@ -15,7 +15,7 @@ from functools import partial
 from pans.trainer.baselines.bayes import bayes
 from pans.trainer.baselines.common import Decide, Measurement
 from pans.trainer.baselines.common import measure as measure_frames
-from pans.trainer.baselines.direct import aware_cnn
+from pans.trainer.baselines.networks import aware_cnn
 from pans.trainer.baselines.statistics import matched_decision, pairs_decision
 from pans.trainer.paper.equal import (
     EQUAL_LIGHT,

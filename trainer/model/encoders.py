@@ -9,6 +9,13 @@ in); never detects. Called with `(x, floor)` an encoder gives photoelectrons (n,
 
 The paper's passive W is unconstrained: it may create photons. With `conserving`, W's largest singular value (coherent) or its column
 sums (incoherent) are at most 1, so that the detectors together receive no more than the object gave.
+
+How concentrated the light of a pattern is: a penalty for sensors that must bear a table which is not perfect.
+
+Owns the measure and its gradient. Of a pattern P of n pixels it is log(n sum P**2 / (sum P)**2): the brightness that its light has on
+average, over the mean brightness of all pixels. A pattern that lights k pixels alike has log(n / k), a uniform one 0; how bright
+it is does not matter. Bright spots leave the object pixel that they were made for where the image is off, and light that leaks through dark
+pixels of the projector is a part of the brightest one's.
 """
 
 from __future__ import annotations
@@ -28,6 +35,7 @@ from .imaging import bleached_patterns
 
 AT_TOP = 1e-5  # relative distance at which a pixel is as bright as the top level: some steps of float32
 KAIMING_A = 1.2  # paper, appendix on the training procedure
+FAINT = 1e-12  # squared light of a pattern without any
 
 
 class ActiveIllumination(nn.Module):
@@ -204,3 +212,20 @@ def new_encoder(n_inputs: int, profile: Profile, options: Options, random: torch
     if options.encoder == "incoherent":
         return IncoherentIntensity(*shape, random, **passive)
     return CoherentField(*shape, random, complex_field=options.complex_field, **passive)
+
+
+def concentration(patterns: Tensor) -> Tensor:
+    """Return the mean over patterns (patterns, pixels), none below 0, of the logarithm of their concentration."""
+    return concentrations(patterns).mean()
+
+
+def concentrations(patterns: Tensor) -> Tensor:
+    """Return the logarithm of the concentration of every pattern, (patterns,)."""
+    squares, whole = patterns.square().sum(dim=1), patterns.sum(dim=1).square()
+    return torch.log(patterns.shape[1] * squares.clamp(min=FAINT) / whole.clamp(min=FAINT))
+
+
+def concentration_slope(patterns: Tensor) -> Tensor:
+    """Return the gradient of each pattern's logarithm of concentration, (patterns, pixels): 2 P / sum P**2 - 2 / sum P."""
+    squares, whole = patterns.square().sum(dim=1, keepdim=True), patterns.sum(dim=1, keepdim=True)
+    return 2 * patterns / squares.clamp(min=FAINT) - 2 / whole.clamp(min=FAINT**0.5)

@@ -34,7 +34,7 @@ from pans.runtime.outputs import replace_file
 from pans.trainer.baselines.bayes import bayes
 from pans.trainer.baselines.common import Decide, Measurement, run_trials
 from pans.trainer.baselines.common import measure as measure_frames
-from pans.trainer.baselines.direct import aware_cnn
+from pans.trainer.baselines.networks import aware_cnn
 from pans.trainer.model.field_basis import principal_fields
 from pans.trainer.options import EXACT_FEATURES_MAX, Options, plain_options
 from pans.trainer.tasks.registry import Task, load_task

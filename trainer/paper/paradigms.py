@@ -13,8 +13,7 @@ from functools import partial
 import numpy as np
 
 from pans.trainer.baselines.common import Decide, measure, run_trials, silent
-from pans.trainer.baselines.compressive import clean_mlp, patterns
-from pans.trainer.baselines.nets import EpochOfFit
+from pans.trainer.baselines.networks import EpochOfFit, clean_mlp, patterns
 from pans.trainer.baselines.options import METHODS, BaselineOptions
 from pans.trainer.baselines.rows import baseline_rows
 from pans.trainer.evaluate.accuracy import row_of

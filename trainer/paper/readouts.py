@@ -19,7 +19,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import Measurement, Trials, detect, measure
 from pans.trainer.evaluate.accuracy import EXACT_OUTCOMES_MAX, Light, decision_shares, light_of, row_of, sampled_shares
-from pans.trainer.evaluate.tsne import tsne
+from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 from . import images

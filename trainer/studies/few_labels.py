@@ -23,7 +23,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.choosing import CLEARLY, KINDS, Kind, Refitted, choose, fitted, kinds_for
 from pans.runtime.refit.evidence import Evidence, evidence_of
 from pans.trainer.baselines.common import measure
-from pans.trainer.baselines.compressive import patterns
+from pans.trainer.baselines.networks import patterns
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.paper.page import Asked, Made, Row, Rows, Table, columns, kept, pages
 from pans.trainer.paper.swept import shipped_bundle

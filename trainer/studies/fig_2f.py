@@ -18,7 +18,7 @@ from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.bayes import log_joint
 from pans.trainer.baselines.common import detect, measure
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.tsne import tsne
+from pans.trainer.evaluate.pictures import tsne
 from pans.trainer.paper.page import Asked, Made, Row, Rows, Table, columns, kept, pages
 from pans.trainer.paper.readouts import neighbours_agree
 from pans.trainer.paper.swept import shipped_bundle

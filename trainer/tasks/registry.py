@@ -6,12 +6,18 @@ trains and never shows an image. The public sets are in public_sets.py, the draw
 
 A user's file or folder without a test part is split by position: every fifth object is held out. Both parts are then mixed, so that
 any stretch of them holds all classes in their shares: folders are read class by class, and trainings keep the last objects back.
+
+The data set that a bundle was trained on, found again.
+
+Owns where it is looked for: by its name, where it was when the bundle was written (relative to the bundle), beside the bundle and in the
+working folder. What is there must be the same data, by SHA-256.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -291,3 +297,36 @@ def _checked(task: Task, where: Path) -> Task:
     if n_classes < 2 or labels.min() < 0 or labels.max() >= n_classes:
         raise UsageError(f"{where}: labels from {labels.min()} to {labels.max()} for {n_classes} classes")
     return task
+
+
+def path_from(bundle: Path, task: str) -> str:
+    """Return where the data set `task` is, relative to the folder of the bundle; "" for a name, or where there is no such path."""
+    if task in task_names():
+        return ""
+    try:
+        return Path(os.path.relpath(task, bundle.parent)).as_posix()
+    except ValueError:  # another drive
+        return ""
+
+
+def remembered_task(provenance: Mapping[str, Any], name: str, bundle: Path) -> str:
+    """Return the name or the path of what a bundle was trained on; UsageError says where it was looked for.
+
+    `provenance` is the bundle's, `name` its task, `bundle` its file.
+    """
+    told = str(provenance.get("task_argument", name))
+    if told in task_names():
+        return told
+    kept = str(provenance.get("data_path", ""))
+    places = [Path(told), bundle.parent / told] if told else []
+    places = ([bundle.parent / kept] if kept else []) + places
+    places += [place.with_name(f"{place.name}.npz") for place in places if not place.suffix]
+    for place in dict.fromkeys(Path(os.path.normpath(place)) for place in places):
+        if place.exists():
+            return str(place)
+    looked = ", ".join(dict.fromkeys(os.path.normpath(place) for place in places)) or "nothing: the bundle names none"
+    digest = str(provenance.get("data_sha256", ""))[:12]
+    raise UsageError(
+        f"the data set {told!r}{f' (SHA-256 {digest}…)' if digest else ''} of {bundle} was not found; looked for {looked}",
+        remedy="name it: --task FOLDER, FILE.npz or a name of `pans data list`",
+    )

@@ -18,9 +18,8 @@ from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import here
 from pans.trainer.model.imaging import DrawnOptics
 from pans.trainer.options import Options
-from pans.trainer.tasks.distort import with_copies
+from pans.trainer.tasks.changes import shifted, with_copies
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.tasks.shifts import shifted
 
 VALIDATION_PART = 12  # one in 12 training objects, the last ones, only chooses among restarts
 CHUNK = 2000  # objects per pass where no gradient is needed

@@ -13,9 +13,8 @@ import math
 import torch
 from torch import Tensor
 
-from pans.trainer.model.estimators import LossOf, cross_entropy
+from pans.trainer.model.estimators import Clicks, LossOf, Readings, cross_entropy
 from pans.trainer.model.heads import Heads, PictureHead
-from pans.trainer.model.readings import Clicks, Readings
 from pans.trainer.options import EXACT_WORDS_MAX
 
 SHOTS = (2, 3, 5, 8, 13, 21, 34, 55)  # numbers of shots that are fitted beside one, up to the largest wanted

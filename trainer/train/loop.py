@@ -1,4 +1,9 @@
-"""Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
+"""What changes in the course of a training: stages, learning rates_at, black_at, slope, clamp and loss.
+
+Owns every schedule, as functions of the options and of `now`, the epochs that have passed (with the part of the present one);
+never holds state and never trains.
+
+Training through the instrument: one flat loop from random patterns to whole projector levels and a finished head.
 
 Owns the schedule, the photon budget and the checkpoint; never writes a bundle (the package export) and never sees the held-out
 objects. `train` returns a `Trained` whose patterns are already what the projector will show.
@@ -30,19 +35,15 @@ from pans.runtime.instrument.click_law import click_law
 from pans.runtime.instrument.count_law import CountLaw, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
-from pans.trainer.model.afterpulses import trained_through, with_mean_memory
-from pans.trainer.model.concentration import concentration
-from pans.trainer.model.detection import Law, with_crosstalk
-from pans.trainer.model.encoders import ActiveIllumination, Encoder, new_encoder
-from pans.trainer.model.estimators import LossOf, cross_entropy, similarity_loss
+from pans.trainer.model.detection import Law, trained_through, with_crosstalk, with_mean_memory
+from pans.trainer.model.encoders import ActiveIllumination, Encoder, concentration, new_encoder
+from pans.trainer.model.estimators import LossOf, cross_entropy, decision_loss, readings_of, similarity_loss
 from pans.trainer.model.exposure import exposure_us_of
 from pans.trainer.model.field_basis import in_pixels
 from pans.trainer.model.heads import Heads, new_head
-from pans.trainer.model.readings import readings_of
-from pans.trainer.options import BUDGETS, EXACT_WORDS_MAX, Options, check_options
+from pans.trainer.options import BUDGETS, EXACT_WORDS_MAX, STRAIGHT_THROUGH, Options, check_options
 from pans.trainer.tasks.registry import Task
 
-from . import schedule
 from .checkpoint import read_checkpoint, write_checkpoint
 from .data import CHUNK, TrainingData
 from .head_fit import fit_head
@@ -56,6 +57,67 @@ FINE_LEVELS = (
 )  # of patterns through optics, from the start: dark pixels leak a part of the top level, which is then trained too
 FINAL_DRAWS = 1 << 40  # of optics: those of validation and of the head's fit come after those of all epochs
 HEAD_DRAWS = 4  # optics through which the head sees every object when it is fitted
+
+
+def second_stage(options: Options) -> int:
+    """Return the epoch at which stage_at 2 begins; the end when there is no stage_at 2."""
+    return options.epochs if options.estimator in STRAIGHT_THROUGH else round(options.warm * options.epochs)
+
+
+def whole_levels(options: Options) -> int:
+    """Return the epoch at which the patterns become whole levels."""
+    return round(0.75 * options.epochs)
+
+
+def estimator_at(options: Options, epoch: int) -> str:
+    """Return the name of the estimator_at of an epoch."""
+    first = options.estimator if options.estimator in STRAIGHT_THROUGH else "ste"
+    return first if epoch < second_stage(options) else options.estimator
+
+
+def stage_at(options: Options, epoch: int) -> str:
+    """Return the name of the stage_at of an epoch, for reports."""
+    return estimator_at(options, epoch) + (", levels" if epoch >= whole_levels(options) else "")
+
+
+def rates_at(options: Options, now: float) -> tuple[float, float]:
+    """Return learning rates_at of patterns and head: one cycle per estimator_at, the second one half as high in front."""
+    if options.constant:
+        return options.front_rate, options.head_rate
+    first, second = now < second_stage(options), second_stage(options)
+    start, end = (0, second) if first else (second, options.epochs)
+    at = (now - start) / (end - start)
+    rising, falling = math.pi * at / 0.25, math.pi * (at - 0.25) / 0.75
+    cycle = 0.5 - 0.5 * math.cos(rising) if at < 0.25 else 0.5 + 0.5 * math.cos(falling)
+    front = options.front_rate * (1.0 if first else 0.5)
+    return front * cycle + 1e-6, options.head_rate * cycle + 1e-6
+
+
+def black_at(options: Options, now: float, floor: float) -> float:
+    """Return the transmission of black_at: 0 in stage_at 1, then rising to the modulator's; patterns found at once are worse by points."""
+    start = 0.3 * options.epochs if options.estimator in STRAIGHT_THROUGH else second_stage(options)
+    return floor * min(1.0, max(0.0, (now - start) / (0.4 * options.epochs)))
+
+
+def slope_and_clamp(options: Options, now: float) -> tuple[float, float]:
+    """Return the factor on the light and the most photoelectrons that count; 1 and infinity once stage_at 1 is over."""
+    done = min(1.0, now / (0.3 * options.epochs))
+    if now >= second_stage(options) or done == 1.0:
+        return 1.0, math.inf
+    return options.slope ** (1 - done), options.clamp
+
+
+def loss_at(options: Options, now: float, picture_shape: tuple[int, int] | None) -> LossOf:
+    """Return the cross-entropy, which turns to wrong decisions in the last part of the epochs; of pictures error and similarity.
+
+    Similarity waits for stage_at 2, where there is one: it takes most of the time, and to start without it cost nothing measurable.
+    """
+    if picture_shape is not None:
+        waits = now < second_stage(options) < options.epochs
+        return similarity_loss(0.0 if waits else options.similarity, picture_shape)
+    part = options.polish * options.epochs
+    into = now - (options.epochs - part)
+    return decision_loss(min(1.0, into / (0.3 * part)) if part > 0 and into > 0 else 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +183,7 @@ def train(
                 run.restore(saved.pop("run"))
             elif start == options.starts and chosen is not None:
                 run.restore(chosen)
-            until = schedule.second_stage(options) if start < options.starts else options.epochs
+            until = second_stage(options) if start < options.starts else options.epochs
             while run.epoch < until:
                 report(run.one_epoch())
                 if checkpoint:
@@ -168,11 +230,11 @@ class Run:
     def one_epoch(self) -> EpochReport:
         """Pass once over the training objects, in random order."""
         options, data = self.options, self.data
-        if self.epoch == schedule.second_stage(options):
+        if self.epoch == second_stage(options):
             self.optimiser = self._new_optimiser()  # the moments of another estimator would mislead
-        if self.epoch == schedule.whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
+        if self.epoch == whole_levels(options) and isinstance(self.encoder, ActiveIllumination):
             self.encoder.start_quantising(self.profile.projector.levels)
-        readings, loss_of_clicks = self.readings, self.readings.estimator(schedule.estimator(options, self.epoch))
+        readings, loss_of_clicks = self.readings, self.readings.estimator(estimator_at(options, self.epoch))
         law, traps = self.law(), self.afterpulses()
         order = torch.randperm(data.n_fit, generator=self.random)
         batches = [part for part in order.split(options.batch) if len(part) > 1]
@@ -183,16 +245,16 @@ class Run:
             now = self.epoch + i / len(batches)
             light = self.encoder(shown[batch], self._black(now) if data.optics is None else lifted)
             photons = light.sum(dim=1).mean()
-            slope, clamp = schedule.slope_and_clamp(options, now)
+            slope, clamp = slope_and_clamp(options, now)
             p = self._linked(readings.chances(light.clamp(max=clamp), law, slope), traps)
-            loss_of = schedule.loss_at(options, now, data.picture_shape)
+            loss_of = loss_at(options, now, data.picture_shape)
             loss = loss_of_clicks(p, data.target[batch], self.head, loss_of, self.random)
-            if options.mix > 0 and self.epoch >= schedule.second_stage(options):
+            if options.mix > 0 and self.epoch >= second_stage(options):
                 loss = (1 - options.mix) * loss + options.mix * self._several_shots(p, data.target[batch], loss_of)
             clicks = readings.mean(p).sum(dim=1).mean() * (readings.outcomes - 1)
             illumination = self.encoder.illumination()
             total = loss + self._penalty(clicks, photons, illumination)
-            for group, rate in zip(self.optimiser.param_groups, schedule.rates(options, now)):
+            for group, rate in zip(self.optimiser.param_groups, rates_at(options, now)):
                 group["lr"] = rate
             self.optimiser.zero_grad()
             total.backward()
@@ -200,12 +262,12 @@ class Run:
             if isinstance(self.encoder, ActiveIllumination):
                 self.encoder.dim_to_top()
             sums += torch.stack([loss, clicks, photons, illumination]).detach().double()
-        stage = schedule.stage(options, self.epoch)
+        stage = stage_at(options, self.epoch)
         self.epoch += 1
         return EpochReport(self.restart, self.epoch, stage, *(sums / len(batches)).tolist())
 
     def _black(self, now: float) -> float:
-        return schedule.black(self.options, now, self.data.floor)
+        return black_at(self.options, now, self.data.floor)
 
     def _several_shots(self, p: Tensor, target: Tensor, loss_of: LossOf) -> Tensor:
         """The loss of mean clicks of 2 to `shots` shots, straight-through: the more shots, the smaller its bias."""
@@ -276,7 +338,7 @@ class Run:
         """
         p = self.probabilities(self.data.n_fit, len(self.data.labels))
         target = self.data.target[self.data.n_fit :]
-        loss_of = schedule.loss_at(self.options, self.epoch, self.data.picture_shape)
+        loss_of = loss_at(self.options, self.epoch, self.data.picture_shape)
         random = new_generator(self.options.seed)
         self.head.eval()
         with torch.no_grad():

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from pans.runtime.errors import DamagedFileError, UsageError
 from pans.runtime.outputs import replace_file
 from pans.trainer.device import here, product_dtype
-from pans.trainer.tasks.distort import SIDE_MIN_PX, distorted
+from pans.trainer.tasks.changes import SIDE_MIN_PX, distorted
 from pans.trainer.tasks.registry import Objects
 
 F32 = NDArray[np.float32]

@@ -16,8 +16,7 @@ from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw, click_probability
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.grow import GrowOptions, Growth
-from pans.trainer.adaptive.light import Bits, as_bits
-from pans.trainer.adaptive.machine import Aim, Level, Machine, Sight, backward, forward
+from pans.trainer.adaptive.machine import Aim, Bits, Level, Machine, Sight, as_bits, backward, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
 from pans.trainer.adaptive.options import (
     AutomatonOptions,

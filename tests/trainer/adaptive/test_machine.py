@@ -11,11 +11,10 @@ from naive_adaptive import every_word
 from trainings import random_machine
 
 from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click
-from pans.trainer.adaptive.figures import figures
-from pans.trainer.adaptive.light import Bits, as_bits
-from pans.trainer.adaptive.machine import WRONG, Aim, Sight, backward, brought, forward
+from pans.trainer.adaptive.machine import WRONG, Aim, Bits, Sight, as_bits, backward, brought, forward
 from pans.trainer.adaptive.objects import Block
 from pans.trainer.adaptive.outcomes import no_click
+from pans.trainer.adaptive.tune import figures
 from pans.trainer.processor import settle
 
 NOISY = ClickLaw(dark_per_exposure=0.02, read_noise_e=0.3, threshold_e=0.5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from naive_adaptive import merged as oracle
 
-from pans.trainer.adaptive.merge import merged
+from pans.trainer.adaptive.grow import merged
 
 
 @pytest.mark.uncompiled

@@ -17,15 +17,15 @@ from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.count_law import CountLaw, count_chances, count_slopes
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive import reroute as module
-from pans.trainer.adaptive.figures import figures
+from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth
 from pans.trainer.adaptive.machine import Aim, Sight, backward, brought, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
 from pans.trainer.adaptive.options import AutomatonOptions, check_automaton_options
 from pans.trainer.adaptive.outcomes import readings
-from pans.trainer.adaptive.reroute import reroute
+from pans.trainer.adaptive.sweeps import reroute
 from pans.trainer.adaptive.train import train_automaton
+from pans.trainer.adaptive.tune import figures
 from pans.trainer.export.automaton import export_automaton
 
 LAWS = [CountLaw(0.0, 0.0, (0.5, 1.5)), CountLaw(0.02, 0.3, (0.5, 1.5)), CountLaw(0.01, 0.0, (0.5, 1.5, 2.5))]

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the train extra")
 
-from pans.trainer.adaptive.posteriors import calibrated, calibration_error, log_loss, smoothed
+from pans.trainer.adaptive.finish import calibrated, calibration_error, log_loss, smoothed
 
 
 def test_smoothing_is_that_of_pseudo_objects():

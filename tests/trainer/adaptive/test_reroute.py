@@ -9,12 +9,12 @@ from trainings import bars_task
 
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive import reroute as module
-from pans.trainer.adaptive.figures import figures
+from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth
 from pans.trainer.adaptive.machine import Sight, forward
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
-from pans.trainer.adaptive.reroute import reroute
+from pans.trainer.adaptive.sweeps import reroute
+from pans.trainer.adaptive.tune import figures
 
 PRICE = 0.02
 

@@ -12,13 +12,12 @@ from trainings import bars_task, random_machine
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.count_law import CountLaw
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.adaptive import share as module
-from pans.trainer.adaptive.figures import figures, masses, mean_objects
+from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth
-from pans.trainer.adaptive.light import Bits, as_bits
-from pans.trainer.adaptive.machine import Sight, brought, forward, leaf_losses
+from pans.trainer.adaptive.machine import Bits, Sight, as_bits, brought, forward, leaf_losses
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
-from pans.trainer.adaptive.share import choose_patterns, k_means, one_bit, share_patterns
+from pans.trainer.adaptive.sweeps import choose_patterns, k_means, one_bit, share_patterns
+from pans.trainer.adaptive.tune import figures, masses, mean_objects
 
 PRICE = 0.02
 
@@ -146,7 +145,7 @@ def test_states_choose_the_patterns_that_cost_least(shared, monkeypatch):
         least = min(of(row * 10**power) for row in seen for power in torch.linspace(-3, 2, 100).tolist())
         now = of(seen[level.light.rows[state]] * level.light.scale()[state])
         dearest = float((alpha * torch.maximum(quiet, click)).sum())
-        assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE * float(alpha.sum())
+        assert now <= least + 0.1 * max(0.0, dearest - least) + 5 * module.SURE_OF_PATTERN * float(alpha.sum())
 
 
 def test_states_of_three_outcomes_choose_too(shared):

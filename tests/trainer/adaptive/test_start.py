@@ -15,8 +15,8 @@ from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import train as module
+from pans.trainer.adaptive.machine import machine_of
 from pans.trainer.adaptive.options import AutomatonOptions, started_from
-from pans.trainer.adaptive.state import machine_of
 from pans.trainer.adaptive.train import train_automaton
 from pans.trainer.evaluate.accuracy import outcome_law_of
 from pans.trainer.export.automaton import bundle_of

@@ -16,7 +16,7 @@ from trainings import bars_task
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.errors import PansError, PlanError, UsageError
 from pans.runtime.instrument.profile import load_profile, parse_profile
-from pans.trainer.adaptive.finished import Grid, to_grid
+from pans.trainer.adaptive.finish import Grid, to_grid
 from pans.trainer.adaptive.objects import Augmentation, TrainingObjects
 from pans.trainer.adaptive.options import (
     AutomatonOptions,

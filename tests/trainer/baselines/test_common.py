@@ -20,9 +20,8 @@ from pans.trainer.baselines import common as baselines
 from pans.trainer.baselines import rows as baseline_rows
 from pans.trainer.baselines.bayes import FLOORS, bayes, choose_floor, log_joint
 from pans.trainer.baselines.common import Trials, detect, measure, run_trials
-from pans.trainer.baselines.compressive import aware_mlp, clean_mlp, patterns, walsh
-from pans.trainer.baselines.direct import aware_cnn, clean_cnn
-from pans.trainer.baselines.e2e import measured_by, quantised, train_conventionally
+from pans.trainer.baselines.end_to_end import patterns_measured, quantised, train_conventionally
+from pans.trainer.baselines.networks import aware_cnn, aware_mlp, clean_cnn, clean_mlp, patterns, walsh
 from pans.trainer.tasks.registry import Objects, Task, load_task
 
 SIDE = 8
@@ -313,7 +312,7 @@ def test_the_quantiser_has_its_levels_and_passes_the_gradient() -> None:
 @pytest.mark.parametrize("bits", [4, None])
 def test_conventional_end_to_end_works_in_bright_light_only(task: Task, bits: int | None) -> None:
     model = train_conventionally(task, 6, seed=0, bits=bits, epochs=40)
-    measurement, at = measured_by(model, task, "source")
+    measurement, at = patterns_measured(model, task, "source")
     assert (measurement.full > 0).all()
     accuracy = {}
     for photons in (3.0, 1e6):

@@ -11,7 +11,14 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.baselines.common import measure, run_trials
-from pans.trainer.baselines.fsi import START_LIGHT, FsiOptions, measured_by, noisy, principal_masks, train_masks
+from pans.trainer.baselines.end_to_end import (
+    START_LIGHT,
+    FsiOptions,
+    masks_measured,
+    noisy,
+    principal_masks,
+    train_masks,
+)
 from pans.trainer.tasks.registry import Objects, Task
 
 
@@ -67,7 +74,7 @@ def test_masks_hold_the_photon_budget_and_reach_what_counts_allow() -> None:
     """Best is one mask per pixel: right if the bright pixel (2.4) counts more than the dim one (0.6), half right on a tie."""
     task = pixels_task()
     model = train_masks(task, FsiOptions(2, 3.0, seed=0, epochs=6, start="random"))
-    measurement, decide = measured_by(model, task, "source")
+    measurement, decide = masks_measured(model, task, "source")
     with torch.no_grad():
         masks = model.masks().numpy()
     assert (masks @ np.array([0.5, 0.5])).sum() == pytest.approx(3.0, rel=1e-4)  # the mean object is 0.5 everywhere

@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.trainer.baselines.common import measure, run_trials
-from pans.trainer.baselines.hadamard import FIELDS, PAIRS_MAX, hadamard_12, pair_net, pairs
+from pans.trainer.baselines.networks import FIELDS, PAIRS_MAX, hadamard_12, pair_net, pairs
 from pans.trainer.tasks.registry import Objects, Task
 
 

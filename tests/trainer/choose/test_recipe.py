@@ -7,8 +7,8 @@ import pytest
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.choose.recipe import BATCH, OBJECTS, choose_encoder, choose_training, warnings_of
+from pans.trainer.tasks.changes import Variation
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.tasks.variation import Variation
 
 IDEAL = load_profile("ideal")
 TURNED = Variation(turn_deg=180)

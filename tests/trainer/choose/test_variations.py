@@ -8,9 +8,9 @@ pytest.importorskip("PIL", reason="needs the train extra")
 
 from trainings import practice_folder
 
-from pans.trainer.choose.variations import choose_variation
+from pans.trainer.choose.recipe import choose_variation
+from pans.trainer.tasks.changes import Variation
 from pans.trainer.tasks.registry import Objects, Task, load_task
-from pans.trainer.tasks.variation import Variation
 
 
 def test_letters_are_not_mirrored_nor_turned_over(tmp_path):

@@ -17,7 +17,7 @@ from pans.runtime.cli import main
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.choose import recipe
 from pans.trainer.commands import train_own
-from pans.trainer.commands.course import curve
+from pans.trainer.commands.arguments import curve
 
 QUICK = ["--exposures", "4", "--states", "8", "--epochs", "1"]
 

@@ -17,10 +17,18 @@ from pans.runtime.instrument.click_law import object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.dose import Knowledge, caps_of, dose_curve, figures_of, within_cap
-from pans.trainer.evaluate.dose_picture import draw_dose
+from pans.trainer.evaluate.dose import (
+    Knowledge,
+    caps_of,
+    dose_curve,
+    figures_of,
+    of_first,
+    patterns_within,
+    training_readings,
+    within_cap,
+)
 from pans.trainer.evaluate.held_out import Conditions, HeldOut
-from pans.trainer.evaluate.shown import of_first, patterns_within, training_readings
+from pans.trainer.evaluate.pictures import draw_dose
 from pans.trainer.evaluate.walks import walks_of
 from pans.trainer.tasks.registry import Objects, Task
 

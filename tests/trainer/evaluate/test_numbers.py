@@ -13,7 +13,7 @@ from pans.runtime.decide import make_decider
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of, sampled_shares
 from pans.trainer.evaluate.held_out import trials_needed
-from pans.trainer.evaluate.numbers import Numbers
+from pans.trainer.evaluate.readings import Numbers
 
 PROFILE = load_profile("dmd-qcmos")
 D_F, OUTCOMES, PIXELS = 2, 3, 16

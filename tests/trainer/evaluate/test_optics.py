@@ -13,7 +13,7 @@ from pans.runtime.bundle.model import Bundle, load_bundle
 from pans.runtime.errors import UsageError
 from pans.runtime.imaging import IDENTITY, Imaging, imaging_of, tolerance_of
 from pans.runtime.instrument.profile import Optics, load_profile
-from pans.trainer.commands.evaluate_optics import curve_words, several_tables
+from pans.trainer.commands.evaluate import optics_curve_words, several_tables
 from pans.trainer.evaluate.accuracy import light_of
 from pans.trainer.evaluate.held_out import Conditions, HeldOut, held_out_of, imaging_on
 from pans.trainer.evaluate.optics import CURVES, drawn_tables, figures_under, misalignment_curves, over_optics
@@ -83,7 +83,7 @@ def test_curves_start_from_the_table_that_they_are_about() -> None:
         assert points[0]["accuracy_mean"] == there
     shifted = figures_under(bundle, HELD_OUT, Imaging(0.0, 2.0), Conditions()).accuracy_mean
     assert curves["shift_px"][4]["accuracy_mean"] == shifted
-    assert "shift_px" in curve_words("toy", 30, TABLE, curves)
+    assert "shift_px" in optics_curve_words("toy", 30, TABLE, curves)
 
 
 def test_without_optics_a_table_is_as_the_profile_states() -> None:

@@ -15,7 +15,7 @@ pytest.importorskip("sklearn")
 from trainings import short_fits  # noqa: F401  a fixture
 
 from pans.runtime.cli import main
-from pans.trainer.evaluate.tsne import tsne
+from pans.trainer.evaluate.pictures import tsne
 
 RNG = np.random.default_rng(4)
 

@@ -10,7 +10,7 @@ from pans.runtime.bundle.layers import int8_reference, quantise_head, reference_
 from pans.runtime.decide.backends import make_decider
 
 pytest.importorskip("onnx")
-from pans.trainer.export.int8_onnx import int8_onnx
+from pans.trainer.export.onnx_heads import int8_onnx
 
 
 def test_the_model_gives_the_scores_of_the_integers() -> None:

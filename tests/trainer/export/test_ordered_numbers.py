@@ -18,11 +18,9 @@ from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.evaluate.dose import dose_curve
+from pans.trainer.evaluate.dose import dose_curve, of_first, training_readings
 from pans.trainer.evaluate.held_out import Conditions, HeldOut
-from pans.trainer.evaluate.shown import of_first, training_readings
-from pans.trainer.export.ordering import _Samples, information_order
-from pans.trainer.export.reorder import reordered
+from pans.trainer.export.ordering import _Samples, information_order, reordered
 from pans.trainer.tasks.registry import Objects, Task
 
 PROFILE = load_profile("dmd-qcmos")

@@ -18,8 +18,7 @@ from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.evaluate.accuracy import light_of
-from pans.trainer.export.ordering import _Samples, information_order
-from pans.trainer.export.reorder import reordered
+from pans.trainer.export.ordering import _Samples, information_order, reordered
 from pans.trainer.tasks.registry import Objects
 
 IDEAL = load_profile("ideal")

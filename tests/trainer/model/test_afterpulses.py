@@ -23,8 +23,8 @@ from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.machine import Sight, forward
 from pans.trainer.evaluate.accuracy import evaluate_exactly, evaluate_sampled, light_of
-from pans.trainer.evaluate.chain import Chain
-from pans.trainer.model.afterpulses import trained_through, with_mean_memory
+from pans.trainer.evaluate.readings import Chain
+from pans.trainer.model.detection import trained_through, with_mean_memory
 
 LAW = Afterpulses(0.15, 2.0, 0.1)
 

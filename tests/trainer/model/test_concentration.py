@@ -13,7 +13,7 @@ from trainings import random_machine
 from pans.runtime.instrument.click_law import ClickLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive.machine import Aim, Sight, backward, forward
-from pans.trainer.model.concentration import concentration, concentration_slope, concentrations
+from pans.trainer.model.encoders import concentration, concentration_slope, concentrations
 from pans.trainer.options import Options
 from pans.trainer.tasks.registry import load_task
 from pans.trainer.train.loop import train

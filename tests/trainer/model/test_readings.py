@@ -12,9 +12,8 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.count_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import load_profile
-from pans.trainer.model.estimators import cross_entropy
+from pans.trainer.model.estimators import Numbers, cross_entropy, readings_of
 from pans.trainer.model.heads import MlpHead
-from pans.trainer.model.readings import Numbers, readings_of
 from pans.trainer.options import Options, check_options
 
 LAW = CountLaw(0.02, 0.3, (0.7, 1.5))

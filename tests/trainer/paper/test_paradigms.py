@@ -15,7 +15,7 @@ pytest.importorskip("matplotlib", reason="needs the plot extra")
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.baselines.common import measure
-from pans.trainer.baselines.compressive import clean_mlp, patterns
+from pans.trainer.baselines.networks import clean_mlp, patterns
 from pans.trainer.baselines.options import BaselineOptions
 from pans.trainer.commands import baseline as cmd_baseline
 from pans.trainer.options import Options, check_options

@@ -9,7 +9,7 @@ pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.options import Options
-from pans.trainer.tasks.distort import distorted, with_copies
+from pans.trainer.tasks.changes import distorted, with_copies
 from pans.trainer.tasks.registry import Objects, Task
 from pans.trainer.train.data import TrainingData
 

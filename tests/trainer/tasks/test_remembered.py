@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pans.runtime.errors import UsageError
-from pans.trainer.tasks.remembered import path_from, remembered_task
+from pans.trainer.tasks.registry import path_from, remembered_task
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("torch")
 
+from pans.trainer.tasks.changes import shifted
 from pans.trainer.tasks.registry import Objects
-from pans.trainer.tasks.shifts import shifted
 
 
 def objects(n: int) -> Objects:

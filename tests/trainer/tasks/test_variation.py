@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pans.trainer.tasks.changes import Variation, enlarged, varied
 from pans.trainer.tasks.registry import Objects, Task
-from pans.trainer.tasks.variation import Variation, enlarged, varied
 
 HEIGHT, WIDTH = 24, 40
 

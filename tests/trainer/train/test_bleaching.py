@@ -17,8 +17,8 @@ from pans.runtime.errors import UsageError
 from pans.runtime.imaging import Bleaching
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import light_of
+from pans.trainer.evaluate.dose import training_readings
 from pans.trainer.evaluate.held_out import Conditions, HeldOut, as_trained, measure, trained_bleaching
-from pans.trainer.evaluate.shown import training_readings
 from pans.trainer.export.writer import export_trained
 from pans.trainer.model.encoders import ActiveIllumination, new_encoder
 from pans.trainer.options import Options, check_options, check_order

@@ -23,7 +23,7 @@ from pans.trainer.model.estimators import cross_entropy, decision_loss, similari
 from pans.trainer.model.heads import MlpHead
 from pans.trainer.options import Options, check_options
 from pans.trainer.tasks.registry import load_task
-from pans.trainer.train import schedule
+from pans.trainer.train import loop as schedule
 from pans.trainer.train.checkpoint import read_checkpoint
 from pans.trainer.train.data import TrainingData, encoder_input
 from pans.trainer.train.head_fit import fit_head_exactly, joint_distribution

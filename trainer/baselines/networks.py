@@ -1,0 +1,445 @@
+"""Networks of the baselines and their one training loop.
+
+Owns the AlexNet-style frame classifier of the paper's appendix on direct imaging, the two-layer head for measured features,
+and `fit`; never deals out light and never scores. `fit` trains in place; `decider` returns a function from readouts to labels.
+
+Everything random comes from `seed`; the global generator of torch is left as it was.
+
+Direct imaging: a frame of the object under uniform light, one readout per pixel.
+
+Owns the networks that decide from a frame; the light, the detector and the score are those of common.py. Each way is a
+function from a photon level to a decision `readouts -> labels`. SIMULATED, ideal shot noise unless dark counts are asked for.
+
+- `bayes` (bayes.py): the exact Poisson likelihood, averaged over all training objects. Knows the noise;
+  the strong one at few photons.
+- `cnn`: an AlexNet-style network trained on noisy frames of the very photon level. Knows the noise; strong at many photons.
+- `clean-cnn`: the same network trained on noiseless frames (the paper's baseline, which cannot know what noise looks like).
+
+Compressive sensing: fixed patterns that know nothing of the task, and a classifier on the measured features.
+
+Owns the pattern families and the feature classifiers; light, detector and score are those of common.py. Without
+reconstruction: the classifier sees the d_f readouts (paper, appendix on fixed optical transformations). SIMULATED.
+
+- `mlp`: the paper's back end trained on noisy readouts of the very photon level.
+- `clean-mlp`: the same trained on noiseless features and shown noisy ones (the paper's baseline).
+- `bayes` (bayes.py): the exact posterior over the training objects.
+
+Single-pixel classification by Hadamard patterns: pairs of binary patterns, counts, and a network on their differences.
+
+Owns the patterns and the network's view of the counts; light, detector and score are those of common.py. SIMULATED, ideal shot noise.
+
+After Kanwal et al., arXiv 2603.12036: a microLED projector shows Hadamard patterns of 12 x 12 fields, one detector sums the light, and a
+small network classifies the series of readings without a picture in between. Taken from there: 12 x 12 fields, at most 144 patterns, no
+reconstruction. Assumed here, as only the abstract and summaries were at hand: every pattern is followed by its inverse (330 000 patterns/s
+for 1200 digits/s leave 275 per digit, about two for each of 144), the network sees the differences (method `differences`), patterns are
+taken from the coarsest on, H12 is Paley's, and the network is that of every other baseline, trained on noisy counts of each photon level.
+With `counts` it sees all 2 x pairs counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+import pans.trainer.device  # noqa: F401  # before a convolution: it sets what torch needs on this processor
+
+from .common import F32, I64, Decide, Measurement, Report, named, silent
+
+CHUNK = 1000  # readouts per pass where no gradient is needed
+FRAME_SIDE = 28  # pixels; larger frames are reduced to about this by the first layer's stride
+RATE = 2e-3
+CONV_KERNEL, CONV_CHANNELS = 15, ((1, 32), (32, 64))  # of the convolutional back end: before and after each layer
+
+Inputs = Callable[[Tensor, torch.Generator], Tensor]  # (which objects, random numbers) -> what the network sees
+FRAME_EPOCHS = 5
+FAMILIES = ("binary", "hadamard", "gaussian", "binning")
+EPOCHS = 10
+
+F64 = NDArray[np.float64]
+FIELDS = 12  # along each side
+PAIRS_MAX = FIELDS**2
+
+
+class FrameNet(nn.Module):
+    """Five convolutions and two dense layers (AlexNet's plan, sized for small grey frames): (n, height * width) -> scores.
+
+    `normalise` "frame" gives every frame mean 0 and variance 1, so that its exposure does not matter; "given" divides by
+    `spread` alone, which keeps what the number of photons tells.
+    """
+
+    def __init__(self, shape: tuple[int, int], n_classes: int, spread: float | None = None) -> None:
+        super().__init__()
+        self.shape, self.spread = shape, spread
+        stride = max(1, round(max(shape) / FRAME_SIDE))
+        self.features = nn.Sequential(
+            *_convolution(1, 16, 2 * stride + 3, stride),
+            nn.MaxPool2d(2, ceil_mode=True),
+            *_convolution(16, 32, 3),
+            nn.MaxPool2d(2, ceil_mode=True),
+            *_convolution(32, 48, 3),
+            *_convolution(48, 48, 3),
+            *_convolution(48, 32, 3),
+            nn.AdaptiveAvgPool2d(4),
+            nn.Flatten(),
+        )
+        self.classifier = nn.Sequential(nn.Dropout(0.25), nn.Linear(512, 128), nn.ReLU(), nn.Linear(128, n_classes))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Return scores (n, classes) of frames (n, height * width)."""
+        if self.spread is None:
+            mean = frames.mean(dim=1, keepdim=True)
+            deviation = frames.std(dim=1, keepdim=True, unbiased=False)
+            frames = (frames - mean) / deviation.clamp(min=1e-3)  # a frame without photons stays 0
+        else:
+            frames = frames / self.spread
+        scores: Tensor = self.classifier(self.features(frames.reshape(-1, 1, *self.shape)))
+        return scores
+
+
+def _convolution(before: int, after: int, kernel: int, stride: int = 1) -> tuple[nn.Module, ...]:
+    layer = nn.Conv2d(before, after, kernel, stride, kernel // 2, bias=False)
+    return layer, nn.BatchNorm2d(after), nn.ReLU()
+
+
+@dataclass(frozen=True, slots=True)
+class EpochOfFit:
+    """Means over the objects of one epoch, while the network learnt from them."""
+
+    loss: float
+    accuracy: float
+
+
+Watch = Callable[[EpochOfFit, Decide], None]
+
+
+def feature_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
+    """Return the paper's digital back end behind continuous features: batch normalisation, one hidden layer, scores."""
+    hidden = nn.Linear(n_features, n_hidden)
+    return nn.Sequential(nn.BatchNorm1d(n_features), hidden, nn.ReLU(), nn.Linear(n_hidden, n_classes))
+
+
+def feature_conv_net(n_features: int, n_classes: int, n_hidden: int = 512) -> nn.Module:
+    """Return the back end with two convolutions along the features before its hidden layer, kernel 15 as in the paper's comparison."""
+    length = -(-n_features // 4)  # each convolution rounds half the length up
+    convolutions = (nn.Conv1d(a, b, CONV_KERNEL, stride=2, padding=CONV_KERNEL // 2) for a, b in CONV_CHANNELS)
+    hidden = nn.Linear(CONV_CHANNELS[-1][1] * length, n_hidden)
+    layers = [layer for convolution in convolutions for layer in (convolution, nn.ReLU())]
+    first = (nn.BatchNorm1d(n_features), nn.Unflatten(1, (1, n_features)))
+    return nn.Sequential(*first, *layers, nn.Flatten(), hidden, nn.ReLU(), nn.Linear(n_hidden, n_classes))
+
+
+def seeded(make: Callable[[], nn.Module], seed: int) -> nn.Module:
+    """Return `make()` with its initial values drawn from `seed`."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+def fit(
+    net: nn.Module,
+    inputs: Inputs,
+    labels: Tensor,
+    *,
+    epochs: int,
+    seed: int,
+    batch: int = 256,
+    rates: dict[str, float] | None = None,
+    report: Report = silent,
+    watch: Callable[[EpochOfFit], None] = lambda _: None,
+) -> None:
+    """Train `net` on fresh `inputs` of every batch by cross-entropy, Adam and one cycle of the learning rate.
+
+    `rates` gives parameters whose name begins with a key a peak rate of their own; the others have `RATE`. `watch` is called after
+    every epoch, with `net` as for use.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    of_rate = _by_rate(net, rates or {})
+    peaks = list(of_rate)
+    optimiser = torch.optim.Adam([{"params": parameters} for parameters in of_rate.values()])
+    n_batches = max(1, len(labels) // batch)
+    step, steps = 0, epochs * n_batches
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)  # dropout
+        for _ in range(epochs):
+            net.train()
+            sums = torch.zeros(2)  # of the loss and of right decisions
+            order = torch.randperm(len(labels), generator=generator)
+            for which in order.tensor_split(n_batches):
+                for group, peak in zip(optimiser.param_groups, peaks):
+                    group["lr"] = peak * _one_cycle(step / steps)
+                scores = net(inputs(which, generator))
+                loss = nn.functional.cross_entropy(scores, labels[which])
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                right = (scores.argmax(dim=1) == labels[which]).sum()
+                sums += torch.stack([loss.detach() * len(which), right])
+                step += 1
+                if step % 20 == 0 or step == steps:
+                    report(f"loss {float(loss.detach()):.3f}", step / steps)
+            net.eval()
+            watch(EpochOfFit(*(sums / len(labels)).tolist()))
+
+
+def _by_rate(net: nn.Module, rates: dict[str, float]) -> dict[float, list[nn.Parameter]]:
+    of_rate: dict[float, list[nn.Parameter]] = {}
+    for name, parameter in net.named_parameters():
+        own = [rate for start, rate in rates.items() if name.startswith(start)]
+        of_rate.setdefault(own[0] if own else RATE, []).append(parameter)
+    return of_rate
+
+
+def _one_cycle(progress: float) -> float:
+    rising = progress < 0.2
+    at = progress / 0.2 if rising else (progress - 0.2) / 0.8
+    return 0.5 - 0.5 * math.cos(math.pi * at) if rising else 0.5 + 0.5 * math.cos(math.pi * at)
+
+
+def poisson(photoelectrons: Tensor, detector: str, generator: torch.Generator, dark: float = 0.0) -> Tensor:
+    """Return readouts as `common.detect` does, from torch's generator."""
+    counts = torch.poisson(photoelectrons + dark, generator=generator)
+    return (counts > 0).to(counts.dtype) if detector == "binary" else counts
+
+
+def shown(measurement: Measurement, photons: float, detector: str | None = None, dark: float = 0.0) -> Inputs:
+    """Return what a network sees of training objects: fresh readouts of `detector` every time, or without one their expectation."""
+
+    def inputs(which: Tensor, generator: torch.Generator) -> Tensor:
+        light = torch.from_numpy(measurement.photoelectrons(measurement.train[which.numpy()], photons))
+        return light if detector is None else poisson(light, detector, generator, dark)
+
+    return inputs
+
+
+def fitted(
+    net: nn.Module,
+    measurement: Measurement,
+    inputs: Inputs,
+    *,
+    seed: int,
+    epochs: int,
+    report: Report,
+    watch: Watch = lambda _epoch, _decide: None,
+) -> Decide:
+    """Train `net` on `inputs` of the training objects and return its decision; `watch` is told it after every epoch."""
+    decide, labels = decider(net), torch.from_numpy(measurement.train_labels)
+    fit(net, inputs, labels, epochs=epochs, seed=seed, report=report, watch=lambda epoch: watch(epoch, decide))
+    return decide
+
+
+def decider(net: Callable[[Tensor], Tensor]) -> Decide:
+    """Return a trained network as a function from readouts (n, m) to labels (n,)."""
+
+    def decide(readouts: F32) -> I64:
+        with torch.no_grad():
+            parts = [net(part).argmax(dim=1) for part in torch.from_numpy(readouts).split(CHUNK)]
+        labels: I64 = torch.cat(parts).numpy().astype(np.int64)
+        return labels
+
+    return decide
+
+
+def aware_cnn(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    *,
+    seed: int,
+    dark: float = 0.0,
+    epochs: int = FRAME_EPOCHS,
+    report: Report = silent,
+) -> Decide:
+    """Return the frame network trained on fresh noisy frames at this photon level."""
+    light = measurement.photoelectrons(measurement.train[:: max(1, len(measurement.train) // 1000)], photons) + dark
+    square = light + light**2 if detector == "counting" else -np.expm1(-light)
+    spread = math.sqrt(float(square.mean()))
+    net, told = _frame_net(measurement, seed, spread), named(f"noise-aware CNN at {photons:g} photons", report)
+    return fitted(net, measurement, shown(measurement, photons, detector, dark), seed=seed, epochs=epochs, report=told)
+
+
+def clean_cnn(measurement: Measurement, *, seed: int, epochs: int = FRAME_EPOCHS, report: Report = silent) -> Decide:
+    """Return the frame network trained on noiseless frames; one network serves all photon levels."""
+    net, told = _frame_net(measurement, seed, None), named("CNN on clean frames", report)
+    return fitted(net, measurement, shown(measurement, 1e6), seed=seed, epochs=epochs, report=told)
+
+
+def _frame_net(measurement: Measurement, seed: int, spread: float | None) -> torch.nn.Module:
+    assert measurement.image_shape is not None, "direct imaging measures frames"
+    shape, n_classes = measurement.image_shape, measurement.n_classes
+    return seeded(lambda: FrameNet(shape, n_classes, spread), seed)
+
+
+def patterns(family: str, n_features: int, shape: tuple[int, int], seed: int) -> F64:
+    """Return fixed patterns, 0 or more, float64 (d_f, pixels).
+
+    `binary`: every pixel by a fair coin. `hadamard`: two-dimensional Walsh functions, coarsest first, -1 shown as dark; the
+    first one is light everywhere. Sides that are no power of two are cut from the next larger pattern. `gaussian`: the absolute
+    values of normal numbers, as light has no sign. `binning`: each pattern lights one block of a grid of d_f blocks, as square as d_f
+    has divisors; blocks differ by a pixel where the sides cannot be divided.
+    """
+    if n_features < 1:
+        raise ValueError(f"features is {n_features}, allowed: 1 or more")
+    height, width = shape
+    if family == "binary":
+        return np.random.default_rng([seed, 3]).integers(0, 2, (n_features, height * width)).astype(np.float64)
+    if family == "gaussian":
+        return np.abs(np.random.default_rng([seed, 5]).standard_normal((n_features, height * width)))
+    if family == "binning":
+        return _bins(n_features, shape)
+    if family != "hadamard":
+        raise ValueError(f"patterns are {family!r}, allowed: {', '.join(FAMILIES)}")
+    rows, columns = walsh(height), walsh(width)
+    order = sorted(((u, v) for u in range(len(rows)) for v in range(len(columns))), key=lambda uv: (sum(uv), uv))
+    if n_features > len(order):
+        raise ValueError(f"features is {n_features}, allowed for Walsh patterns of {height} x {width}: {len(order)}")
+    signs = [np.outer(rows[u, :height], columns[v, :width]).ravel() for u, v in order[:n_features]]
+    return (np.array(signs) + 1) / 2
+
+
+def _bins(n_features: int, shape: tuple[int, int]) -> F64:
+    """Indicators of the blocks, rows first."""
+    height, width = shape
+    down = max((n for n in range(1, n_features + 1) if n_features % n == 0 and n * n <= n_features), default=1)
+    across = n_features // down
+    if down > height or across > width:
+        raise ValueError(f"features is {n_features}: a grid of {down} x {across} blocks in {height} x {width} pixels")
+    row = np.arange(height) * down // height
+    column = np.arange(width) * across // width
+    block = (row[:, None] * across + column[None, :]).ravel()
+    return (block == np.arange(n_features)[:, None]).astype(np.float64)
+
+
+def walsh(n: int) -> F64:
+    """Return all Walsh functions (-1 and 1) of the power of two from `n` up, by their number of sign changes."""
+    matrix: NDArray[Any] = np.ones((1, 1))
+    while len(matrix) < n:
+        matrix = np.kron(matrix, [[1, 1], [1, -1]])
+    changes = (np.diff(matrix, axis=1) != 0).sum(axis=1)
+    return matrix[np.argsort(changes)]
+
+
+def aware_mlp(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    *,
+    seed: int,
+    dark: float = 0.0,
+    epochs: int = EPOCHS,
+    report: Report = silent,
+) -> Decide:
+    """Return the feature network trained on fresh readouts at this photon level."""
+    told = named(f"noise-aware MLP at {photons:g} photons", report)
+    inputs = shown(measurement, photons, detector, dark)
+    return fitted(_net(measurement, seed), measurement, inputs, seed=seed, epochs=epochs, report=told)
+
+
+def clean_mlp(
+    measurement: Measurement,
+    *,
+    seed: int,
+    epochs: int = EPOCHS,
+    convolutions: bool = False,
+    report: Report = silent,
+    watch: Watch = lambda _epoch, _decide: None,
+) -> Callable[[float, str], Decide]:
+    """Return (photons, detector) -> decision, by one feature network that was trained on noiseless features.
+
+    With `convolutions` there are two along the patterns before its hidden layer.
+
+    Counts are divided by the exposure, clicks by their mean over that of the clean features: the network then sees features
+    of the size that it knows. `watch` is called after every epoch, with what the network decides then on noiseless features.
+    """
+    told, inputs = named("network on clean features", report), shown(measurement, 1.0)
+    decide = fitted(
+        _net(measurement, seed, convolutions), measurement, inputs, seed=seed, epochs=epochs, report=told, watch=watch
+    )
+    return lambda photons, detector: lambda readouts: decide(readouts / size(measurement, photons, detector))
+
+
+def size(measurement: Measurement, photons: float, detector: str) -> np.float32:
+    """Return the mean readout at `photons`, relative to the mean feature at one photon per object (training objects)."""
+    light = measurement.photoelectrons(measurement.train, 1.0)
+    if detector == "counting":
+        return np.float32(photons)
+    return np.float32(-np.expm1(-light * np.float32(photons)).mean(dtype=np.float64) / light.mean(dtype=np.float64))
+
+
+def _net(measurement: Measurement, seed: int, convolutions: bool = False) -> torch.nn.Module:
+    made = feature_conv_net if convolutions else feature_net
+    return seeded(lambda: made(measurement.train.shape[1], measurement.n_classes), seed)
+
+
+def hadamard_12() -> F64:
+    """Return Paley's Hadamard matrix of order 12 (-1 and 1), rows by their number of sign changes, the constant one first."""
+    squares = {k * k % 11 for k in range(1, 11)}
+    character = [0] + [1 if k in squares else -1 for k in range(1, 11)]
+    skew = np.zeros((12, 12))
+    skew[0, 1:], skew[1:, 0] = 1, -1
+    for i in range(11):
+        for j in range(11):
+            skew[i + 1, j + 1] = character[(j - i) % 11]
+    matrix = skew + np.eye(12)
+    matrix = matrix * matrix[0]  # the first row all 1
+    changes = (np.diff(matrix, axis=1) != 0).sum(axis=1)
+    return matrix[np.argsort(changes, kind="stable")]
+
+
+def pairs(n_pairs: int, shape: tuple[int, int]) -> F64:
+    """Return patterns of 0 and 1, float64 (2 x n_pairs, pixels): the coarsest Hadamard patterns, and then their inverses.
+
+    A field covers the pixels whose row and column, times 12 / side and rounded down, are its own.
+    """
+    if not 1 <= n_pairs <= PAIRS_MAX:
+        raise ValueError(f"features is {n_pairs} pairs, allowed: 1 to {PAIRS_MAX}")
+    signs = hadamard_12()
+    changes = (np.diff(signs, axis=1) != 0).sum(axis=1)
+    order = sorted(
+        ((u, v) for u in range(FIELDS) for v in range(FIELDS)), key=lambda uv: (changes[uv[0]] + changes[uv[1]], uv)
+    )
+    rows, columns = (np.arange(side) * FIELDS // side for side in shape)
+    positive = np.array([np.outer(signs[u, rows], signs[v, columns]).ravel() for u, v in order[:n_pairs]]) / 2 + 0.5
+    return np.concatenate([positive, 1 - positive])
+
+
+class Differences(nn.Module):
+    """The feature network behind the differences of pairs: counts (n, 2 x pairs) -> scores."""
+
+    def __init__(self, n_pairs: int, n_classes: int) -> None:
+        super().__init__()
+        self.n_pairs = n_pairs
+        self.head = feature_net(n_pairs, n_classes)
+
+    def forward(self, counts: Tensor) -> Tensor:
+        """Return scores (n, classes)."""
+        scores: Tensor = self.head(counts[:, : self.n_pairs] - counts[:, self.n_pairs :])
+        return scores
+
+
+def pair_net(
+    measurement: Measurement,
+    photons: float,
+    detector: str,
+    *,
+    seed: int,
+    differences: bool = True,
+    dark: float = 0.0,
+    epochs: int = EPOCHS,
+    report: Report = silent,
+) -> Decide:
+    """Return the network trained on fresh counts of pairs (`measure` by `pairs`) at this photon level."""
+    n, n_classes = measurement.train.shape[1], measurement.n_classes
+
+    def net() -> torch.nn.Module:
+        return Differences(n // 2, n_classes) if differences else feature_net(n, n_classes)
+
+    told = named(f"Hadamard pairs at {photons:g} photons", report)
+    inputs = shown(measurement, photons, detector, dark)
+    return fitted(seeded(net, seed), measurement, inputs, seed=seed, epochs=epochs, report=told)
