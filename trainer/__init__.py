@@ -1,15 +1,4 @@
-"""The torch trainer: patterns and heads trained through the physics of an instrument, and exported as bundles (extra `train`).
+"""The torch trainer (extra `train`): patterns and heads are trained through the physics of an instrument and written as bundles.
 
-Owns tasks, models, training, export, evaluation, baselines and the paper's tables; never talks to a device.
+A task's images come in (`tasks`), a bundle and its figures go out. Start with `train/loop.py`, or `adaptive/train.py` for automata.
 """
-
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .options import Options, check_options
-
-__all__ = ["Options", "check_options"]
-
-__getattr__ = lazy_names(__name__, {"Options": ".options", "check_options": ".options"})

@@ -1,27 +1,10 @@
-"""Training of automata: patterns that follow from the clicks before them, by exact sums over all walks.
+"""Training of automata, whose patterns follow from the clicks before them, by exact sums over all walks.
 
-Owns growing, merging, tuning and the one-bit patterns of an automaton, its budget of light and its calibrated posteriors; never sees the
-held-out objects and never writes a bundle (the package export).
+A task, a profile and `AutomatonOptions` come in, a `TrainedAutomaton` goes out. Start with `train.py` (the stages), then `machine.py` (the
+automaton and its gradient).
 """
 
-from typing import TYPE_CHECKING
+from .train import TrainedAutomaton, train_automaton
+from .tune import Progress
 
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .options import AutomatonOptions, check_automaton_options
-    from .train import TrainedAutomaton, train_automaton
-    from .tune import Progress
-
-__all__ = ["AutomatonOptions", "Progress", "TrainedAutomaton", "check_automaton_options", "train_automaton"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "AutomatonOptions": ".options",
-        "check_automaton_options": ".options",
-        "Progress": ".figures",
-        "TrainedAutomaton": ".train",
-        "train_automaton": ".train",
-    },
-)
+__all__ = ["Progress", "TrainedAutomaton", "train_automaton"]

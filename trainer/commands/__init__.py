@@ -1,1 +1,1 @@
-"""Argparse in, exit code out; no computation."""
+"""The commands of the trainer: arguments come in, an answer and an exit code go out."""

@@ -1,28 +1,10 @@
-"""What a bundle decides on held-out objects, against photons, and how much its clicks know of the label.
+"""What a bundle decides on held-out objects, against photons. It needs numpy and the runtime alone. All figures are SIMULATED.
 
-Owns the sampled and the exact evaluation through a profile's optics and detector, information measures, and pictures of a bundle.
-It needs numpy and the runtime alone, and never trains. All figures are SIMULATED.
+A bundle and a task come in, accuracy with clicks, photons and illumination goes out. Start with `held_out.py`, then `accuracy.py` (fixed
+patterns) and `walks.py` (automata).
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .accuracy import Conditions, Light, Measured, MeasuredPictures, light_of
-    from .held_out import evaluate, measure
+from .accuracy import Conditions, Light, Measured, MeasuredPictures, light_of
+from .held_out import evaluate, measure
 
 __all__ = ["Conditions", "Light", "Measured", "MeasuredPictures", "evaluate", "light_of", "measure"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "Light": ".accuracy",
-        "Measured": ".accuracy",
-        "MeasuredPictures": ".accuracy",
-        "light_of": ".accuracy",
-        "Conditions": ".accuracy",
-        "evaluate": ".held_out",
-        "measure": ".held_out",
-    },
-)

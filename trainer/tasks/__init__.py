@@ -1,7 +1,7 @@
-"""Tasks: labelled 8-bit images for training, and others held out.
+"""Tasks: labelled 8-bit images to train on, and others held out.
 
-Owns the pinned public sets, the generators of the drawn tasks, a user's own files and folders, and the distortions of training images;
-never trains and never shows an image to an instrument.
+A name, a file or a folder comes in, a `Task` goes out. Start with `registry.py`; public sets are in `public_sets.py`, drawn tasks in
+`generators.py`, changes of training images in `changes.py`.
 
 >>> from pans.trainer.tasks import TASKS, load_task
 >>> "barcode" in TASKS
@@ -10,24 +10,7 @@ True
 (1, 10)
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .generators import GENERATORS
-    from .registry import TASKS, Objects, Task, load_task, task_names
+from .generators import GENERATORS
+from .registry import TASKS, Objects, Task, load_task, task_names
 
 __all__ = ["GENERATORS", "TASKS", "Objects", "Task", "load_task", "task_names"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "GENERATORS": ".generators",
-        "TASKS": ".registry",
-        "Objects": ".registry",
-        "Task": ".registry",
-        "load_task": ".registry",
-        "task_names": ".registry",
-    },
-)

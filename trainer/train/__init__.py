@@ -1,26 +1,9 @@
-"""Training through an instrument: the loop, its schedule, its data, checkpoints, and exact searches for small tasks.
+"""Training of fixed patterns or passive optics through an instrument.
 
-Owns the way from random patterns to whole projector levels and a finished head, within a budget of light; never sees the held-out
-objects (but `history.follow`, which measures and does not choose) and never writes a bundle.
+A task, a profile and `Options` come in, a `Trained` model goes out. Start with `loop.py`; `exact_search.py` solves small tasks exactly.
 """
 
-from typing import TYPE_CHECKING
-
-from pans.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from .head_fit import fit_head
-    from .loop import EpochReport, Run, Trained, train
+from .head_fit import fit_head
+from .loop import EpochReport, Run, Trained, train
 
 __all__ = ["EpochReport", "Run", "Trained", "fit_head", "train"]
-
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "fit_head": ".head_fit",
-        "EpochReport": ".loop",
-        "Run": ".loop",
-        "Trained": ".loop",
-        "train": ".loop",
-    },
-)
