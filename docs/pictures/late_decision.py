@@ -16,7 +16,7 @@ from pans.firmware_sim.ports.serve import open_sim
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import RunConfig, run_live
+from pans.runtime.live import RunOptions, run_live
 from pans.runtime.timing import attribution
 from pans.runtime.timing.attribution import Verdict
 from pans.runtime.timing.evidence import IDLE, OVERSLEPT, Facts
@@ -41,7 +41,7 @@ def witnessed(faults: str) -> tuple[Facts, Verdict]:
         return verdict
 
     profile, bundle, plan = small_setup("sequential")
-    config = RunConfig(n_cycles=4000, deadline_us=10_000.0, realtime=False)
+    config = RunOptions(n_cycles=4000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
     attribution.judge = listen
     try:

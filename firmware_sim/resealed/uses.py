@@ -95,23 +95,20 @@ def passive_bundle() -> Bundle:
 
 
 def _record(folder: Path, bundle: Path, profile: str, device: str, **more: Any) -> Path:
-    from pans.runtime.commands.carry_out import run_job
-    from pans.runtime.commands.job import Job
+    from pans.runtime.commands.one_run import run_once
+    from pans.runtime.live import RunOptions
 
-    loaded = load_profile(profile)
-    job = Job(
-        bundle_path=bundle,
+    options = RunOptions(
+        bundle=bundle,
+        profile=profile,
         device=f"sim:{profile}?{device}&seed=1&pace=fast",
-        profile=loaded,
-        deadline_us=loaded.timing.decision_deadline_us,
-        act_profile=loaded,
         record=folder / "run.pansrec",
         realtime=False,
         command="pans fuzz",
-        shows=False,
+        display=False,
         **more,
     )
-    run_job(job)
+    run_once(options)
     return folder / "run.pansrec"
 
 

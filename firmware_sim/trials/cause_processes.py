@@ -31,7 +31,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
+from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
 from pans.runtime.record import Recorder
 
 HOST_CORE, INSTRUMENT_CORE = 0, 1
@@ -212,7 +212,7 @@ def host(url: str, script_path: str, recording: str) -> None:
             disturber.start_ns = _ready(pid=os.getpid(), disk_pid=piped.process.pid)
 
         seconds = script[-1].at_ns * 1e-9 + AFTER_S + 0.5
-        config = RunConfig(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=5000)
+        config = RunOptions(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=5000)
         result = run_live(
             open_link(url), profile, bundle, plan, core, config, recorder, observers=Observers(disturber.watch, prepared)
         )  # fmt: skip

@@ -42,7 +42,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.instrument.profile import Profile
-from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.live.config import AUTO, COMPILED, PYTHON
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, Recording, read_recording
@@ -176,7 +176,7 @@ def run_case(
     link = (TapedLink if reads_again else ObservedLink)(SlowReads(device, clock, f"grid:{case}", seed, slow))
     flow = FlowRun(core, None) if isinstance(core, FlowCore) else None
     host = GridHost(checker, frames, flow)
-    config = RunConfig(shots=SHOTS, n_cycles=one.n_cycles, deadline_us=1e9, turn=turn)
+    config = RunOptions(shots=SHOTS, n_cycles=one.n_cycles, deadline_us=1e9, turn=turn)
     recovery = Recovery.of(link, "", 30.0)
 
     def start(run: LiveRun) -> None:

@@ -39,7 +39,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import Link, open_link
-from pans.runtime.live import RunConfig, run_live
+from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.timing.ledger import frozen_heap
@@ -271,7 +271,9 @@ class Stage:
 
     def _drive(self, link: MutatedLink, path: Path, session: Session) -> None:
         # No claim on the processor: many sessions share it, and none is judged by its latencies.
-        config = RunConfig(SHOTS, OBJECTS * self.plan.cycles_per_object, deadline_us=1e5, realtime=False)
+        config = RunOptions(
+            shots=SHOTS, n_cycles=OBJECTS * self.plan.cycles_per_object, deadline_us=1e5, realtime=False
+        )
         core = Core(self.plan, self.decider, SHOTS, config.n_cycles)
         config_of_run = {"shots": SHOTS, "tick_hz": self.profile.clock.tick_hz, "backend": self.backend}
         header = {"config": {**config_of_run, "drive": self.plan.drive, "confidence": 0.0}}

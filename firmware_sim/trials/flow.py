@@ -49,7 +49,7 @@ def cores_of(text: str) -> tuple[int, int] | None:
 class Job:
     """What to run: as the options of the two programs; `pin` the cores of host and instrument, None to leave them free."""
 
-    bundle: Path = option(MISSING, "a bundle trained for the profile and the scene", type=Path)  # noqa: RUF009
+    bundle: Path = option(MISSING, "a bundle trained for the profile and the scene", type=Path)
     profile: str = option("wdm-snspd", "hardware profile (default wdm-snspd)")
     scene: str = option("cells-in-flow", "what passes by (default: the shipped cells-in-flow)")
     flow: str = option("cells", "settings of the flow: cells or a TOML file (default cells)")
@@ -68,7 +68,7 @@ class Job:
     awake: bool = option(
         False, "bind the two loops alone to their cores, and keep these awake (--core)", action="store_true"
     )
-    folder: Path | None = option(None, "where to leave recording and summary (default: nowhere)", type=Path)  # noqa: RUF009
+    folder: Path | None = option(None, "where to leave recording and summary (default: nowhere)", type=Path)
 
 
 def carry_out(job: Job, folder: Path) -> Outcome:

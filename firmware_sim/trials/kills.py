@@ -38,7 +38,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import PansError
 from pans.runtime.link.base import open_link
-from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
+from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.report.verify import verify_file
 from pans.runtime.wire.messages import DeviceState, StateReason
@@ -71,7 +71,7 @@ class LightLog(Instrument):
 def lit_host(url: str) -> None:
     """A host that runs until it is killed."""
     profile, bundle, plan = small_setup("sequential")
-    config = RunConfig(deadline_us=1e9, lease_ms=LEASE_MS, realtime=False)
+    config = RunOptions(deadline_us=1e9, lease_ms=LEASE_MS, realtime=False)
     run_live(open_link(url), profile, bundle, plan, Core(plan, make_decider(bundle), 1, 0), config)
 
 
@@ -90,7 +90,7 @@ def recording_host(path: str, acted: int, seed: int) -> None:
                 os.write(acted, ACTED.pack(decision.number))
 
     with Recorder(path, header, bundle=data) as recorder:
-        config = RunConfig(deadline_us=1e9, lease_ms=1000, realtime=False)
+        config = RunOptions(deadline_us=1e9, lease_ms=1000, realtime=False)
         core = Core(plan, make_decider(bundle), 1, 0)
         run_live(link, profile, bundle, plan, core, config, recorder, observers=Observers(act))
 

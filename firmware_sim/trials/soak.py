@@ -197,7 +197,7 @@ class Settings:
 
     minutes: float = option(30.0, "how long (default 30)")
     seed: int = option(1, "of the instrument and its faults (default 1)")
-    folder: Path | None = option(None, "where to leave the recording and the state (default: nowhere)", type=Path)  # noqa: RUF009
+    folder: Path | None = option(None, "where to leave the recording and the state (default: nowhere)", type=Path)
 
 
 def run(settings: Settings) -> Report:

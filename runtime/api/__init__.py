@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from pans.runtime.bundle.model import Bundle
-    from pans.runtime.commands.carry_out import Outcome
+    from pans.runtime.commands.one_run import Outcome
     from pans.runtime.core.plan import build_plan
     from pans.runtime.decide.verdict import Verdicts
     from pans.runtime.instrument.profile import Profile, load_profile
@@ -150,30 +150,27 @@ def run(
     from tempfile import TemporaryDirectory
 
     from pans.runtime.bundle.model import bundle_path
-    from pans.runtime.commands.carry_out import run_job
-    from pans.runtime.commands.job import Job
+    from pans.runtime.commands.one_run import run_once
     from pans.runtime.commands.run import profile_of
     from pans.runtime.instrument.profile import Profile, load_profile
+    from pans.runtime.live import RunOptions
 
     loaded = profile if isinstance(profile, Profile) else load_profile(profile or profile_of(device))
     with TemporaryDirectory() as folder:
         path = bundle_path(bundle) if isinstance(bundle, (str, Path)) else _written(bundle, Path(folder))
-        job = Job(
-            bundle_path=path,
+        options = RunOptions(
+            bundle=path,
             device=device,
-            profile=loaded,
-            deadline_us=loaded.timing.decision_deadline_us,
-            act_profile=loaded,
             out=None if out is None else Path(out),
             shots=shots,
             decisions=decisions,
             seconds=seconds,
             realtime=False,
             command="pans.run",
-            shows=shows,
+            display=shows,
             force=force,
         )
-        return run_job(job)
+        return run_once(options, loaded)
 
 
 def _written(bundle: Bundle, folder: Path) -> Path:

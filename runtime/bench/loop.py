@@ -23,7 +23,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import Profile, load_profile, parse_profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live import Recovery, RunConfig, run_live
+from pans.runtime.live import Recovery, RunOptions, run_live
 from pans.runtime.record import Recorder
 from pans.runtime.timing.machine import steal_ms
 
@@ -72,7 +72,7 @@ def _run(asked: _Asked, seconds: float, load: bool) -> Row:
         plan = build_plan(profile, bundle, drive=drive)
         core = Core(plan, make_decider(bundle), 1, 0)
         link = open_link(f"sim:{path}?scene=fashion200&seed=1&pace=real")
-        config = RunConfig(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime=realtime)
+        config = RunOptions(seconds=seconds, deadline_us=DEADLINE_US, lease_ms=1000, realtime=realtime)
         started, load_before, steal_before = time.process_time(), os.getloadavg()[0], steal_ms()
         with Recorder(Path(folder) / "loop.pansrec", {"simulated": True}) as recorder:
             # starved for a whole lease, the host finds its instrument dark

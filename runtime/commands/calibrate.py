@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from pans.runtime.cli import EXIT_ALERT, EXIT_FINE, EXIT_TIMING, Command, add_force, emit, say
+from pans.runtime.cli.option_fields import refuse_without
 from pans.runtime.cli.talk import is_quiet
 from pans.runtime.errors import LinkError, UsageError, as_usage_error
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.outputs import check_outputs
 from pans.runtime.ranges import Range
 
-from .options import refuse_without
 from .run import profile_of
 from .run_files import files_of_url
 
@@ -134,14 +134,14 @@ def _measure(device: str, profile: Profile, design: Any) -> tuple[Any, dict[str,
     """Run one design through the ordinary session; return the core with its sums, the device's facts and what contradicts the evidence."""
     from pans.runtime.core.calibration import CalibrationCore
     from pans.runtime.link.base import open_link
-    from pans.runtime.live import Observers, RunConfig, run_live
+    from pans.runtime.live import Observers, RunOptions, run_live
     from pans.runtime.live.continuous import INTERRUPTED
     from pans.runtime.report.summary import contradictions_of
 
     core = CalibrationCore(design.plan, design.n_cycles)
     seconds = design.n_cycles * design.plan.cycle_us * 1e-6
     say(f"calibrating: {len(design.drives)} patterns, {seconds:.1f} s of instrument time")
-    config = RunConfig(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
+    config = RunOptions(n_cycles=design.n_cycles, lease_ms=profile.timing.lease_ms)
     with _bar(design.n_cycles * design.plan.slots_per_cycle) as tell:
         seen = Observers(lambda run, _: tell(run.core.tracker.next_exposure), acts=False)
         result = run_live(open_link(device), profile, design.bundle, design.plan, core, config, observers=seen)

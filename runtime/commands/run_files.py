@@ -1,94 +1,117 @@
-"""The files of one run: which they are, that none is in the way before it begins, and their folder while it runs.
+"""The files of one run: the checks before it begins, their folder while it runs, what the recording and the page say of it.
 
-Owns what a run may write and replace; each file's content is its writer's. A run that is refused leaves nothing behind.
+A run that is refused leaves nothing behind.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
+from pans.runtime import __version__
 from pans.runtime.cli import EXIT_USAGE
+from pans.runtime.cli.option_fields import changed_options
+from pans.runtime.container import MIB
 from pans.runtime.errors import PansError, RecordingError, UsageError
+from pans.runtime.instrument.profile import Profile
+from pans.runtime.live.run_options import RunOptions
 from pans.runtime.outputs import check_outputs, make_folder, refuse_existing
-from pans.runtime.record.part_keeper import files_of_parts, index_path
+from pans.runtime.record.part_keeper import PartLimits, files_of_parts, index_path
 from pans.runtime.run_folder import locked, new_run_folder
 
-from .job import Job
-from .options import MIB
+if TYPE_CHECKING:
+    from pans.runtime.core.plan import Plan
+    from pans.runtime.decide.verdict import Decider
+    from pans.runtime.report.summary import Summary
 
 STATE_FORMAT = "pans-state 1"
 STATE_MAX_BYTES = 1 << 16
 
 
-def check_run_files(job: Job) -> None:
-    """Check every output of `job` before anything is opened; UsageError if one exists, is an input, or cannot be written."""
-    if job.record is not None and job.record.is_dir():  # `/` has no name that the page's could be made of
-        raise UsageError(f"{job.record}: is a folder, expected the name of a file", remedy="choose another name")
-    inputs = input_files(job)
-    outputs = [path for path in (job.recording, job.page, job.trace) if path is not None]
-    if job.recording is not None and job.continuous.limits is not None:
-        outputs = [index_path(path) if path == job.recording else path for path in outputs]
-        parts = files_of_parts(job.recording)
-        if parts and not job.force:
+def check_run_files(options: RunOptions) -> None:
+    """Check every output of `options` before anything is opened; UsageError if one exists, is an input, or cannot be written."""
+    if options.record is not None and options.record.is_dir():  # `/` has no name that the page's could be made of
+        raise UsageError(f"{options.record}: is a folder, expected the name of a file", remedy="choose another name")
+    inputs = input_files(options)
+    outputs = [path for path in (options.recording, options.page, options.trace) if path is not None]
+    if options.recording is not None and options.rotate_bytes:
+        outputs = [index_path(path) if path == options.recording else path for path in outputs]
+        parts = files_of_parts(options.recording)
+        if parts and not options.force:
             raise refuse_existing(parts[0])
-    if job.out_root is not None:
-        outputs.append(job.out_root / ".new" / "run")
-    state = job.continuous.state
+    if options.out_root is not None:
+        outputs.append(options.out_root / ".new" / "run")
+    state = options.state
     if state is not None:
-        check_outputs([state], inputs=inputs, force=job.force, ours=is_state_file)  # its folder must be there
+        check_outputs([state], inputs=inputs, force=options.force, ours=is_state_file)  # its folder must be there
         outputs.append(state)
     check_outputs(
         outputs,
         inputs=inputs,
-        force=job.force,
+        force=options.force,
         ours=lambda path: path == state and is_state_file(path),
         makes_folders=True,
     )
-    _check_disk(job)
+    _check_disk(options)
 
 
-def input_files(job: Job) -> list[str | Path | None]:
+def input_files(options: RunOptions) -> list[str | Path | None]:
     """Return the files that a run reads."""
-    return [*job.inputs, job.bundle_path, job.dark.calibration, job.dark.registration, *files_of_url(job.device)]
+    named = (
+        options.bundle,
+        options.profile,
+        options.flow,
+        options.act_profile,
+        options.calibration,
+        options.registration,
+    )
+    return [*options.files_read, *named, *files_of_url(options.device)]
 
 
-def _check_disk(job: Job) -> None:
+def _check_disk(options: RunOptions) -> None:
     """A run that would be stopped at once does not begin."""
-    folder = job.out_root if job.out_root is not None else None if job.recording is None else job.recording.parent
-    if folder is None or not job.continuous.stop_below:
+    folder = (
+        options.out_root
+        if options.out_root is not None
+        else None
+        if options.recording is None
+        else options.recording.parent
+    )
+    if folder is None or not options.stop_below:
         return
     there = next((path for path in (folder, *folder.absolute().parents) if path.is_dir()), Path.cwd())
     free = shutil.disk_usage(there).free
-    if free < job.continuous.stop_below:
+    if free < options.stop_below:
         raise UsageError(
-            f"{folder}: {free / MIB:.1f} MiB are free on its disk, and a run stops below {job.continuous.stop_below / MIB:.1f}",
+            f"{folder}: {free / MIB:.1f} MiB are free on its disk, and a run stops below {options.stop_below / MIB:.1f}",
             remedy="make room (pans runs prune), record elsewhere, or lower --disk-reserve-mb",
         )
 
 
 @contextmanager
-def claimed(job: Job) -> Iterator[Job]:
-    """Make the folders of `job` and hold them while it runs; yield it with its own folder. Folders that stay empty go."""
+def claimed(options: RunOptions) -> Iterator[RunOptions]:
+    """Make the folders of `options` and hold them while it runs; yield it with its own folder. Folders that stay empty go."""
     made: list[Path] = []
-    if job.out_root is not None:
-        job = replace(job, out=new_run_folder(job.run_name, job.out_root), out_root=None)
-        made.append(job.out)  # type: ignore[arg-type]
-    folders = {path.parent for path in (job.recording, job.page, job.trace) if path is not None}
+    if options.out_root is not None:
+        options = replace(options, out=new_run_folder(options.bundle.stem, options.out_root), out_root=None)
+        made.append(options.out)  # type: ignore[arg-type]
+    folders = {path.parent for path in (options.recording, options.page, options.trace) if path is not None}
     try:
         for folder in sorted(folders):
             made += missing_folders(folder)
             make_folder(folder)
         with ExitStack() as held:
-            for lock in sorted(_locks(job)):
+            for lock in sorted(_locks(options)):
                 held.enter_context(locked(lock))
-            yield job
+            yield options
     finally:
         for folder in reversed(made):
             with suppress(OSError):  # it holds something
@@ -96,23 +119,23 @@ def claimed(job: Job) -> Iterator[Job]:
 
 
 @contextmanager
-def gone_if_refused(job: Job) -> Iterator[None]:
+def gone_if_refused(options: RunOptions) -> Iterator[None]:
     """Remove the recording that was begun within the block when the run is refused before it measures anything."""
-    before = _recorded_files(job)
+    before = _recorded_files(options)
     try:
         yield
     except PansError as error:
         if error.exit_code == EXIT_USAGE and not isinstance(error, RecordingError):
-            for path in _recorded_files(job) - before:
+            for path in _recorded_files(options) - before:
                 with suppress(OSError):
                     path.unlink()
         raise
 
 
-def _recorded_files(job: Job) -> set[Path]:
-    if job.recording is None:
+def _recorded_files(options: RunOptions) -> set[Path]:
+    if options.recording is None:
         return set()
-    return {path for path in (job.recording, *files_of_parts(job.recording)) if os.path.lexists(path)}
+    return {path for path in (options.recording, *files_of_parts(options.recording)) if os.path.lexists(path)}
 
 
 def missing_folders(folder: Path) -> list[Path]:
@@ -135,9 +158,9 @@ def is_state_file(path: Path) -> bool:
     return isinstance(found, dict) and found.get("format") == STATE_FORMAT
 
 
-def _locks(job: Job) -> set[Path]:
-    recording = set() if job.recording is None else {job.recording.with_name(f".{job.recording.name}.lock")}
-    return recording if job.out is None else {*recording, job.out / ".pans-run.lock"}
+def _locks(options: RunOptions) -> set[Path]:
+    recording = set() if options.recording is None else {options.recording.with_name(f".{options.recording.name}.lock")}
+    return recording if options.out is None else {*recording, options.out / ".pans-run.lock"}
 
 
 def files_of_url(device: str) -> list[str]:
@@ -145,3 +168,76 @@ def files_of_url(device: str) -> list[str]:
     base, _, query = device.partition("?")
     values = [base.partition(":")[2], *(value for _, value in parse_qsl(query))]
     return [value for value in values if value and os.path.isfile(value)]
+
+
+def part_limits(options: RunOptions) -> PartLimits | None:
+    """Return how a recording is divided into parts; None for one file."""
+    return PartLimits(options.rotate_bytes, options.keep_bytes) if options.rotate_bytes else None
+
+
+def what_was_run(
+    options: RunOptions,
+    profile: Profile,
+    name: str,
+    bundle_sha256: str,
+    backend: str,
+    recording: Path | None,
+    summary: Summary,
+) -> dict[str, str]:
+    """The lines below the summary page's figures."""
+    return {
+        "bundle": f"{name} ({options.bundle.name}, SHA-256 {bundle_sha256[:16]}…)",
+        "device": f"{options.device} (firmware {summary.device.get('firmware', 'unknown')})",
+        "profile": f"{profile.name}: {profile.description}",
+        "decision back end": backend,
+        "recording": f"{recording} (decision log SHA-256 {summary.decisions_sha256[:16]}…; pans replay recomputes it)",
+        "command": options.command,
+        "machine": f"{platform.machine()}, Python {platform.python_version()}, pans {__version__}",
+    }
+
+
+def recording_header(
+    options: RunOptions, profile: Profile, bundle_sha256: str, decider: Decider, n_objects: int, plan: Plan
+) -> dict[str, Any]:
+    """What a recording must say to be understood alone; units are in the keys."""
+    import numba
+    import numpy
+    import onnxruntime
+
+    from pans.runtime.decide.verdict import choice_of
+
+    dose = getattr(decider, "dose", None)
+    return {
+        "bundle_sha256": bundle_sha256,
+        "command": options.command,
+        "device_url": options.device,
+        "profile": {"name": profile.name, "sha256": profile.sha256, "toml": profile.text},
+        "options": changed_options(options),
+        "config": {
+            "shots": options.shots,
+            "trials": options.trials,
+            "objects": n_objects,
+            "seconds": options.seconds,
+            "deadline_us": options.deadline_us,
+            "order": options.order,
+            "dark_slots_per_cycle": options.dark_slots,
+            "backend": decider.name,
+            "backend_choice": dict(choice_of(decider)),
+            "tick_hz": profile.clock.tick_hz,
+            "realtime_requested": options.realtime,
+            **({"mode": "parallel"} if profile.mode == "parallel" else {}),
+            **({"drive": plan.drive, "confidence": options.confidence} if plan.drive else {}),
+            **({"photon_number_max": plan.largest} if plan.largest > 1 and plan.channels_at_once == 1 else {}),
+            **({"channels_at_once": plan.channels_at_once} if plan.channels_at_once > 1 else {}),
+            **({"dose_cap": options.dose_cap} if options.dose_cap else {}),
+            **({"walk_dose": {"most": dose.most, "states": dose.states}} if dose is not None else {}),
+        },
+        "versions": {
+            "pans": __version__,
+            "python": platform.python_version(),
+            "numpy": numpy.__version__,
+            "numba": numba.__version__,
+            "onnxruntime": onnxruntime.__version__,
+            "platform": platform.platform(),
+        },
+    }

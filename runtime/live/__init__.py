@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from pans.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from .config import RunConfig, RunResult
+    from .config import RunResult
     from .loop import Observers, run_live
     from .reconnect import Recovery
     from .run import LiveCore, LiveRun
+    from .run_options import RunOptions
 
-__all__ = ["LiveCore", "LiveRun", "Observers", "Recovery", "RunConfig", "RunResult", "run_live"]
+__all__ = ["LiveCore", "LiveRun", "Observers", "Recovery", "RunOptions", "RunResult", "run_live"]
 
 __getattr__ = lazy_names(
     __name__,
@@ -23,7 +24,7 @@ __getattr__ = lazy_names(
         "LiveRun": ".run",
         "Observers": ".loop",
         "Recovery": ".reconnect",
-        "RunConfig": ".config",
+        "RunOptions": ".run_options",
         "RunResult": ".config",
         "run_live": ".loop",
     },

@@ -1,17 +1,11 @@
-"""What goes into a live run and what comes out of it: plain facts, and the calls that a run makes of a core and of what takes its turns.
-
-Owns no behaviour; units are in the names. Light to import: the command line fills these in before anything is loaded.
-"""
+"""What comes out of a live run, and the calls that a run makes of a core and of what takes its turns. What goes in is run_options.py."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-
-from pans.runtime.instrument.calibration import MAX_AGE_H
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -43,35 +37,6 @@ class TurnChoice(NamedTuple):
     def words(self) -> str:
         """Return it as it stands in a summary."""
         return f"{self.taken}: {self.why}" if self.why else self.taken
-
-
-@dataclass(frozen=True, slots=True)
-class RunConfig:
-    """What to run: `shots` per decision, how many cycles (0: until `seconds` have passed or the device stops).
-
-    `started_ns` is the time from which "armed after" counts, on time.perf_counter_ns (0: from the call of run_live).
-    """
-
-    shots: int = 1
-    n_cycles: int = 0
-    seconds: float = 0.0
-    deadline_us: float = 0.0
-    lease_ms: int = 1000
-    realtime: bool = True
-    started_ns: int = 0
-    core: int | None = None  # that the loop is bound to, and kept awake
-    turn: str = AUTO  # one of TURNS
-
-
-@dataclass(frozen=True, slots=True)
-class DarkSettings:
-    """What to do about calibration and dark counts; `policy` is one of dark_guard.POLICIES."""
-
-    calibration: Path | None = None
-    max_age_h: float = MAX_AGE_H
-    policy: str = "warn"
-    warns: bool = False  # about a calibration that is missing or old
-    registration: Path | None = None  # of the optical table; its age is checked like a calibration's
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Running for days: what may be asked for, recordings in parts, and how a signal ends the run.
+"""Running for days: recordings in parts, and how a signal ends the run.
 
 Owns the handlers of signals while a run lives; who watches it is watch's. A signal becomes a word that the loop reads at the end of its
 turn, so that nothing is cut in its middle; while the loop does not look (setting up, waiting for a lost device, the second time) the signal
@@ -12,7 +12,6 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -28,21 +27,6 @@ RECORDING_DELETED = "the recording was deleted during the run"
 REFUSED = "the device refused: "  # and what it said
 LOADERS = frozenset(("numba", "llvmlite", "importlib", "_frozen_importlib"))  # top-level modules
 AGAIN_S = 0.02
-
-
-@dataclass(frozen=True, slots=True)
-class Continuous:
-    """What was asked for: parts (None: one recording), a state file, an address for metrics, what is to stay free on the disk."""
-
-    limits: PartLimits | None = None
-    state: Path | None = None
-    metrics: str = ""
-    disk_reserve: int = 0  # bytes; 0: the disk is not watched over
-
-    @property
-    def stop_below(self) -> int:
-        """Bytes of free disk below which a run ends. Where parts can be deleted that comes first (part_keeper.py)."""
-        return self.disk_reserve if self.limits is None else min(self.disk_reserve, self.limits.rotate_bytes // 2)
 
 
 def open_recorder(

@@ -32,7 +32,7 @@ from pans.runtime.instrument.light_level import LightWatch
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import binomial_tail
 
-from .config import DarkSettings
+from .run_options import RunOptions
 
 if TYPE_CHECKING:
     from .run import LiveRun
@@ -66,15 +66,15 @@ class DarkRun:
         self.light = LightWatch()
 
     @staticmethod
-    def of(settings: DarkSettings, profile: Profile) -> DarkRun:
-        """Read what `settings` ask for; ConfigError for a calibration of another profile."""
-        calibration = None if settings.calibration is None else load_calibration(settings.calibration)
-        if not settings.max_age_h > 0:
-            raise UsageError(f"--calibration-max-age-h must be above 0, found {settings.max_age_h:g}")
+    def of(options: RunOptions, profile: Profile) -> DarkRun:
+        """Read what `options` ask for; ConfigError for a calibration of another profile."""
+        calibration = None if options.calibration is None else load_calibration(options.calibration)
         if calibration is not None:
             find_objections(calibration, profile, None)
-        warnings = find_warnings(calibration, now_utc(), settings.max_age_h) if settings.warns else []
-        return DarkRun(profile, calibration, settings.policy, warnings)
+        warnings = []
+        if options.warns_uncalibrated:
+            warnings = find_warnings(calibration, now_utc(), options.calibration_max_age_h)
+        return DarkRun(profile, calibration, options.on_dark, warnings)
 
     def guard(self, plan: Plan, bundle: Bundle, shots: int, flow: bool = False) -> DarkGuard | None:
         """Return the guard of a core; None where the plan has nothing dark in it and nothing was asked for.

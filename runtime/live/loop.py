@@ -40,10 +40,11 @@ from pans.runtime.turn.eligible import excluded
 from pans.runtime.wire.session import ArmTooLate
 
 from .compiled import CompiledTurns
-from .config import COMPILED, PYTHON, RunConfig, RunResult, TurnChoice
+from .config import COMPILED, PYTHON, RunResult, TurnChoice
 from .continuous import INTERRUPTED, REFUSED, Stop
 from .reconnect import Recovery, Refusals, reconnect_run
 from .run import LiveCore, LiveRun, Watcher
+from .run_options import RunOptions
 
 NS_PER_S = 1_000_000_000
 VIRTUAL = "virtual time: what was read at once is taken at once"
@@ -75,7 +76,7 @@ def run_live(
     bundle: Bundle,
     plan: Plan,
     core: LiveCore,
-    config: RunConfig,
+    config: RunOptions,
     recorder: AnyRecorder | None = None,
     recovery: Recovery | None = None,
     observers: Observers = NO_OBSERVERS,
@@ -92,7 +93,7 @@ def running(
     bundle: Bundle,
     plan: Plan,
     core: LiveCore,
-    config: RunConfig,
+    config: RunOptions,
     recorder: AnyRecorder | None = None,
     recovery: Recovery | None = None,
     observers: Observers = NO_OBSERVERS,

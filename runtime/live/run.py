@@ -29,11 +29,12 @@ from pans.runtime.wire.schema import MalformedMessage
 from pans.runtime.wire.tracker import Gap
 
 from .config import LiveCore as LiveCore
-from .config import RunConfig, TurnChoice
+from .config import TurnChoice
 from .drive import HostDriver, WalkPlace
 from .gates import GateQueue
 from .journal import Journal, Reconciled
 from .lateness import Lateness
+from .run_options import RunOptions
 from .tally import RunTally
 
 NS_PER_US, NS_PER_MS, NS_PER_S = 1_000, 1_000_000, 1_000_000_000
@@ -60,7 +61,7 @@ class LiveRun(Reconciled):
         plan: Plan,
         core: LiveCore,
         n_classes: int,
-        config: RunConfig,
+        config: RunOptions,
         recorder: AnyRecorder | None,
         started_ns: int,
     ) -> None:

@@ -24,7 +24,7 @@ from pans.runtime.decide.verdict import Decider
 from pans.runtime.errors import LinkError, UsageError
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.base import open_link
-from pans.runtime.live import LiveRun, Observers, RunConfig, RunResult, run_live
+from pans.runtime.live import LiveRun, Observers, RunOptions, RunResult, run_live
 from pans.runtime.live.config import PYTHON
 from pans.runtime.live.continuous import Stop
 from pans.runtime.record.replaying import ClickLog
@@ -81,8 +81,12 @@ class Bench:
                 log.note(output.decisions)
 
             timing = self.profile.timing
-            config = RunConfig(
-                1, n_cycles, 0.0, timing.decision_deadline_us, timing.lease_ms, realtime=False, turn=PYTHON
+            config = RunOptions(
+                n_cycles=n_cycles,
+                deadline_us=timing.decision_deadline_us,
+                lease_ms=timing.lease_ms,
+                realtime=False,
+                turn=PYTHON,
             )
             watching = Observers(look, stop=self.stop, acts=False)
             result = run_live(link, self.profile, bundle, plan, core, config, None, None, watching)

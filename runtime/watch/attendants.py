@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from pans.runtime.live import LiveRun
-    from pans.runtime.live.continuous import Continuous, Stop
+    from pans.runtime.live.continuous import Stop
+    from pans.runtime.live.run_options import RunOptions
     from pans.runtime.record import AnyRecorder
 
     from .host import HostWatch
@@ -28,7 +29,7 @@ class Attendants:
 
     def __init__(
         self,
-        wanted: Continuous,
+        wanted: RunOptions,
         recorder: AnyRecorder | None,
         watchdog: Watchdog | None = None,
         stop: Stop | None = None,

@@ -37,7 +37,7 @@ from pans.runtime.instrument.profile import load_profile
 
 # stage -> where the child is met: module, class or "" and name; the call before which it waits
 STAGES = {
-    "opening": ("pans.runtime.commands.carry_out", "", "open_link", 1),
+    "opening": ("pans.runtime.commands.one_run", "", "open_link", 1),
     "handshake": ("pans.runtime.link.connection", "Connection", "handshake", 1),
     "upload": ("pans.runtime.link.connection", "Connection", "upload", 1),
     "armed": ("pans.runtime.live.run", "LiveRun", "turn", 1),

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from pans.firmware_sim.testing import small_setup
-from pans.runtime.commands import carry_out as carry_out
+from pans.runtime.commands import one_run as one_run
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.link import serial as serial

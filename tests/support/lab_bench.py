@@ -18,7 +18,7 @@ from pans.runtime.bundle import load_bundle
 from pans.runtime.core import Core, build_plan
 from pans.runtime.decide import make_decider
 from pans.runtime.instrument import load_profile
-from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.record import Recorder
 
 FASHION = ROOT / "runtime" / "shipped" / "fashion10.pans"
@@ -103,7 +103,7 @@ class Bench:
         self.path = folder / "run.pansrec"
 
     def run(self, observers: Observers, decisions: int = 0, seconds: float = 0.0) -> RunResult:
-        config = RunConfig(n_cycles=decisions, seconds=seconds, deadline_us=1e9, lease_ms=self.profile.timing.lease_ms)
+        config = RunOptions(n_cycles=decisions, seconds=seconds, deadline_us=1e9, lease_ms=self.profile.timing.lease_ms)
         core = Core(self.plan, make_decider(self.bundle, backend="table"), 1, decisions)
         header = {"config": {"shots": 1, "tick_hz": self.profile.clock.tick_hz, "backend": "table", "dark": {}}}
         with Recorder(self.path, header, bundle=FASHION.read_bytes()) as recorder:

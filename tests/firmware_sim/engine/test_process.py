@@ -26,7 +26,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import ConfigError, UsageError
 from pans.runtime.instrument.profile import Profile, load_profile
 from pans.runtime.link.base import Link, open_link
-from pans.runtime.live import RunConfig, run_live
+from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.report.summary import Summary, summarise
 from pans.runtime.wire import messages as wire
@@ -106,7 +106,7 @@ def carried_out(link: Link, profile: Profile, bundle: Bundle, objects: int, path
     plan = build_plan(profile, bundle)
     backend = "table" if bundle.automaton is None else "automaton"
     decider = make_decider(bundle, shots=1, backend=backend)
-    config = RunConfig(1, objects * plan.cycles_per_object, deadline_us=1e6, realtime=False)
+    config = RunOptions(n_cycles=objects * plan.cycles_per_object, deadline_us=1e6, realtime=False)
     core = Core(plan, decider, 1, config.n_cycles)
     told = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
     with Recorder(path, {"config": told}) as recorder:

@@ -13,7 +13,7 @@ import pytest
 from pans.firmware_sim.checks.mutation import STAMP, Mutation, by, to
 from pans.firmware_sim.trials.fields import Session, Stage, sessions
 from pans.runtime.cli import main
-from pans.runtime.commands.carry_out import _exit_code
+from pans.runtime.commands.one_run import _exit_code
 
 ALL = 1 << 30
 SECOND = 1_000_000  # ticks of the instrument in these sessions

@@ -11,7 +11,7 @@ import pytest
 from pans.firmware_sim.checks.mutation import Mutation, by
 from pans.firmware_sim.trials.fields import Evidence, MutatedLink
 from pans.runtime.cli import EXIT_ALERT, EXIT_TIMING, main
-from pans.runtime.commands import carry_out
+from pans.runtime.commands import one_run
 from pans.runtime.errors import DamagedFileError
 from pans.runtime.instrument.calibration import find_warnings, load_calibration, now_utc, save_calibration
 from pans.runtime.instrument.profile import load_profile
@@ -25,7 +25,7 @@ def test_contradictions_are_a_fault_and_stand_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     opened = base.open_link
-    for module in (carry_out, reconnect, second_device):  # imported before: else they would keep the false one for good
+    for module in (one_run, reconnect, second_device):  # imported before: else they would keep the false one for good
         assert module.open_link is opened
     lie = Mutation("CLICKS", "object_index", *by(17), most=3)
     monkeypatch.setattr(base, "open_link", lambda url: MutatedLink(opened(url), (lie,), Evidence(1 << 40, 2, 10**6)))

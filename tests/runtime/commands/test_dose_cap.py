@@ -14,25 +14,24 @@ from commands import json_of
 
 from pans.runtime import SHIPPED
 from pans.runtime.bundle.automaton import STATES_MAX, DoseCap
-from pans.runtime.commands.job import Job, dose_of, stops_of
+from pans.runtime.commands.one_run import dose_of
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live.config import DarkSettings
+from pans.runtime.live import RunOptions
 from pans.runtime.record.sent_plan import automaton_of
 
 IDEAL = load_profile("ideal")
-JOB = Job(Path("toy.pans"), "sim:ideal", IDEAL, 100.0, IDEAL, dose_cap=3.0)
+CAPPED = RunOptions(dose_cap=3.0)
 
 
 def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
     bundle = automaton_bundle()
     assert bundle.automaton is not None
-    job = replace(JOB, dose_cap=6.0, trials=2)
-    dose = dose_of(job, bundle)
+    dose = dose_of(RunOptions(dose_cap=6.0, trials=2), bundle, IDEAL)
     assert dose is not None
     assert dose.most == 3.0
-    decider = make_decider(bundle, **stops_of(job, bundle))
+    decider = make_decider(bundle, dose=dose)
     automaton = decider.automaton  # type: ignore[attr-defined]
     assert automaton.n_states < bundle.automaton.n_states
     light = bundle.light_of(automaton)
@@ -54,34 +53,33 @@ def test_no_walk_of_a_run_passes_the_cap_of_its_object() -> None:
 
 def test_without_a_cap_nothing_changes() -> None:
     bundle = automaton_bundle()
-    assert dose_of(replace(JOB, dose_cap=0.0), bundle) is None
-    assert make_decider(bundle, **stops_of(replace(JOB, dose_cap=0.0), bundle)).automaton is bundle.automaton  # type: ignore[attr-defined]
+    assert dose_of(RunOptions(), bundle, IDEAL) is None
+    assert make_decider(bundle, dose=None).automaton is bundle.automaton  # type: ignore[attr-defined]
 
 
 def test_the_device_s_memory_for_states_bounds_the_automaton() -> None:
     bundle = automaton_bundle()
     for held, allowed in ((0, STATES_MAX), (7, 7), (10**6, STATES_MAX)):
         profile = replace(IDEAL, projector=replace(IDEAL.projector, automaton_states=held))
-        assert dose_of(replace(JOB, profile=profile), bundle) == DoseCap(3.0, allowed)
+        assert dose_of(CAPPED, bundle, profile) == DoseCap(3.0, allowed)
 
 
 def test_fixed_patterns_must_fit() -> None:
     bundle = made_bundle(3, 2, table=np.zeros((8, 2)))  # one photoelectron each
-    assert dose_of(JOB, bundle) is None
-    for changed in (replace(JOB, dose_cap=2.9), replace(JOB, shots=2), replace(JOB, trials=2)):
+    assert dose_of(CAPPED, bundle, IDEAL) is None
+    for changed in ({"dose_cap": 2.9}, {"shots": 2}, {"trials": 2}):
         with pytest.raises(
             UsageError, match=r"photoelectrons of illumination to an object .*--dose-cap allows"
         ) as told:
-            dose_of(changed, bundle)
+            dose_of(replace(CAPPED, **changed), bundle, IDEAL)
         assert "pans order" in (told.value.remedy or "")
     with pytest.raises(UsageError, match="has no automaton"):
         make_decider(bundle, dose=DoseCap(1.0))
 
 
 def test_what_a_cap_cannot_know_is_refused() -> None:
-    changed = replace(JOB, dark=DarkSettings(registration=Path("there.registration")))
     with pytest.raises(UsageError, match="not for passive optics"):
-        dose_of(changed, automaton_bundle())
+        dose_of(RunOptions(dose_cap=3.0, registration=Path("there.registration")), automaton_bundle(), IDEAL)
 
 
 @pytest.mark.parametrize("most", [0.0, -1.0, float("nan"), float("inf")])

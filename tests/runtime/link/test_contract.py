@@ -37,7 +37,7 @@ from pans.runtime.link.connection import Connection
 from pans.runtime.link.reader import LinkReader
 from pans.runtime.link.serial import SerialLink, latency_timer_ms, port_of
 from pans.runtime.link.usb import UsbLink, usb_target
-from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.wire import messages as wire
 
 PATIENCE_S = 20.0
@@ -180,7 +180,7 @@ def run_on(link: Link, n_cycles: int, recovery: Recovery | None = None, pull: An
     """Run `n_cycles` one-shot cycles of the small set-up on `link`; `pull` observes each block."""
     profile, bundle, plan = small_setup("sequential")
     core = Core(plan, make_decider(bundle), 1, n_cycles)
-    config = RunConfig(n_cycles=n_cycles, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=n_cycles, deadline_us=1e9, realtime=False)
     return run_live(link, profile, bundle, plan, core, config, recovery=recovery, observers=Observers(pull))
 
 

@@ -20,7 +20,7 @@ from pans.runtime.flow.make import plan_flow
 from pans.runtime.flow.plan import build_flow_plan
 from pans.runtime.flow.settings import FlowSettings, flow_of_header, read_flow
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
+from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import read_recording
 from pans.runtime.wire.messages import DARK_PATTERN
@@ -85,7 +85,7 @@ def test_the_instrument_pulses_what_was_asked_for_and_nothing_else(flow_folder: 
     def watch(run: LiveRun, output: Any) -> None:
         asked.extend(action.tick for action in output.actions)
 
-    config = RunConfig(n_cycles=cycles, deadline_us=1000.0)
+    config = RunOptions(n_cycles=cycles, deadline_us=1000.0)
     result = run_live(link, PROFILE, bundle, plan, core, config, observers=Observers(watch, flow.prepared))
     assert result.ended == "completed"
     pulses = [pulse.tick for pulse in device.gates.pulses]

@@ -21,8 +21,7 @@ from pans.runtime.flow.settings import FlowSettings
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link import connection
 from pans.runtime.link.base import open_link
-from pans.runtime.live import Observers, Recovery, RunConfig, run_live
-from pans.runtime.live.config import DarkSettings
+from pans.runtime.live import Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.dark_run import DarkRun
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, read_recording, replay
@@ -36,10 +35,10 @@ SETTINGS = FlowSettings("cells", fields_per_s=20_000.0, onset_frames=4, gate_cla
 def run(folder: Path, settings: FlowSettings, link: Any, turn: str, seconds: float, url: str = "") -> tuple[Any, ...]:
     bundle = load_bundle(folder / "thirds.pans")[0]
     plan, core, cycles = plan_flow(PROFILE, bundle, make_decider(bundle), settings, 1, seconds)
-    dark = DarkRun.of(DarkSettings(), PROFILE)
+    dark = DarkRun.of(RunOptions(), PROFILE)
     core.guard = dark.guard(plan, bundle, 1, flow=True)
     flow, path = FlowRun(core, None), folder / f"{turn}.pansrec"
-    config = RunConfig(n_cycles=cycles, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=cycles, deadline_us=1e9, realtime=False, turn=turn)
     facts = {"shots": 1, "tick_hz": PROFILE.clock.tick_hz, "backend": "table", "confidence": 0.0, "dark": dark.header()}
     with Recorder(path, {"config": facts | {"flow": flow.header()}}, overwrite=True) as recorder:
         recovery, observers = Recovery.of(link, url, 10.0), Observers(prepared=flow.prepared)

@@ -19,7 +19,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DeviceError, LinkError
 from pans.runtime.instrument.profile import load_profile
 from pans.runtime.link.base import Link
-from pans.runtime.live import RunConfig, RunResult, run_live
+from pans.runtime.live import RunOptions, RunResult, run_live
 from pans.runtime.record import read_recording
 
 PROFILE = load_profile("oled-qcmos")
@@ -78,7 +78,7 @@ def run(
     plan = build_plan(PROFILE, bundle, shots_per_object=trials * shots, **options)
     link: Link = open_sim(f"sim:oled-qcmos?scene={scene}&seed=5&pace=fast")
     link = link if wrap is None else wrap(link)
-    config = RunConfig(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
+    config = RunOptions(shots=shots, n_cycles=n_objects * plan.cycles_per_object, deadline_us=16667.0)
     return run_live(
         link, PROFILE, bundle, plan, Core(plan, make_decider(bundle, shots=shots), shots, config.n_cycles), config
     )
@@ -174,7 +174,7 @@ def test_a_device_of_another_kind_is_refused(bundle: Bundle, scene: Path) -> Non
     plan = build_plan(PROFILE, bundle, shots_per_object=1)
     link = open_sim(f"sim:dmd-spad?scene={scene}&pace=fast")
     with pytest.raises(DeviceError, match=r"projector levels: 2, needed 124"):
-        run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunConfig(n_cycles=1))
+        run_live(link, PROFILE, bundle, plan, Core(plan, make_decider(bundle), 1, 1), RunOptions(n_cycles=1))
 
 
 def test_several_shots_per_decision(bundle: Bundle, scene: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import LinkError
 from pans.runtime.link.base import open_link
-from pans.runtime.live import Observers, Recovery, RunConfig, run_live
+from pans.runtime.live import Observers, Recovery, RunOptions, run_live
 from pans.runtime.live.reconnect import MOST_FRUITLESS
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.turn.system import offered
@@ -92,7 +92,7 @@ def test_the_frames_of_attempts_that_failed_are_counted(mode: str) -> None:
         first.link.pause,
     )
     core = Core(plan, make_decider(bundle, backend="table"), 1, CYCLES)
-    config = RunConfig(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
     result = run_live(first, profile, bundle, plan, core, config, None, recovery)
     assert (result.ended, result.reconnects) == ("completed", 1)
     assert min(frames["first attempt"], frames["second attempt"]) > 0
@@ -107,7 +107,7 @@ def test_what_comes_before_arm_is_no_part_of_the_run(tmp_path: Path, turn: str) 
     device = Instrument(profile, load_scene("uniform"), seed=1, power_on_tick=clock.tick_at(START_NS))
     first = VirtualLink(device, clock, "sim:stop")
     core = Core(plan, make_decider(bundle, backend="table"), 1, plan.cycles_per_object)
-    config = RunConfig(n_cycles=plan.cycles_per_object, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=plan.cycles_per_object, deadline_us=1e9, realtime=False, turn=turn)
 
     def broken(run: Any, output: Any) -> None:
         if output.block_end_tick is not None and not run.reconnects:
@@ -152,7 +152,7 @@ def recorded_run(path: Path, link: Any, mode: str, turn: str, url: str = "") -> 
     profile, bundle, plan = small_setup(mode)
     backend = "table" if bundle.automaton is None else "automaton"
     core = Core(plan, make_decider(bundle, shots=1, backend=backend), 1, FEW)
-    config = RunConfig(n_cycles=FEW, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=FEW, deadline_us=1e9, realtime=False, turn=turn)
     facts = {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": backend, "drive": plan.drive, "confidence": 0.0}
     with Recorder(path, {"config": facts}) as recorder:
         result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, url, 60.0))

@@ -20,7 +20,7 @@ from pans.firmware_sim.trials import fault_grid
 from pans.runtime import SHIPPED
 from pans.runtime.flow.core import FlowCore
 from pans.runtime.link.base import open_link
-from pans.runtime.live import Observers, RunConfig, RunResult, run_live
+from pans.runtime.live import Observers, RunOptions, RunResult, run_live
 from pans.runtime.live.config import COMPILED, PYTHON
 from pans.runtime.live.flow_run import FlowRun
 from pans.runtime.record import Recorder, Recording, read_recording, replay
@@ -100,7 +100,7 @@ def session(
     device = Repeating(one.profile, one.scene, seed=seed, power_on_tick=clock.tick_at(START_NS))
     device.repeats = repeats
     flow = FlowRun(one.core, None) if isinstance(one.core, FlowCore) else None
-    config = RunConfig(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=turn)
     header = fault_grid._recorded(one, {} if flow is None else {"flow": flow.header()})
     observers = Observers(prepared=lambda run: None if flow is None else flow.prepared(run))
     with Recorder(path, {"config": header}, overwrite=True) as recorder:
@@ -210,7 +210,7 @@ def test_a_call_that_goes_on_compares_too(how: int, tmp_path: Path) -> None:
     port, stopped = open_port("tcp:127.0.0.1:0"), threading.Event()
     thread = threading.Thread(target=serve, args=(device, clock, port, stopped.is_set), daemon=True)
     thread.start()
-    config = RunConfig(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=COMPILED)
+    config = RunOptions(n_cycles=one.n_cycles, deadline_us=1e9, realtime=False, turn=COMPILED)
     with Recorder(tmp_path / "run.pansrec", {"config": fault_grid._recorded(one, {})}) as recorder:
         result = run_live(open_link(port.url), one.profile, one.bundle, one.plan, one.core, config, recorder)
         recorder.close({})

@@ -23,7 +23,7 @@ from commands import fixed_run
 from pans.runtime import SHIPPED, monitor
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.cli import main
-from pans.runtime.commands import carry_out
+from pans.runtime.commands import one_run
 from pans.runtime.instrument.cusum import ChannelWatch
 from pans.runtime.intervals import wilson_interval
 from pans.runtime.monitor import History, Monitor, Snapshots
@@ -194,7 +194,7 @@ def test_the_pictures_of_a_run_add_up_to_its_summary(tmp_path: Path, monkeypatch
         def __exit__(self, *_: Any) -> None:
             self.history.take(json.loads(json.dumps(self.snapshots.take(lambda _: None))))
 
-    monkeypatch.setattr(carry_out, "_monitor_of", lambda job: Watched(panel=False))
+    monkeypatch.setattr(one_run, "_monitor_of", lambda job: Watched(panel=False))
     assert main([*fixed_run(60, trials=2), "--out", str(tmp_path / "run")]) == 0
     (run, history) = made[0]
     tally, last = run.tally, history.picture
@@ -237,7 +237,7 @@ def test_a_walk_is_told_pattern_by_pattern(tmp_path: Path, monkeypatch: pytest.M
                 assert node >= automaton.n_states  # at a leaf
                 assert sum(word["clicks"]) == one["latest"][-1][4]
 
-    monkeypatch.setattr(carry_out, "_monitor_of", lambda job: Watched(panel=False))
+    monkeypatch.setattr(one_run, "_monitor_of", lambda job: Watched(panel=False))
     assert main(["demo", "--pace", "fast", "--seconds", "0.2", "--out", str(tmp_path / "run")]) == 0
     assert len(words) > 10
     assert begin_facts(load_bundle(SHIPPED / "fashion-adaptive.pans")[0])["encoder"] == "automaton"

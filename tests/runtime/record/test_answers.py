@@ -14,7 +14,7 @@ from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, DeviceError
-from pans.runtime.live import LiveRun, Observers, RunConfig, run_live
+from pans.runtime.live import LiveRun, Observers, RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording, replay
 from pans.runtime.record.format import Kind
 from pans.runtime.wire.messages import MessageType, Opcode, unpack_body
@@ -27,7 +27,7 @@ def record(path: Path, prepared: Any = None) -> Path:
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
     header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
     core = Core(plan, make_decider(bundle, backend="table"), 1, CYCLES)
-    config = RunConfig(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
     with Recorder(path, header, bundle=bundle_bytes(bundle)) as recorder:
         link = open_sim("sim:ideal?scene=uniform&pace=fast&seed=1")
         run_live(link, profile, bundle, plan, core, config, recorder, observers=Observers(prepared=prepared))

@@ -13,7 +13,7 @@ from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import bundle_bytes
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
-from pans.runtime.live import Recovery, RunConfig, run_live
+from pans.runtime.live import Recovery, RunOptions, run_live
 from pans.runtime.record import Recorder, Recording, read_recording, replay
 from pans.runtime.record.format import Kind
 
@@ -29,7 +29,7 @@ def record(path: Path, faults: str = "", seed: int = 1) -> Path:
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}}
     header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
     core = Core(plan, make_decider(bundle, backend="table"), 1, CYCLES)
-    config = RunConfig(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=CYCLES, deadline_us=1e9, realtime=False)
     with Recorder(path, header, bundle=bundle_bytes(bundle)) as recorder:
         result = run_live(link, profile, bundle, plan, core, config, recorder, Recovery.of(link, url, 10.0))
         recorder.close({"decisions": result.tally.decisions})

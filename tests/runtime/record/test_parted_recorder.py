@@ -19,7 +19,7 @@ from pans.runtime.cli import main
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import DamagedFileError, RecordingError, UsageError
-from pans.runtime.live import LiveRun, Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live import LiveRun, Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.record import PartedRecorder, read_recording, replay
 from pans.runtime.record.part_keeper import PartLimits, index_path, part_path
 from pans.runtime.record.parts import chain_violations, first_decision, part_of, parts_in
@@ -38,7 +38,7 @@ def record(
     header = {"config": {"shots": 1, "tick_hz": profile.clock.tick_hz, "backend": "table"}, "simulated": True}
     header["profile"] = {"name": profile.name, "sha256": profile.sha256, "toml": profile.text}
     core = Core(plan, make_decider(bundle, backend="table"), 1, cycles)
-    config = RunConfig(n_cycles=cycles, deadline_us=1e9, realtime=False)
+    config = RunOptions(n_cycles=cycles, deadline_us=1e9, realtime=False)
     folder.mkdir(exist_ok=True)
     with PartedRecorder(folder / "run.pansrec", header, limits, bundle=bundle_bytes(bundle)) as recorder:
 

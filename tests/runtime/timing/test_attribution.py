@@ -21,7 +21,7 @@ from pans.runtime.core.plan import build_plan
 from pans.runtime.core.still import Core
 from pans.runtime.decide.backends import make_decider
 from pans.runtime.instrument.profile import load_profile
-from pans.runtime.live import RunConfig, run_live
+from pans.runtime.live import RunOptions, run_live
 from pans.runtime.record import Recorder, read_recording
 from pans.runtime.timing.attribution import CAUSES, QUIET_NS, Incidents, LateWork, judge, judge_gap
 from pans.runtime.timing.evidence import (
@@ -269,7 +269,7 @@ def test_memory_is_bounded() -> None:
 )
 def test_whole_runs_in_virtual_time_blame_what_was_done_to_them(faults: str, causes: set[str], tmp_path: Path) -> None:
     profile, bundle, plan = small_setup("sequential")
-    config = RunConfig(n_cycles=8000, deadline_us=10_000.0, realtime=False)
+    config = RunOptions(n_cycles=8000, deadline_us=10_000.0, realtime=False)
     core = Core(plan, make_decider(bundle, backend="table"), 1, config.n_cycles)
     path = tmp_path / "run.pansrec"
     with Recorder(path, {}) as recorder:

@@ -41,7 +41,7 @@ from pans.runtime.decide.backends import make_decider
 from pans.runtime.errors import UsageError
 from pans.runtime.link.base import open_link
 from pans.runtime.link.connection import Connection
-from pans.runtime.live import Observers, Recovery, RunConfig, RunResult, run_live
+from pans.runtime.live import Observers, Recovery, RunOptions, RunResult, run_live
 from pans.runtime.live.compiled import CompiledTurns
 from pans.runtime.live.drive import HostDriver, WalkPlace
 from pans.runtime.live.loop import NO_OBSERVERS, choose_turn
@@ -83,7 +83,7 @@ class Served:
 def recorded(setup: Any, link: Any, path: Path, turn: str, observers: Any = NO_OBSERVERS) -> tuple[RunResult, Any]:
     backend = "table" if setup.bundle.automaton is None else "automaton"
     decider = make_decider(setup.bundle, shots=1, backend=backend)
-    config = RunConfig(1, OBJECTS * setup.plan.cycles_per_object, 0.0, 1e9, realtime=False, turn=turn)
+    config = RunOptions(n_cycles=OBJECTS * setup.plan.cycles_per_object, deadline_us=1e9, realtime=False, turn=turn)
     core = Core(setup.plan, decider, 1, config.n_cycles)
     driven = {"drive": setup.plan.drive, "confidence": 0.0}
     facts = {"config": {"shots": 1, "tick_hz": setup.profile.clock.tick_hz, "backend": backend, **driven}}

@@ -26,8 +26,8 @@ from pans.firmware_sim.ports.virtual import VirtualLink
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.commands import carry_out
-from pans.runtime.commands.carry_out import _exit_code
+from pans.runtime.commands import one_run
+from pans.runtime.commands.one_run import _exit_code
 from pans.runtime.errors import UsageError
 from pans.runtime.live.continuous import ASKED_TO_STOP, INTERRUPTED, RECORDING_DELETED, Stop, stop_signals
 from pans.runtime.record import Recorder, read_recording
@@ -295,7 +295,7 @@ def test_a_busy_port_is_refused_before_anything_is_prepared(
     pytest.importorskip("prometheus_client")
     begun = list[str]()
     for name in ("open_link", "compiled_beside", "_prepare"):
-        monkeypatch.setattr(carry_out, name, lambda *_, name=name: begun.append(name))
+        monkeypatch.setattr(one_run, name, lambda *_, name=name: begun.append(name))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         words = ["run", str(bundle_file), "--device", f"{DEVICE}&pace=fast", "--out", str(tmp_path / "out")]
@@ -348,7 +348,7 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_stays_an_int
         except KeyboardInterrupt as interrupt:
             raise ImportError("initialization failed") from interrupt
 
-    monkeypatch.setattr("pans.runtime.commands.carry_out._prepare", loading)
+    monkeypatch.setattr("pans.runtime.commands.one_run._prepare", loading)
     words = ["run", str(bundle_file), "--device", "sim:ideal?pace=fast&scene=uniform", "--out", str(tmp_path / "out")]
     assert main([*words, "--decisions", "4"]) == 130
 

@@ -12,9 +12,8 @@ import pytest
 from pans.firmware_sim.testing import small_setup
 from pans.runtime.bundle.model import write_bundle
 from pans.runtime.cli import main
-from pans.runtime.live.continuous import Continuous
+from pans.runtime.live.run_options import RunOptions
 from pans.runtime.record import read_recording
-from pans.runtime.record.part_keeper import PartLimits
 from pans.runtime.watch import host
 from pans.runtime.watch.host import ClockSteps, DiskTrend, HostWatch, clock_is_synchronised, clock_offset_ns
 
@@ -96,9 +95,9 @@ def test_without_a_reserve_nothing_is_stopped(tmp_path: Path, monkeypatch: pytes
 
 
 def test_parts_are_deleted_before_a_run_is_stopped() -> None:
-    assert Continuous(None, disk_reserve=64 * MIB).stop_below == 64 * MIB
-    assert Continuous(PartLimits(10 * MIB), disk_reserve=64 * MIB).stop_below == 5 * MIB  # the keeper deletes below 20
-    assert Continuous(PartLimits(10 * MIB), disk_reserve=0).stop_below == 0
+    assert RunOptions(disk_reserve_mb=64).stop_below == 64 * MIB
+    assert RunOptions(rotate_mb=10, disk_reserve_mb=64).stop_below == 5 * MIB  # the keeper deletes below 20
+    assert RunOptions(rotate_mb=10, disk_reserve_mb=0).stop_below == 0
 
 
 @pytest.fixture

@@ -1,0 +1,564 @@
+"""One run from its options to its files: check, prepare, open, run, report. `run_once` is the page to read.
+
+What is prepared (bundle, plan, core, header) is made while the port opens. The loop is live/loop.py's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pans.runtime.cli import EXIT_ALERT, EXIT_DEVICE, EXIT_FINE, EXIT_INTERRUPTED, EXIT_TIMING, emit, say, warn
+from pans.runtime.cli.option_fields import check_options, option_fields, refuse_without
+from pans.runtime.cli.talk import is_quiet
+from pans.runtime.errors import DamagedFileError, PansError, UsageError
+from pans.runtime.flow.settings import FlowSettings, read_flow, with_gate
+from pans.runtime.html_card import html_card
+from pans.runtime.instrument.calibration import MAX_AGE_H
+from pans.runtime.instrument.profile import Profile, load_profile
+from pans.runtime.link.base import open_link
+from pans.runtime.live.continuous import (
+    DISK_NEARLY_FULL,
+    INTERRUPTED,
+    RECORDING_DELETED,
+    REFUSED,
+    Stop,
+    open_recorder,
+    stop_signals,
+)
+from pans.runtime.live.run_options import FLOW, RunOptions
+from pans.runtime.operate.first_start import compiled_beside, load_ahead
+from pans.runtime.timing.cpu import check_core
+
+from .run_files import check_run_files, claimed, gone_if_refused, part_limits, recording_header, what_was_run
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pans.runtime.bundle.automaton import DoseCap
+    from pans.runtime.bundle.model import Bundle
+    from pans.runtime.core.decision import Output
+    from pans.runtime.core.plan import Plan
+    from pans.runtime.decide.verdict import Decider
+    from pans.runtime.link.base import Link
+    from pans.runtime.live import LiveCore, LiveRun, RunResult
+    from pans.runtime.live.dark_run import DarkRun
+    from pans.runtime.live.flow_run import FlowRun
+    from pans.runtime.monitor import Monitor
+    from pans.runtime.record import AnyRecorder
+    from pans.runtime.registration.use import InUse
+    from pans.runtime.report.summary import Summary
+    from pans.runtime.watch import Watchdog
+    from pans.runtime.watch.metrics import MetricsServer
+
+ROUNDING = 1e-9  # of a dose cap: a sum of light is known to so many digits
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a run: its summary, truth against decision (classes, classes), and the files that it left."""
+
+    summary: Summary
+    confusion: NDArray[np.int64]
+    recording: Path | None
+    report: Path | None
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the figures of the summary, and the files."""
+        found = self.summary.as_json()
+        names = ("verdict", "faults", "ended", "decisions", "accuracy", "clicks_mean", "photons_mean", "illumination")
+        latency = found.get("latency_us") or {}
+        rows = {
+            "clicks are": "SIMULATED" if found.get("simulated") else "",
+            **{name: found.get(name) for name in (*names, "late", "lost")},
+            "latency p99 (us)": latency.get("p99"),
+            "recording": self.recording,
+        }
+        return html_card("Run", rows)
+
+
+class _Around(NamedTuple):
+    """What lives around a run: who ends it, who displays it, and what is closed when its outcome is known."""
+
+    stop: Stop
+    watchdog: Watchdog | None
+    monitor: Monitor
+    compiled: Callable[[], None]  # waits until the largest kernels are
+    metrics: MetricsServer | None
+    ending: ExitStack
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """All that a run needs but its link."""
+
+    profile: Profile
+    bundle: Bundle  # with the patterns that are displayed
+    bundle_sha256: str
+    decider: Decider
+    dark: DarkRun
+    plan: Plan
+    core: LiveCore
+    flow_run: FlowRun | None
+    frames: int  # of a decision: shots, times the windows of a flow that are added
+    options: RunOptions  # as `run_live` takes them
+    header: dict[str, Any]
+    expected_decisions: int
+    registration: InUse | None
+    warnings: Sequence[str]
+
+
+def run_and_report(args: argparse.Namespace, options: RunOptions) -> int:
+    """Run, print how it went and return the exit code."""
+    from pans.runtime.report.words import closing_words
+
+    def tell(done: Outcome) -> None:
+        files = {"recording": str(done.recording), "report": str(done.report)}
+        payload = {**done.summary.as_json(), **files, "shots": options.shots, "seed": getattr(args, "seed", None)}
+        emit(args, payload, closing_words(done.summary, **files))
+
+    options = replace(options, started_ns=process_start_ns())
+    return _exit_code(run_once(options, ends_process=True, tell=tell).summary)
+
+
+def run_once(
+    options: RunOptions,
+    profile: Profile | None = None,
+    *,
+    ends_process: bool = False,
+    tell: Callable[[Outcome], None] = lambda done: None,
+) -> Outcome:
+    """Run and leave the files; `profile` takes the place of the one that `options` name.
+
+    With `ends_process` a run that hangs when a signal asks for its end takes the process with it (watch/watchdog.py). `tell` gets the
+    outcome once the files are whole and before the link is closed, which may wait for a device or a child process.
+    """
+    check_together(options)
+    profile = profile or load_profile(options.profile or "")
+    options = replace(
+        options,
+        deadline_us=options.deadline_us or profile.timing.decision_deadline_us,
+        started_ns=options.started_ns or time.perf_counter_ns(),
+    )
+    check_run_files(options)
+    continuous, watchdog = not (options.seconds or options.decisions), None
+    with stop_signals(continuous=continuous) as stop, ExitStack() as watched:
+        if ends_process:
+            from pans.runtime.watch import Watchdog
+
+            watchdog = watched.enter_context(Watchdog(continuous=continuous))
+        try:
+            # ports first: a busy one is refused before anything is compiled or opened
+            with _metrics_of(options) as metrics, ExitStack() as ending:
+                with _monitor_of(options) as monitor, compiled_beside() as compiled:
+                    around = _Around(stop, watchdog, monitor, compiled, metrics, ending)
+                    done = _prepare_and_run(options, profile, around)
+                tell(done)
+                return done
+        except PansError:
+            raise
+        except Exception as error:
+            if stop.raised:  # a library that was being loaded makes an ImportError of the interrupt
+                raise KeyboardInterrupt(stop.word) from error
+            raise
+
+
+# ---- check ----
+
+
+def check_together(options: RunOptions) -> None:
+    """Raise UsageError for options that are out of range, or make no sense together."""
+    check_options(options)
+    check_core(options.core)
+    if options.flow is None:
+        of_flow = {one.name: one.default for one, _ in option_fields(options) if one.metadata["group"] == FLOW}
+        refuse_without(options, "--flow", of_flow)
+    elif flow_of(options) is not None and (options.decisions or options.trials != 1):
+        raise UsageError(
+            "a flow has as many decisions as objects pass", remedy="--seconds, in place of --decisions and --trials"
+        )
+    if options.calibration is None and options.registration is None:
+        refuse_without(options, "--calibration or --registration", {"calibration_max_age_h": MAX_AGE_H})
+    if options.keep_mb and not options.rotate_mb:
+        raise UsageError("--keep-mb deletes parts, and there are none", remedy="say how large with --rotate-mb")
+    if options.rotate_mb and options.on_dark != "warn":
+        raise UsageError(
+            f"--rotate-mb with --on-dark {options.on_dark}: what the guard has learnt is not in a part, which could not be replayed",
+            remedy="record without parts, or use --on-dark warn",
+        )
+    part_limits(options)
+    _check_address(options.serve, options.serve_public, "--serve")
+    _check_address(options.metrics, options.metrics_public, "--metrics")
+
+
+def _check_address(address: str, public: bool, option: str) -> None:
+    """Check where a page is served; one that others can reach is said aloud."""
+    if not address:
+        if public:
+            raise UsageError(f"{option}-public has no effect without {option}", remedy=f"add {option}, or leave it out")
+        return
+    from pans.runtime.watch.metrics import check_address, is_public
+
+    check_address(address, public=public, option=option)
+    if is_public(address):
+        warn(f"other machines can read the figures at {address}; there is no password")
+
+
+def flow_of(options: RunOptions) -> FlowSettings | None:
+    """Return the settings of the flow that is asked for; None without one."""
+    if options.flow is None:
+        return None
+    classes = tuple(name for part in options.gate_class for name in part.split(",") if name)
+    settings = with_gate(read_flow(options.flow), classes, options.gate_delay_us)
+    return settings if options.pool is None else replace(settings, pool=options.pool)
+
+
+def dose_of(options: RunOptions, bundle: Bundle, profile: Profile) -> DoseCap | None:
+    """Return what each walk of an automaton may bring, so that no object receives more than the dose cap; None of fixed patterns.
+
+    UsageError where the cap cannot be kept: for fixed patterns that bring more, passive bundles, objects in flow, and patterns that a
+    registration changes.
+    """
+    if not options.dose_cap:
+        return None
+    if bundle.analyser is not None or options.flow is not None or options.registration is not None:
+        raise UsageError(
+            "--dose-cap is for patterns that are displayed to one object after another as the bundle states them: not for passive "
+            "optics, --flow or --registration",
+            remedy="leave --dose-cap out, or the other one",
+        )
+    if bundle.automaton is not None:
+        from pans.runtime.bundle.automaton import STATES_MAX, DoseCap
+
+        states = min(profile.projector.automaton_states or STATES_MAX, STATES_MAX)
+        return DoseCap(options.dose_cap / options.trials, states)
+    light = bundle.illumination() * options.shots * options.trials
+    if light > options.dose_cap * (1 + ROUNDING):
+        raise UsageError(
+            f"{bundle.name} sends {light:.6g} photoelectrons of illumination to an object ({bundle.n_features} patterns, "
+            f"{options.shots} shots, {options.trials} trials), --dose-cap allows {options.dose_cap:.6g}",
+            remedy="pans order BUNDLE --by dose --dose-cap N makes a bundle of as many patterns as stay below; or fewer shots or trials",
+        )
+    return None
+
+
+# ---- prepare ----
+
+
+def _prepare(options: RunOptions, profile: Profile) -> _Prepared:
+    from pans.runtime.bundle.model import load_bundle
+    from pans.runtime.core.plan import build_plan, detector_warnings
+    from pans.runtime.core.plan_codec import drive_words
+    from pans.runtime.core.still import Core
+    from pans.runtime.decide.backends import make_decider
+    from pans.runtime.flow.make import plan_flow
+    from pans.runtime.instrument.calibration import now_utc
+    from pans.runtime.live.dark_run import DarkRun
+    from pans.runtime.live.flow_run import FlowRun
+    from pans.runtime.live.gates import open_actuator
+    from pans.runtime.registration.use import in_use
+
+    flow, shots = flow_of(options), options.shots
+    bundle, bundle_sha256 = load_bundle(options.bundle)
+    dose = dose_of(options, bundle, profile)
+    decider = make_decider(bundle, shots=shots, backend=options.backend, confidence=options.confidence, dose=dose)
+    placed = in_use(options.registration, bundle, profile, now_utc(), options.calibration_max_age_h)
+    if placed is not None:
+        say(f"pans: {placed.words()}")
+        bundle = placed.shown
+    dark = DarkRun.of(options, placed.profile if placed and not options.calibration else profile)
+    n_objects, flow_run = -(-options.decisions // options.trials), None
+    core: LiveCore
+    if flow is not None:
+        plan, flow_core, n_cycles = plan_flow(dark.profile, bundle, decider, flow, shots, options.seconds)
+        flow_core.guard = dark.guard(plan, bundle, shots, flow=True)
+        second = load_profile(options.act_profile) if options.act_profile else profile
+        core, flow_run = flow_core, FlowRun(flow_core, open_actuator(options.act, second))
+    else:
+        plan = build_plan(
+            dark.profile,
+            bundle,
+            shots_per_object=shots * options.trials,
+            dark_slots_per_cycle=options.dark_slots,
+            order=options.order,
+            drive=options.drive,
+            automaton=getattr(decider, "automaton", None),
+        )
+        if plan.automaton is not None:
+            say(f"pans: {drive_words(dark.profile, bundle, plan)}")
+        n_cycles = n_objects * plan.cycles_per_object
+        core = Core(plan, decider, shots, n_cycles, dark.guard(plan, bundle, shots))
+    header = recording_header(options, profile, bundle_sha256, decider, n_objects, plan)
+    header["config"] |= {"dark": dark.header()}
+    header["config"] |= {} if placed is None else {"registration": placed.header()}
+    header["config"] |= {} if flow_run is None else {"flow": flow_run.header()}
+    return _Prepared(
+        profile=profile,
+        bundle=bundle,
+        bundle_sha256=bundle_sha256,
+        decider=decider,
+        dark=dark,
+        plan=plan,
+        core=core,
+        flow_run=flow_run,
+        frames=shots * (1 if flow is None else flow.pool),
+        # the end of a flow is in its plan
+        options=replace(
+            options,
+            n_cycles=n_cycles,
+            lease_ms=profile.timing.lease_ms,
+            seconds=options.seconds if flow is None else 0.0,
+        ),
+        header=header,
+        expected_decisions=n_objects * options.trials,
+        registration=placed,
+        warnings=[*dark.warnings, *detector_warnings(dark.profile, bundle, plan.exposure_us)],
+    )
+
+
+# ---- open ----
+
+
+def _prepare_and_run(options: RunOptions, profile: Profile, around: _Around) -> Outcome:
+    opening = _in_background(lambda: open_link(options.device))
+    if around.monitor.url:
+        say(f"pans: live page at {around.monitor.url}")
+    try:
+        ready = _prepare(options, profile)
+        load_ahead()
+    except BaseException as error:
+        besides = _closed_quietly(opening)
+        if besides and isinstance(error, PansError):
+            error.message += f"\nbesides, the device could not be opened: {besides}"
+        raise
+    for warning in ready.warnings:
+        warn(warning)
+    link = opening.result()
+    around.ending.callback(link.close)
+    with claimed(options) as options:
+        if options.trace is not None:
+            link = _traced(options, link, options.trace, around)
+        return _recorded(options, ready, link, around)
+
+
+def _in_background(call: Callable[[], Link]) -> Future[Link]:
+    """Begin `call` in a thread, so that a port can open while the compiled kernels load; the thread does not keep the process."""
+    future: Future[Link] = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return future
+
+
+def _closed_quietly(opening: Future[Link]) -> str:
+    """Close the link that is being opened; return why it could not be, "" where it could."""
+    try:
+        opening.result().close()
+    except Exception as error:
+        return str(error)
+    return ""
+
+
+def _traced(options: RunOptions, link: Link, path: Path, around: _Around) -> Link:
+    """Return `link` with a trace; one that could not be written to its end is reported, and ends nothing."""
+    from pans.runtime.link.trace import TracedLink
+
+    traced = TracedLink(link, path, options.device, force=options.force)
+
+    def close() -> None:
+        traced.close()
+        if traced.trouble:
+            say(f"pans: {path}: the trace is not whole: {traced.trouble}")
+
+    around.ending.callback(close)
+    return traced
+
+
+@contextmanager
+def _metrics_of(options: RunOptions) -> Iterator[MetricsServer | None]:
+    if not options.metrics:
+        yield None
+        return
+    from pans.runtime.watch.metrics import MetricsServer
+
+    with closing(MetricsServer(options.metrics)) as server:
+        yield server
+
+
+def _monitor_of(options: RunOptions) -> Monitor:
+    from pans.runtime.monitor import Monitor
+
+    panel = options.display and not is_quiet() and sys.stderr.isatty()
+    return Monitor(panel=panel, address=options.serve, lines=options.display)
+
+
+# ---- run ----
+
+
+def _recorded(options: RunOptions, ready: _Prepared, link: Link, around: _Around) -> Outcome:
+    """Run with a recording, if one is asked for."""
+    if options.recording is None:
+        result = _watched(options, ready, link, None, around)
+        return _conclude(options, ready, result, _summary(options, ready, result))
+    header = ready.header | {"simulated": link.simulated}
+    with ExitStack() as opened:
+        opened.enter_context(gone_if_refused(options))
+        # the bundle's bytes are not held by a name: they may have 64 MiB, and the run begins here
+        recorder = opened.enter_context(
+            open_recorder(
+                options.recording, header, _same_bundle(options, ready), part_limits(options), force=options.force
+            )
+        )
+        result = _watched(options, ready, link, recorder, around)
+        summary = _summary(options, ready, result)
+        if (kept := recorder.keep_deleted()) is not None:
+            options = replace(options, out=kept.parent, record=kept, rotate_mb=None)
+            fault = f"{RECORDING_DELETED}: what could be kept of it is now {kept}"
+            warn(fault)
+            summary = replace(summary, verdict="FAIL", faults=[*summary.faults, fault])
+        summary = replace(summary, decisions_sha256=recorder.close(summary.as_json()))
+    return _conclude(options, ready, result, summary)
+
+
+def _same_bundle(options: RunOptions, ready: _Prepared) -> bytes:
+    """Return the bundle's file once more, for the recording; DamagedFileError if it is no longer the one that decides."""
+    from pans.runtime.container import read_file
+
+    data = read_file(options.bundle)
+    if hashlib.sha256(data).hexdigest() != ready.bundle_sha256:
+        raise DamagedFileError(f"{options.bundle}: changed while the run began", remedy="run it again")
+    return data
+
+
+def _watched(
+    options: RunOptions, ready: _Prepared, link: Link, recorder: AnyRecorder | None, around: _Around
+) -> RunResult:
+    """Run, with all observers: the dark counts' guard, the live view, metrics and the state file."""
+    from pans.runtime.live import Observers, Recovery
+    from pans.runtime.live.loop import running
+    from pans.runtime.watch import Attendants
+
+    dark, monitor = ready.dark, around.monitor
+    recovery = Recovery.of(link, options.device, options.reconnect_s) if options.reconnect_s else None
+    monitor.begin(ready.bundle, recorder, _facts(options, ready, link))
+    with Attendants(options, recorder, around.watchdog, around.stop, around.metrics) as seen:
+
+        def prepared(run: LiveRun) -> None:
+            dark.check_device(run)
+            if ready.registration is not None:
+                ready.registration.check_device(dark.serial_of(run))
+            _name_scene(run, options.device)
+            seen.prepared(run)
+            monitor.prepared(run)
+            if ready.flow_run is not None:
+                ready.flow_run.prepared(run)
+
+        def look(run: LiveRun, output: Output) -> None:
+            dark.look(run, output)
+            seen.tell(run)
+            monitor.watch(run, output)
+
+        observers = Observers(look, prepared, around.stop, acts=False, uploaded=around.compiled)
+        what = dark.profile, ready.bundle, ready.plan, ready.core, ready.options
+        return around.ending.enter_context(running(link, *what, recorder, recovery, observers))
+
+
+def _facts(options: RunOptions, ready: _Prepared, link: Link) -> dict[str, Any]:
+    """What a live view is told before the run."""
+    from pans.runtime.monitor.snapshot import begin_facts
+
+    bundle = ready.bundle
+    return begin_facts(
+        bundle,
+        title=f"{bundle.name} on {ready.profile.name}",
+        simulated=link.simulated,
+        expected=ready.expected_decisions,
+        deadline_us=options.deadline_us,
+        trials=options.trials,
+        illumination=bundle.illumination() * ready.frames,
+    )
+
+
+def _name_scene(run: LiveRun, device: str) -> None:
+    from pans.runtime.link.scene_fit import scene_words
+
+    welcome = run.connection.session.welcome
+    if welcome is not None and (words := scene_words(welcome.facts, device)):
+        say(f"pans: {words}")
+
+
+# ---- report ----
+
+
+def _summary(options: RunOptions, ready: _Prepared, result: RunResult) -> Summary:
+    from pans.runtime.report.summary import summarise, walk_figures
+
+    walks = walk_figures(result, ready.plan, ready.bundle, ready.profile.name, options.confidence)
+    shown = None if walks is None else walks.illumination_mean
+    return summarise(
+        result,
+        illumination=ready.bundle.illumination() * ready.frames if shown is None else shown,
+        expected_decisions=ready.expected_decisions,
+        flow=None if ready.flow_run is None else ready.flow_run.figures(),
+        dark=ready.dark.figures(result.dark),
+        walks=walks,
+        registration=None if ready.registration is None else ready.registration.facts(),
+    )
+
+
+def _conclude(options: RunOptions, ready: _Prepared, result: RunResult, summary: Summary) -> Outcome:
+    """Write the page and return what came of the run."""
+    from pans.runtime.record.part_keeper import index_path
+    from pans.runtime.report.summary_page import write_markdown
+
+    confusion, page, bundle = result.tally.confusion, options.page, ready.bundle
+    if ready.flow_run is not None:
+        confusion = confusion + ready.flow_run.core.matcher.confusion
+    recording = options.recording
+    if recording is not None and options.rotate_bytes:
+        recording = index_path(recording)
+    if page is not None:
+        facts = what_was_run(
+            options, ready.profile, bundle.name, ready.bundle_sha256, ready.decider.name, recording, summary
+        )
+        write_markdown(page, summary, facts, confusion, bundle.classes, force=options.force)
+    return Outcome(summary, confusion, recording, page)
+
+
+def process_start_ns() -> int:
+    """Return when this process started on the scale of time.perf_counter_ns (Linux), or now where that is not known."""
+    now_ns = time.perf_counter_ns()
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        ticks_hz = 100  # USER_HZ: fixed at 100 in the ABI of Linux
+        age_s = float(Path("/proc/uptime").read_text().split()[0]) - int(fields[19]) / ticks_hz
+        return now_ns - round(max(age_s, 0.0) * 1e9)
+    except (OSError, ValueError, IndexError):
+        return now_ns
+
+
+def _exit_code(summary: Summary) -> int:
+    if summary.ended == INTERRUPTED:
+        return EXIT_INTERRUPTED
+    if summary.ended in (DISK_NEARLY_FULL, RECORDING_DELETED):
+        return EXIT_ALERT
+    if summary.link_lost or summary.ended.startswith(REFUSED):
+        return EXIT_DEVICE
+    if summary.late or summary.lost or summary.stream["lost_messages"] or summary.contradictions:
+        return EXIT_TIMING
+    return EXIT_FINE if summary.verdict == "PASS" else EXIT_ALERT
