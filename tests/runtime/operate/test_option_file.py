@@ -88,12 +88,12 @@ def test_the_command_line_overrides_the_file(tmp_path: Path) -> None:
         'bundle = "a.pans"\ndevice = "sim:ideal"\nshots = 4\nno-realtime = true\ngate-class = ["a", "b"]\nrotate-mb = 2\n'
     )
     args = parsed("--config", str(path))
-    assert (args.bundle, args.shots, args.no_realtime, args.gate_class) == (Path("a.pans"), 4, True, ["a", "b"])
+    assert (args.bundle, args.shots, args.realtime, args.gate_class) == (Path("a.pans"), 4, False, ["a", "b"])
     assert args.rotate_mb == 2
     args = parsed("c.pans", "--config", str(path), "--shots", "1", "--gate-class", "x", "--gate-class=y")
     assert (args.bundle, args.shots, args.gate_class) == (Path("c.pans"), 1, ["x", "y"])
     args = parsed(f"--config={path}", "--unset", "no-realtime", "--unset=--shots")
-    assert (args.no_realtime, args.shots) == (False, 1)
+    assert (args.realtime, args.shots) == (True, 1)
 
 
 @pytest.mark.parametrize(
