@@ -1,34 +1,35 @@
 """Maximum likelihood under the click law: the photon level, the dark rate and the non-uniformity behind counts of clicks.
 
-Owns the likelihood of known drives (lit levels of a pattern on a clear field), its maximum, and intervals where it has fallen
-by what 95 % allow; never shows a pattern (calibration_run.py) and never writes a file (calibration.py). The estimate is of
-photoelectrons per level and exposure: flux, transmission and efficiency together; clicks cannot tell them apart.
+`fit_light` takes counts at known drives (lit levels of a pattern on a clear field) and returns the maximum and its intervals,
+where the likelihood has fallen by what 95 % allow. The estimate is of photoelectrons per level and exposure: flux, transmission and
+efficiency together; clicks cannot tell them apart.
 
 Model: an exposure of drive s has mean `mu = s theta + delta`, of which dead time leaves the counted mean (dead_time.py); it stays
 silent with the click law's probability, times (1 - p_ap) after a click, times what crosstalk leaves. Afterpulsing, crosstalk,
 dead time, read noise and threshold are the profile's; they are not fitted. Intervals by profile likelihood: right to second
-order, one-sided at 0 and at saturation, where Wald's break down."""
+order, one-sided at 0 and at saturation, where Wald's break down.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pans.runtime.intervals import CHI2_95, chi2_quantile, chi2_tail
+from pans.runtime.intervals import CHI2_95, Z_95, bisect, chi2_quantile, chi2_tail
 
-from .click_law import ClickLaw, survival_coefficients
-from .dead_time import counted_mean, counted_slope, mean_of_most_clicks
+from .click_law import ClickLaw, log_no_click
+from .dead_time import mean_of_most_clicks
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 SATURATED = 60.0  # photoelectrons: from here on every exposure clicks, whatever the law
 _FLOOR = 1e-14  # photoelectrons per exposure: less is none
 _STEPS_MAX = 200
+LEVEL, DARK = 0, 1  # the two parameters
 
 
 class Counts(NamedTuple):
@@ -81,42 +82,13 @@ class CountModel:
 
     def log_miss(self, mean: F64) -> F64:
         """Log probability that `mean` photoelectrons (any shape, up to some hundreds) leave the exposure silent."""
-        counted = self._counted(mean)
-        return -counted if self._plain else np.log(_series(_survival(self.law)[0], counted)) - counted
+        return log_no_click(self.law, np.minimum(mean, mean_of_most_clicks(self.law.dead_time)))
 
     def log_miss_slope(self, mean: F64) -> F64:
-        """Its derivative."""
-        inner = np.where(mean < self._most, counted_slope(self.law.dead_time, np.minimum(mean, self._most)), 0.0)
-        if self._plain:
-            return -inner
-        counted = self._counted(mean)
-        powers, slopes = _survival(self.law)
-        return (_series(slopes, counted) / _series(powers, counted) - 1.0) * inner
-
-    def _counted(self, mean: F64) -> F64:
-        return counted_mean(self.law.dead_time, np.minimum(mean, self._most))
-
-    @property
-    def _most(self) -> float:
-        return mean_of_most_clicks(self.law.dead_time)
-
-    @property
-    def _plain(self) -> bool:
-        return self.law.read_noise_e == 0 and self.law.threshold_e <= 1
-
-
-@lru_cache(maxsize=16)
-def _survival(law: ClickLaw) -> tuple[F64, F64]:
-    """The coefficients of exp(mean) times the survival, and of the derivative of that series; all are positive."""
-    powers = survival_coefficients(law)
-    return powers, powers[1:] * np.arange(1, len(powers)) if len(powers) > 1 else np.zeros(1)
-
-
-def _series(coefficients: F64, x: F64) -> F64:
-    total = np.full(np.shape(x), coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = total * x + coefficient
-    return total
+        """Its derivative by a central difference, right to about 1e-6: steps and variances need no more."""
+        step = np.maximum(1e-5 * mean, 1e-10)
+        low = np.maximum(mean - step, 0.0)
+        return np.asarray((self.log_miss(mean + step) - self.log_miss(low)) / (mean + step - low))
 
 
 def log_likelihood(counts: Counts, model: CountModel, level: float, dark: float) -> float:
@@ -141,11 +113,11 @@ def fit_light(counts: Counts, model: CountModel) -> LightFit:
     fit = _Profile(counts, model, top)
     level, dark, best = fit.maximum()
     silent, full = not counts.clicks[lit].any(), bool((counts.clicks[lit] == counts.exposures[lit]).all())
-    low = 0.0 if silent else fit.bound(fit.over_level, level, best, upward=False)
-    high = math.inf if full else fit.bound(fit.over_level, level, best, upward=True)
-    no_dark = best - fit.over_dark(_FLOOR)[0] < 0.5 * CHI2_95
-    dark_low = 0.0 if no_dark else fit.bound(fit.over_dark, dark, best, upward=False)
-    dark_high = fit.bound(fit.over_dark, dark, best, upward=True)
+    low = 0.0 if silent else fit.bound(LEVEL, level, best, upward=False)
+    high = math.inf if full else fit.bound(LEVEL, level, best, upward=True)
+    no_dark = best - fit.height(DARK, _FLOOR) < 0.5 * CHI2_95
+    dark_low = 0.0 if no_dark else fit.bound(DARK, dark, best, upward=False)
+    dark_high = fit.bound(DARK, dark, best, upward=True)
     shown_level = 0.0 if silent else math.inf if full else level
     return LightFit(
         Interval(shown_level, low, high), Interval(0.0 if dark <= 2 * _FLOOR else dark, dark_low, dark_high), best
@@ -162,58 +134,48 @@ def _merged(counts: Counts) -> Counts:
 
 
 class _Profile:
-    """The two-parameter likelihood of one data set: its maximum, and its height along one parameter with the other at its best."""
+    """The likelihood of one data set in level and dark rate: its maximum, and its height along one with the other at its best."""
 
     def __init__(self, counts: Counts, model: CountModel, top: float) -> None:
-        self.counts, self.model, self.top = counts, model, top
-        self._lit = counts.drive > 0
-        self._warm = {True: 0.0, False: 0.0}
+        self.counts, self.model, self.tops = counts, model, (top, SATURATED)
+        self._warm: dict[int, float] = {}  # where a parameter was best last time
 
     def maximum(self) -> tuple[float, float, float]:
-        """Return level, dark and log likelihood at the maximum, by Fisher scoring in both."""
-        counts = self.counts
-        unlit = ~self._lit
-        n_dark, k_dark = int(counts.exposures[unlit].sum()), int(counts.clicks[unlit].sum())
+        """Return level, dark and log likelihood at the maximum."""
+        counts, lit = self.counts, self.counts.drive > 0
+        n_dark, k_dark = int(counts.exposures[~lit].sum()), int(counts.clicks[~lit].sum())
         dark = -math.log1p(-min(k_dark, n_dark - 0.5) / n_dark) if n_dark and k_dark else _FLOOR
-        drive = float(np.average(counts.drive[self._lit], weights=counts.exposures[self._lit]))
-        share = counts.clicks[self._lit].sum() / counts.exposures[self._lit].sum()
-        level = min(max(-math.log1p(-min(share, 1 - 1e-9)) - dark, 1e-3) / drive, self.top)
-        value = log_likelihood(counts, self.model, level, dark)
-        for _ in range(_STEPS_MAX):
-            score, information = self._scores(level, dark)
-            step = _solve(information, score, at_floor=dark <= _FLOOR and score[1] < 0)
-            moved = self._move((level, dark), step, value)
-            if moved is None or moved[2] - value < 1e-10 * (1 + 1e-3 * abs(value)):
-                level, dark, value = moved or (level, dark, value)
-                break
-            level, dark, value = moved
-        return float(level), float(dark), value
+        drive = float(np.average(counts.drive[lit], weights=counts.exposures[lit]))
+        share = counts.clicks[lit].sum() / counts.exposures[lit].sum()
+        level = min(max(-math.log1p(-min(share, 1 - 1e-9)) - dark, 1e-3) / drive, self.tops[0])
+        (level, dark), value = self._climb((level, dark), (LEVEL, DARK))
+        return level, dark, value
 
-    def over_level(self, level: float) -> tuple[float, float]:
-        """Return the height at `level` with the best dark rate, and that rate."""
-        return self._best_other(level, level_is_fixed=True)
+    def height(self, fixed: int, value: float) -> float:
+        """Return the height where LEVEL or DARK is `value` and the other one at its best."""
+        other = 1 - fixed
+        begin = min(max(self._warm.get(other, _FLOOR), _FLOOR), self.tops[other])
+        at = (value, begin) if fixed == LEVEL else (begin, value)
+        if log_likelihood(self.counts, self.model, *at) == -math.inf:
+            begin = 1e-3 * (1.0 if other == DARK else self.tops[LEVEL])
+            at = (value, begin) if fixed == LEVEL else (begin, value)
+        at, height = self._climb(at, (other,))
+        self._warm[other] = at[other]
+        return height
 
-    def over_dark(self, dark: float) -> tuple[float, float]:
-        """Return the height at `dark` with the best level, and that level."""
-        return self._best_other(dark, level_is_fixed=False)
-
-    def bound(self, height: object, best_at: float, best: float, *, upward: bool) -> float:
-        """Return where twice the fall from `best` is the 95 % quantile of chi-square(1), by bisection of the logarithm."""
-        assert callable(height)
+    def bound(self, which: int, best_at: float, best: float, *, upward: bool) -> float:
+        """Return where twice the fall from `best` is the 95 % quantile of chi-square(1), on one side of the maximum."""
 
         def fall(log_x: float) -> float:
-            return 2.0 * (best - height(math.exp(log_x))[0]) - CHI2_95
+            return 2.0 * (best - self.height(which, math.exp(log_x))) - CHI2_95
 
-        inside = math.log(max(best_at, _FLOOR))
-        reach = 0.02
-        while fall(inside + (reach if upward else -reach)) < 0:
-            inside += reach if upward else -reach
-            reach *= 2.0
+        inside, reach = math.log(max(best_at, _FLOOR)), 0.02 if upward else -0.02
+        while fall(inside + reach) < 0:
+            inside, reach = inside + reach, 2.0 * reach
             if inside > 40 or inside < math.log(_FLOOR):
                 return math.inf if upward else 0.0
-        outside = inside + (reach if upward else -reach)
-        low, high = fall(inside), fall(outside)
-        side = 0
+        outside = inside + reach
+        low, high, side = fall(inside), fall(outside), 0
         for _ in range(60):  # regula falsi with the Illinois correction
             middle = (inside * high - outside * low) / (high - low)
             value = fall(middle)
@@ -227,38 +189,42 @@ class _Profile:
                 high, side = (0.5 * high if side == -1 else high), -1
         return math.exp(0.5 * (inside + outside))
 
-    def _best_other(self, fixed: float, *, level_is_fixed: bool) -> tuple[float, float]:
-        """Fisher scoring in the free parameter, from where it was best last time."""
-        top = SATURATED if level_is_fixed else self.top
-        free = min(max(self._warm[level_is_fixed], _FLOOR), top) or _FLOOR
-        index = 1 if level_is_fixed else 0
-
-        def pair(x: float) -> tuple[float, float]:
-            return (fixed, x) if level_is_fixed else (x, fixed)
-
-        value = log_likelihood(self.counts, self.model, *pair(free))
-        if value == -math.inf:
-            free = 1e-3 if level_is_fixed else 1e-3 * self.top
-            value = log_likelihood(self.counts, self.model, *pair(free))
+    def _climb(self, at: tuple[float, float], free: tuple[int, ...]) -> tuple[tuple[float, float], float]:
+        """Go from `at` to the maximum in the `free` parameters by Fisher scoring; return where it is and its height."""
+        value = log_likelihood(self.counts, self.model, *at)
         for _ in range(_STEPS_MAX):
-            score, information = self._scores(*pair(free))
-            step = score[index] / information[index, index] if information[index, index] > 0 else 0.0
-            gained = False
-            for _ in range(40):
-                trial = min(max(free + step, 0.1 * free, _FLOOR), top)
-                found = log_likelihood(self.counts, self.model, *pair(trial))
-                if found > value:
-                    gained = True
-                    break
-                step *= 0.5
-                if abs(step) < 1e-12 * free:
-                    break
-            if not gained or found - value < 1e-10:
-                free, value = (trial, found) if gained else (free, value)
+            moved = self._higher(at, self._step(at, free), value)
+            if moved is None:
                 break
-            free, value = trial, found
-        self._warm[level_is_fixed] = free
-        return value, free
+            gain = moved[1] - value
+            at, value = moved
+            if gain < 1e-10 * (1 + 1e-3 * abs(value)):
+                break
+        return at, value
+
+    def _higher(self, at: tuple[float, float], step: F64, value: float) -> tuple[tuple[float, float], float] | None:
+        """Return the first point along `step` that is higher, or None; no parameter falls by more than nine tenths at once."""
+        for halving in range(40):
+            level, dark = (
+                min(max(x + part, 0.1 * x, _FLOOR), top) if part else x
+                for x, part, top in zip(at, (step * 0.5**halving).tolist(), self.tops)
+            )
+            found = log_likelihood(self.counts, self.model, level, dark)
+            if found > value:
+                return (level, dark), found
+        return None
+
+    def _step(self, at: tuple[float, float], free: tuple[int, ...]) -> F64:
+        """The scoring step (2,); in one parameter where the other is fixed, or where data cannot tell the two apart."""
+        score, information = self._scores(*at)
+        if len(free) == 2:
+            determinant = information[0, 0] * information[1, 1] - information[0, 1] ** 2
+            at_floor = at[DARK] <= _FLOOR and score[DARK] < 0
+            if not at_floor and determinant > 1e-14 * information[0, 0] * information[1, 1]:
+                return np.asarray(np.linalg.solve(information, score), np.float64)
+        step, one = np.zeros(2), free[0]
+        step[one] = score[one] / information[one, one] if information[one, one] > 0 else 0.0
+        return step
 
     def _scores(self, level: float, dark: float) -> tuple[F64, F64]:
         """Score (2,) and expected information (2, 2) in level and dark."""
@@ -273,26 +239,6 @@ class _Profile:
         score = np.array([residual @ counts.drive, residual.sum()])
         cross = load @ counts.drive
         return score, np.array([[load @ counts.drive**2, cross], [cross, load.sum()]])
-
-    def _move(self, at: tuple[float, float], step: F64, value: float) -> tuple[float, float, float] | None:
-        """Return the first point along `step` that is higher, or None; no parameter falls by more than nine tenths at once."""
-        for halving in range(40):
-            part = step * 0.5**halving
-            level = min(max(at[0] + part[0], 0.1 * at[0], _FLOOR), self.top)
-            dark = min(max(at[1] + part[1], 0.1 * at[1], _FLOOR), SATURATED)
-            found = log_likelihood(self.counts, self.model, level, dark)
-            if found > value:
-                return level, dark, found
-        return None
-
-
-def _solve(information: F64, score: F64, *, at_floor: bool) -> F64:
-    """The scoring step; only in the level where the dark rate is at its floor, or where the two cannot be told apart."""
-    determinant = information[0, 0] * information[1, 1] - information[0, 1] ** 2
-    alone = np.array([score[0] / information[0, 0] if information[0, 0] > 0 else 0.0, 0.0])
-    if at_floor or not determinant > 1e-14 * information[0, 0] * information[1, 1]:
-        return alone
-    return np.asarray(np.linalg.solve(information, score), np.float64)
 
 
 def fit_spread(counts: Counts, model: CountModel, level: float, dark: float) -> Spread:
@@ -315,18 +261,15 @@ def fit_spread(counts: Counts, model: CountModel, level: float, dark: float) -> 
         """The tau at which the heterogeneity is q; it falls with tau."""
         if heterogeneity(0.0) <= q:
             return 0.0
-        low, high = 0.0, 1.0
+        high = 1.0
         while heterogeneity(high) > q:
             high *= 4.0
-        for _ in range(100):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if heterogeneity(middle) > q else (low, middle)
-        return math.sqrt(high)
+        return math.sqrt(bisect(lambda tau2: q - heterogeneity(tau2), 0.0, high))
 
     tau = spread_at(n - 1.0)
     ends = spread_at(chi2_quantile(0.975, n - 1)), spread_at(chi2_quantile(0.025, n - 1))
     weights = 1.0 / (variances + tau * tau)
-    centre, half = float(weights @ log_levels / weights.sum()), 1.959963984540054 / math.sqrt(weights.sum())
+    centre, half = float(weights @ log_levels / weights.sum()), Z_95 / math.sqrt(weights.sum())
     mean = Interval(math.exp(centre), math.exp(centre - half), math.exp(centre + half))
     return Spread(Interval(tau, *ends), chi2_tail(heterogeneity(0.0), n - 1), n, mean)
 
