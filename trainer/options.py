@@ -11,7 +11,7 @@ from typing import Any
 
 from pans.runtime.errors import PlanError, UsageError, as_usage_error
 from pans.runtime.imaging import bleaching_of, tolerance_of
-from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count
+from pans.runtime.instrument.click_law import OUTCOMES_MAX, cannot_count
 from pans.runtime.instrument.profile import Profile
 
 EXACT_FEATURES_MAX = 12  # 4096 click words per object

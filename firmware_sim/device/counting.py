@@ -3,7 +3,7 @@
 Also the clicks of several detectors that are read at once as a number: bit k is that of detector k, which sees pattern k of a state.
 
 Owns the way from light to a number: Poisson photoelectrons by inversion, Gaussian read noise, edges. It draws what happens and never asks
-the host's law of counts (runtime/instrument/count_law.py) for a probability, so that each is a test of the other; that law is used for what
+the host's law of counts (runtime/instrument/click_law.py) for a probability, so that each is a test of the other; that law is used for what
 MARK expects alone. The number drawn depends on seed and exposure only: both ways of driving give the same numbers for the same patterns.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pans.firmware_sim.program import Program, States
 from pans.firmware_sim.scene.detector_kernels import GOLDEN_WORD, SHIFT_11, STEP_WORD, click_thresholds, mix
 from pans.firmware_sim.scene.detector_model import CLICK_STREAM, DetectorModel, first_click_probability, stream_key
-from pans.runtime.instrument.count_law import count_chances, counting
+from pans.runtime.instrument.click_law import count_chances, counting
 from pans.runtime.wire.inner import inner
 from pans.runtime.wire.messages import DARK_PATTERN
 

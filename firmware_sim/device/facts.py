@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from pans.firmware_sim.scene.moving import SceneFile, Tape
 from pans.firmware_sim.scene.still import Scene
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING
-from pans.runtime.instrument.count_law import cannot_count
+from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.link.scene_fit import scene_facts
 from pans.runtime.wire.automata import Extension, announcement

@@ -24,8 +24,7 @@ from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.detector.crosstalk import crosstalk_of, spared_by_neighbours, without_crosstalk
 from pans.runtime.errors import PlanError, UsageError
 from pans.runtime.instrument.calibration import now_utc
-from pans.runtime.instrument.click_law import click_law
-from pans.runtime.instrument.count_law import cannot_read_at_once
+from pans.runtime.instrument.click_law import cannot_read_at_once, click_law
 from pans.runtime.instrument.estimate import CountModel, Counts, fit_light, fit_spread
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.intervals import jeffreys_interval

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.detector.limits import BRIGHT, law_warnings
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.count_law import cannot_count
+from pans.runtime.instrument.click_law import cannot_count
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.wire.fields import U32_MAX
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from pans.runtime.bundle.automaton import Automaton
 from pans.runtime.detector import Afterpulses
-from pans.runtime.instrument.click_law import ClickLaw, both_chances, log_no_click
-from pans.runtime.instrument.count_law import CountLaw, count_chances, outcomes_of
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, both_chances, count_chances, log_no_click, outcomes_of
 
 from .remembering import Remembered
 

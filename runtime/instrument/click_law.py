@@ -1,12 +1,17 @@
-"""The click law: the probability that one exposure clicks, given the photoelectrons that reach the detector.
+"""The laws of one exposure: the probabilities of its outcomes, given the photoelectrons that reach the detector.
 
-Owns the formulas and their stable forms; never samples clicks (the simulator does) and never models what links exposures
-(afterpulsing; dead time counts by its mean effect, dead_time.py). All calls return float64 arrays of the shape of their input.
+`ClickLaw` is of a detector that clicks or not, `CountLaw` of one that resolves photon numbers. What links exposures is elsewhere:
+afterpulses in pans.runtime.detector, dead time by its mean effect in dead_time.py. Functions return float64 arrays of the shape of their
+input, those of a count law (outcomes, *shape).
 
 With mu = photoelectrons + dark_per_exposure (of which dead time leaves the counted mean), Poisson counts k are read with Gaussian
 noise sigma against a threshold theta:
 `1 - p = exp(-mu) * sum_k c_k mu^k`, `c_k = Phi((theta - k)/sigma)/k!`. Without read noise and with theta in (0, 1] this is
 the thresholded Poisson law of the paper, `p = 1 - exp(-mu)`.
+
+A count law puts readings into bins between `edges` e_1 < ... < e_n: outcome j is a reading in [e_j, e_j+1), with e_0 = -inf and
+e_n+1 = inf, `P(j) = exp(-mu) * sum_k w_j(k) mu^k / k!`, `w_j(k) = Phi((e_j+1 - k)/sigma) - Phi((e_j - k)/sigma)`. With one edge it is the
+click law. It knows no dead time: a detector that blinds itself counts no photons.
 """
 
 from __future__ import annotations
@@ -23,7 +28,9 @@ from .profile_schema import FREE_RUNNING, PARALYSABLE
 
 F64 = NDArray[np.float64]
 DEAD_TIME_MATTERS = 1e-3  # of the exposure: below it, no probability changes by more than 3e-7
+OUTCOMES_MAX = 16  # a reading is at most 15: beyond it the bins of a real detector overlap
 _TINY = 1e-300  # Phi below this is negligible at any mean that a float can hold, and would soon be subnormal
+_ENOUGH = 1e-18  # of a sum: what all further terms may add
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +43,7 @@ class ClickLaw:
     dead_time: DeadTime = NO_DEAD_TIME
 
     def __post_init__(self) -> None:
-        if not 0 <= self.dark_per_exposure < math.inf:
-            raise ValueError(f"dark_per_exposure must be finite and at least 0, found {self.dark_per_exposure}")
-        if not 0 <= self.read_noise_e <= 3:
-            raise ValueError(f"read_noise_e must be from 0 to 3, found {self.read_noise_e}")
+        _check_noise(self.dark_per_exposure, self.read_noise_e)
         if not 0 < self.threshold_e <= 10:
             raise ValueError(f"threshold_e must be above 0 and at most 10, found {self.threshold_e}")
 
@@ -75,11 +79,7 @@ def survival_coefficients(law: ClickLaw) -> F64:
 
 def click_probability(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
     """p for `photoelectrons` (any shape, per exposure, at least 0); accurate to a few ulp also where p is tiny."""
-    mu = _mean(law, photoelectrons)
-    if _is_plain(law):
-        return np.asarray(-np.expm1(-mu))
-    log_miss = _log_survival(law, mu)
-    return np.where(log_miss < -math.log(2), -np.expm1(log_miss), _small_p(law, mu, log_miss))
+    return both_chances(law, photoelectrons)[0]
 
 
 def both_chances(law: ClickLaw, photoelectrons: ArrayLike) -> tuple[F64, F64]:
@@ -99,15 +99,6 @@ def log_no_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
         return np.asarray(-mu)
     log_miss = _log_survival(law, mu)
     return np.where(log_miss < -math.log(2), log_miss, np.log1p(-_small_p(law, mu, log_miss)))
-
-
-def log_click(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
-    """log p for `photoelectrons` (any shape); -inf where no click can happen (no light, dark counts or read noise)."""
-    mu = _mean(law, photoelectrons)
-    log_miss = -mu if _is_plain(law) else _log_survival(law, mu)
-    small = -np.expm1(-mu) if _is_plain(law) else _small_p(law, mu, log_miss)
-    with np.errstate(divide="ignore"):
-        return np.where(log_miss < -math.log(2), np.log1p(-np.exp(log_miss)), np.log(small))
 
 
 def object_transmission(
@@ -131,35 +122,165 @@ def object_transmission(
     return np.asarray(table[images])
 
 
+@dataclass(frozen=True, slots=True)
+class CountLaw:
+    """Dark photoelectrons per exposure, read noise and the edges between the outcomes, in photoelectrons."""
+
+    dark_per_exposure: float
+    read_noise_e: float
+    edges: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        _check_noise(self.dark_per_exposure, self.read_noise_e)
+        rising = all(low < high for low, high in zip(self.edges, self.edges[1:]))
+        if not (1 <= len(self.edges) < OUTCOMES_MAX and rising and self.edges[0] > 0 and self.edges[-1] <= 20):
+            raise ValueError(
+                f"edges must be 1 to {OUTCOMES_MAX - 1}, rising, above 0 and at most 20, found {self.edges}"
+            )
+
+    @property
+    def outcomes(self) -> int:
+        """Number of outcomes: readings 0, 1, ... and "this many or more"."""
+        return len(self.edges) + 1
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether outcome j is exactly j photoelectrons, and the last one that many or more."""
+        return self.read_noise_e == 0 and all(j < edge <= j + 1 for j, edge in enumerate(self.edges))
+
+
+def count_law(profile: Profile, exposure_us: float, outcomes: int) -> CountLaw | ClickLaw:
+    """The law of one exposure of `exposure_us` microseconds whose reading is one of `outcomes`; of two the click law.
+
+    The first edge is the profile's threshold, the others lie halfway between whole numbers. ValueError for what the profile's detector
+    cannot tell apart, and for dead time and afterpulses.
+    """
+    clicks = click_law(profile, exposure_us)
+    if outcomes == 2:
+        return clicks
+    why = cannot_count(profile, outcomes)
+    if why:
+        raise ValueError(why)
+    return counting(clicks, outcomes)
+
+
+def counting(law: ClickLaw, outcomes: int) -> CountLaw:
+    """The law of `outcomes` readings on a detector whose clicks follow `law`; ValueError where its threshold is 1.5 or more."""
+    return CountLaw(
+        law.dark_per_exposure, law.read_noise_e, (law.threshold_e, *(j + 0.5 for j in range(1, outcomes - 1)))
+    )
+
+
+def outcomes_of(law: ClickLaw | CountLaw) -> int:
+    """Return how many outcomes an exposure has under `law`; two are no click and a click."""
+    return law.outcomes if isinstance(law, CountLaw) else 2
+
+
+def cannot_count(profile: Profile, outcomes: int) -> str:
+    """Return why `profile` cannot tell `outcomes` readings of an exposure apart, or "" if it can."""
+    detector = profile.detector
+    most = detector.photon_number_max + 1
+    if not 2 <= outcomes <= OUTCOMES_MAX:
+        return f"{outcomes} outcomes per exposure, allowed: 2 to {OUTCOMES_MAX}"
+    if outcomes == 2:
+        return ""
+    if outcomes > most:
+        return f"{outcomes} outcomes per exposure, {profile.name} tells {most} apart (detector.photon_number_max)"
+    for key in ("dead_time_ns", "afterpulse_probability"):
+        if getattr(detector, key) > 0:
+            return (
+                f"{outcomes} outcomes per exposure, but {profile.name} has detector.{key}: it clicks, it does not count"
+            )
+    if detector.threshold_e >= 1.5:
+        found = f"detector.threshold_e of {profile.name} is {detector.threshold_e:g}"
+        return f"{outcomes} outcomes per exposure, but {found}, allowed: below 1.5"
+    return ""
+
+
+def cannot_read_at_once(profile: Profile, channels: int) -> str:
+    """Return why no exact law tells what `channels` detectors of `profile` read in one exposure, pattern after pattern, or "" if one does.
+
+    Each clicks by the click law, and given the light they are independent.
+    """
+    detector = profile.detector
+    if profile.mode != "sequential":
+        return f"{channels} channels per exposure of a walk, {profile.name} measures in {profile.mode} mode"
+    if channels > detector.channels:
+        return f"{channels} channels per exposure, {profile.name} has {detector.channels} (detector.channels)"
+    for key in ("crosstalk_probability", "afterpulse_probability"):
+        if getattr(detector, key) > 0:
+            return f"{channels} channels per exposure, but {profile.name} has detector.{key}: their clicks are not independent"
+    return ""
+
+
+def outcome_weights(law: CountLaw) -> F64:
+    """The w_j(k), float64 (outcomes, n): P(outcome j | k photoelectrons), up to the last k at which any but the last outcome counts."""
+    columns: list[list[float]] = []
+    while not columns or max(columns[-1][:-1]) > _TINY:
+        columns.append(_weights(law, len(columns)))
+    return np.array(columns).T
+
+
+def count_chances(law: CountLaw, photoelectrons: ArrayLike) -> F64:
+    """P(outcome) for `photoelectrons` (any shape, per exposure, at least 0), (outcomes, *shape); accurate however small."""
+    mu = _light(photoelectrons) + law.dark_per_exposure
+    weights = outcome_weights(law)
+    found = np.zeros((law.outcomes, *mu.shape))
+    for k in range(weights.shape[1]):
+        found[:-1] += _each(weights[:-1, k], mu) * _poisson(mu, k)
+    rest = 1.0 - found[:-1].sum(axis=0)
+    found[-1] = np.where(rest > 0.5, rest, _tail(law.read_noise_e, law.edges[-1], np.where(rest > 0.5, 0.0, mu)))
+    return found
+
+
+def count_slopes(law: CountLaw, photoelectrons: ArrayLike) -> F64:
+    """d P(outcome) / d photoelectrons, (outcomes, *shape): sum_k (w_j(k + 1) - w_j(k)) exp(-mu) mu^k / k!, a finite sum."""
+    mu = _light(photoelectrons) + law.dark_per_exposure
+    weights = outcome_weights(law)
+    last = np.zeros(law.outcomes)
+    last[-1] = 1.0
+    rise = np.diff(np.column_stack([weights, last]), axis=1)
+    found = np.zeros((law.outcomes, *mu.shape))
+    for k in range(weights.shape[1]):
+        found += _each(rise[:, k], mu) * _poisson(mu, k)
+    return found
+
+
 def _is_plain(law: ClickLaw) -> bool:
     return law.read_noise_e == 0 and law.threshold_e <= 1
 
 
+def _check_noise(dark_per_exposure: float, read_noise_e: float) -> None:
+    if not 0 <= dark_per_exposure < math.inf:
+        raise ValueError(f"dark_per_exposure must be finite and at least 0, found {dark_per_exposure}")
+    if not 0 <= read_noise_e <= 3:
+        raise ValueError(f"read_noise_e must be from 0 to 3, found {read_noise_e}")
+
+
+def _light(photoelectrons: ArrayLike) -> F64:
+    light = np.asarray(photoelectrons, dtype=np.float64)
+    if light.size and not (light.min() >= 0 and light.max() < math.inf):  # also false for nan
+        raise ValueError(f"photoelectrons must be finite and at least 0, found {light.min():g} to {light.max():g}")
+    return light
+
+
 def _mean(law: ClickLaw, photoelectrons: ArrayLike) -> F64:
-    mu = np.asarray(photoelectrons, dtype=np.float64) + law.dark_per_exposure
-    if mu.size and not (mu.min() >= law.dark_per_exposure and mu.max() < math.inf):  # also false for nan
-        low, high = mu.min() - law.dark_per_exposure, mu.max() - law.dark_per_exposure
-        raise ValueError(f"photoelectrons must be finite and at least 0, found {low:g} to {high:g}")
-    return counted_mean(law.dead_time, mu)
+    return counted_mean(law.dead_time, _light(photoelectrons) + law.dark_per_exposure)
 
 
-def _above(law: ClickLaw, k: int) -> float:
-    """P(reading >= threshold | k photoelectrons)."""
-    if law.read_noise_e == 0:
-        return float(k >= law.threshold_e)
-    return 0.5 * math.erfc((law.threshold_e - k) / (law.read_noise_e * math.sqrt(2)))
+def _above(noise_e: float, edge: float, k: int) -> float:
+    """P(reading >= edge | k photoelectrons)."""
+    return float(k >= edge) if noise_e == 0 else 0.5 * math.erfc((edge - k) / (noise_e * math.sqrt(2)))
 
 
-def _below(law: ClickLaw, k: int) -> float:
-    if law.read_noise_e == 0:
-        return float(k < law.threshold_e)
-    return 0.5 * math.erfc((k - law.threshold_e) / (law.read_noise_e * math.sqrt(2)))
+def _below(noise_e: float, edge: float, k: int) -> float:
+    return float(k < edge) if noise_e == 0 else 0.5 * math.erfc((k - edge) / (noise_e * math.sqrt(2)))
 
 
 def _log_coefficients(law: ClickLaw) -> F64:
     """log c_k: the last ones matter at large means, though c_k itself is no float any more."""
     logs: list[float] = []
-    while (below := _below(law, len(logs))) > _TINY:
+    while (below := _below(law.read_noise_e, law.threshold_e, len(logs))) > _TINY:
         logs.append(math.log(below) - math.lgamma(len(logs) + 1))
     return np.array(logs)
 
@@ -176,13 +297,43 @@ def _log_survival(law: ClickLaw, mu: F64) -> F64:
 
 
 def _small_p(law: ClickLaw, mu: F64, log_miss: F64) -> F64:
-    """p = exp(-mu) sum_k Q((theta - k)/sigma) mu^k/k!, right where it is below 1/2: all terms are positive, nothing cancels."""
-    mu = np.where(log_miss < -math.log(2), 0.0, mu)
+    return _tail(law.read_noise_e, law.threshold_e, np.where(log_miss < -math.log(2), 0.0, mu))
+
+
+def _tail(noise_e: float, edge: float, mu: F64) -> F64:
+    """P(reading >= edge), right where it is below 1/2: all terms are positive, nothing cancels."""
     term = np.exp(-mu)
-    total = _above(law, 0) * term
+    total = _above(noise_e, edge, 0) * term
     k = 0
-    while k < law.threshold_e or np.any(term > 1e-18 * total):
+    while k < edge or np.any(term > _ENOUGH * total):
         k += 1
         term = term * (mu / k)
-        total = total + _above(law, k) * term
+        total = total + _above(noise_e, edge, k) * term
     return np.asarray(total)
+
+
+def _each(values: F64, mu: F64) -> F64:
+    return values.reshape((-1,) + (1,) * mu.ndim)
+
+
+def _poisson(mu: F64, k: int) -> F64:
+    """exp(-mu) mu^k / k!, in log space: mu^k overflows and exp(-mu) underflows where their product is an ordinary number."""
+    if k == 0:
+        return np.asarray(np.exp(-mu))
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.exp(k * np.log(mu) - mu - math.lgamma(k + 1)))
+
+
+def _weights(law: CountLaw, k: int) -> list[float]:
+    """P(outcome | k photoelectrons) of every outcome, each from the tails that are small there, so that none cancels."""
+    below = [_below(law.read_noise_e, edge, k) for edge in law.edges]
+    above = [_above(law.read_noise_e, edge, k) for edge in law.edges]
+    between = []
+    for low, high in zip(range(len(below)), range(1, len(below))):
+        if law.edges[low] > k:
+            between.append(above[low] - above[high])
+        elif law.edges[high] < k:
+            between.append(below[high] - below[low])
+        else:
+            between.append(1.0 - below[low] - above[high])
+    return [below[0], *between, above[-1]]

@@ -25,7 +25,7 @@ MAX_LEASE_MS = 3_600_000
 U16_MAX, U32_MAX = (1 << 16) - 1, (1 << 32) - 1
 MAX_STATES = 0xFFFD  # of an automaton: the two numbers above mean "chosen by the clicks" and "dark"
 MAX_LEAVES = 1 << 20
-MAX_PHOTON_NUMBER = 15  # of one reading: beyond it the bins of a real detector overlap (instrument/count_law.py)
+MAX_PHOTON_NUMBER = 15  # of one reading: beyond it the bins of a real detector overlap (instrument/click_law.py)
 MAX_CHANNELS_AT_ONCE = 4  # their clicks are a number of COUNTS, up to 15
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pans.runtime.bundle.automaton import CHANNELS_MAX, SLOTS_MAX, STATES_MAX
 from pans.runtime.bundle.model import Bundle
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.count_law import OUTCOMES_MAX, cannot_count, cannot_read_at_once
+from pans.runtime.instrument.click_law import OUTCOMES_MAX, cannot_count, cannot_read_at_once
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.options import check_optics
 from pans.trainer.tasks.registry import Task

@@ -1,7 +1,7 @@
 """What one exposure can tell, with the light that reaches the detectors as argument: clicks of one or of several, or a number of photons.
 
 Owns the probability of every outcome and its slope, as fast as training needs it; the laws themselves are those of `runtime.instrument`
-(click_law.py, count_law.py). Tensors in, tensors out, of any one shape; float32 in training, float64 where figures are compared. The last
+(click_law.py). Tensors in, tensors out, of any one shape; float32 in training, float64 where figures are compared. The last
 outcome is what remains: its probability is 1 less the others', its slope minus theirs.
 
 Of c channels that are read at once a state has c rows of light, one after the other, and 2**c outcomes: bit k is the click of channel k.
@@ -16,8 +16,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
-from pans.runtime.instrument.count_law import CountLaw, count_law, outcome_weights, outcomes_of
+from pans.runtime.instrument.click_law import (
+    ClickLaw,
+    CountLaw,
+    count_law,
+    outcome_weights,
+    outcomes_of,
+    survival_coefficients,
+)
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.detection import counted_mean
 

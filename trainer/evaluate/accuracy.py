@@ -23,8 +23,17 @@ from pans.runtime.detector.crosstalk import Kernel, crosstalk_of, fired, seen_fr
 from pans.runtime.errors import as_usage_error
 from pans.runtime.image_quality import likeness
 from pans.runtime.imaging import IDENTITY, NO_BLEACHING, Bleaching, Imaging, bleached, met
-from pans.runtime.instrument.click_law import ClickLaw, click_law, click_probability, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, cannot_count, cannot_read_at_once, count_chances, counting
+from pans.runtime.instrument.click_law import (
+    ClickLaw,
+    CountLaw,
+    cannot_count,
+    cannot_read_at_once,
+    click_law,
+    click_probability,
+    count_chances,
+    counting,
+    object_transmission,
+)
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.model.exposure import exposure_us_of
 

@@ -25,8 +25,14 @@ from pans.runtime.decide.expectation import ExpectedWalk, expected_walk, pattern
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.imaging import Bleaching, Imaging, mean_left, met
-from pans.runtime.instrument.click_law import ClickLaw, click_probability, log_no_click, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, count_chances
+from pans.runtime.instrument.click_law import (
+    ClickLaw,
+    CountLaw,
+    click_probability,
+    count_chances,
+    log_no_click,
+    object_transmission,
+)
 from pans.runtime.instrument.profile import Profile
 
 from .accuracy import AS_IT_IS, ByClass, Conditions, among_classes, demand_sequence, exposure_of, outcome_law_of

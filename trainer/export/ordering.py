@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from pans.runtime.bundle.layers import Int8Head, Layer, read_layers
 from pans.runtime.bundle.model import BackEnd, Bundle, Shown, make_bundle
 from pans.runtime.imaging import NO_BLEACHING, Bleaching, mean_left, met
-from pans.runtime.instrument.click_law import click_probability, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, count_chances
+from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import Profile
 from pans.runtime.refit.onnx_chain import chain_onnx
 from pans.trainer.evaluate.accuracy import demand_sequence, outcome_law_of

@@ -27,8 +27,7 @@ from torch.nn.functional import pad
 
 from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.detector.afterpulses import SMALL_RATIO
-from pans.runtime.instrument.click_law import ClickLaw, survival_coefficients
-from pans.runtime.instrument.count_law import CountLaw
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, survival_coefficients
 from pans.runtime.instrument.dead_time import INTERVALS, STEP, DeadTime, counted_table
 from pans.runtime.instrument.profile import Profile
 

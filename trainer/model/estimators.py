@@ -34,7 +34,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pans.runtime.instrument.count_law import CountLaw, outcome_weights
+from pans.runtime.instrument.click_law import CountLaw, outcome_weights
 
 from .detection import Law, click_probability, click_words, sample_clicks, word_probabilities
 from .ssim import ssim
@@ -312,7 +312,7 @@ def readings_of(outcomes: int) -> Readings:
 def outcome_chances(mu: Tensor, law: CountLaw) -> Tensor:
     """Return P(outcome), (*shape of mu, outcomes), for `mu` photoelectrons, dark ones included, float64 and at most 100.
 
-    The same as `pans.runtime.instrument.count_law.count_chances`: exp(-mu) times a polynomial for every outcome but the last.
+    The same as `pans.runtime.instrument.click_law.count_chances`: exp(-mu) times a polynomial for every outcome but the last.
     """
     weights = outcome_weights(law)[:-1]
     factorials = np.array([math.factorial(k) for k in range(weights.shape[1])], np.float64)

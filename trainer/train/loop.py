@@ -31,8 +31,7 @@ from pans.runtime.bundle.quantise import QuantisedPatterns, quantise_patterns
 from pans.runtime.detector import Afterpulses
 from pans.runtime.detector.crosstalk import crosstalk_of
 from pans.runtime.errors import as_usage_error
-from pans.runtime.instrument.click_law import click_law
-from pans.runtime.instrument.count_law import CountLaw, counting
+from pans.runtime.instrument.click_law import CountLaw, click_law, counting
 from pans.runtime.instrument.profile import Profile
 from pans.trainer.device import new_generator
 from pans.trainer.model.detection import Law, trained_through, with_crosstalk, with_mean_memory

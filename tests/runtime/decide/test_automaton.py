@@ -19,8 +19,7 @@ from pans.runtime.decide.expectation import expected_walk
 from pans.runtime.decide.verdict import NO_LABEL
 from pans.runtime.detector import Afterpulses
 from pans.runtime.errors import DamagedFileError, UsageError
-from pans.runtime.instrument.click_law import ClickLaw, click_probability
-from pans.runtime.instrument.count_law import CountLaw
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability
 
 AUTOMATA = [early_leaf(), diamond(), random_automaton(1, slots=9), random_automaton(2, slots=5, channels=2)]
 

@@ -12,8 +12,7 @@ from pans.runtime.detector import Afterpulses, afterpulses_of
 from pans.runtime.detector.afterpulses import HOLDS_TO
 from pans.runtime.detector.crosstalk import fired, seen_from_own, with_crosstalk, without_crosstalk
 from pans.runtime.detector.limits import BRIGHT, STATED, law_warnings
-from pans.runtime.instrument.click_law import ClickLaw, click_probability
-from pans.runtime.instrument.count_law import CountLaw, count_chances
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, click_probability, count_chances
 from pans.runtime.instrument.dead_time import NO_DEAD_TIME, DeadTime, counted_mean, unequal_error
 from pans.runtime.instrument.profile import Profile, load_profile
 

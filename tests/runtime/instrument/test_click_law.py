@@ -15,7 +15,6 @@ from pans.runtime.instrument.click_law import (
     both_chances,
     click_law,
     click_probability,
-    log_click,
     log_no_click,
     object_transmission,
     survival_coefficients,
@@ -64,13 +63,6 @@ def relative_error(found: float, truth: mpmath.mpf) -> float:
 
 
 @pytest.mark.parametrize("law", LAWS, ids=str)
-def test_probability_agrees_with_mpmath(law):
-    for mean, found in zip(MEANS, click_probability(law, MEANS), strict=True):
-        truth, _ = exact(law, mean)
-        assert relative_error(found, truth) < RELATIVE, mean
-
-
-@pytest.mark.parametrize("law", LAWS, ids=str)
 def test_log_no_click_agrees_with_mpmath(law):
     for mean, found in zip(MEANS, log_no_click(law, MEANS), strict=True):
         assert math.isfinite(found)
@@ -85,20 +77,6 @@ def test_both_chances_agree_with_mpmath(law):
         truth, missed = exact(law, mean)
         assert relative_error(click, truth) < RELATIVE, mean
         assert relative_error(miss, missed) < RELATIVE or (missed < mpmath.mpf("1e-300") and miss < 1e-300), mean
-
-
-@pytest.mark.parametrize("law", LAWS, ids=str)
-def test_log_click_agrees_with_mpmath(law):
-    for mean, found in zip(MEANS, log_click(law, MEANS), strict=True):
-        truth, miss = exact(law, mean)
-        if truth == 0:
-            assert found == -math.inf
-        elif miss < mpmath.mpf("1e-300"):
-            assert -1e-290 < found <= 0
-        else:
-            # log p near p = 1 is -(1 - p), whose relative error is the absolute one of a logarithm near -50
-            log_p = mpmath.log1p(-miss) if miss < 0.5 else mpmath.log(truth)
-            assert relative_error(found, log_p) < 1e-12, mean
 
 
 def test_survival_coefficients_are_the_definition():
@@ -158,16 +136,13 @@ def test_probability_is_a_probability_and_grows_with_light(law, one, other):
 
 
 @given(any_law, any_mean)
-def test_the_three_forms_agree(law, mean):
-    p = float(click_probability(law, mean))
-    assert p == pytest.approx(-math.expm1(log_no_click(law, mean)), rel=1e-9)
-    if p > 1e-300:
-        assert math.log(p) == pytest.approx(float(log_click(law, mean)), rel=1e-9, abs=1e-15)
+def test_both_forms_agree(law, mean):
+    assert float(click_probability(law, mean)) == pytest.approx(-math.expm1(log_no_click(law, mean)), rel=1e-9)
 
 
 def test_shapes_are_kept():
     for law in (ClickLaw(), ClickLaw(0.0, 0.3, 0.5)):
-        for call in (click_probability, log_no_click, log_click):
+        for call in (click_probability, log_no_click):
             assert call(law, 0.5).shape == ()
             assert call(law, np.zeros((2, 0, 3))).shape == (2, 0, 3)
             assert call(law, np.full((4, 5), 0.5, np.float32)).dtype == np.float64

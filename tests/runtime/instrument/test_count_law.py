@@ -8,9 +8,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from pans.runtime.instrument.click_law import ClickLaw, both_chances
-from pans.runtime.instrument.count_law import (
+from pans.runtime.instrument.click_law import (
+    ClickLaw,
     CountLaw,
+    both_chances,
     cannot_count,
     count_chances,
     count_law,

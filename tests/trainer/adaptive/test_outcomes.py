@@ -14,8 +14,7 @@ from trainings import bars_task, random_machine
 from pans.runtime.bundle.model import load_bundle
 from pans.runtime.core.plan import build_plan
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.count_law import CountLaw, count_chances, count_slopes
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw, count_chances, count_slopes
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth

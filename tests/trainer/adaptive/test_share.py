@@ -9,8 +9,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from trainings import bars_task, random_machine
 
-from pans.runtime.instrument.click_law import ClickLaw
-from pans.runtime.instrument.count_law import CountLaw
+from pans.runtime.instrument.click_law import ClickLaw, CountLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.adaptive import sweeps as module
 from pans.trainer.adaptive.grow import GrowOptions, Growth

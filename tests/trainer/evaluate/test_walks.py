@@ -17,8 +17,7 @@ from commands import json_of
 from pans.runtime.bundle import Automaton, Bundle, with_expected, write_bundle
 from pans.runtime.cli import main
 from pans.runtime.decide import make_decider
-from pans.runtime.instrument.click_law import click_probability, object_transmission
-from pans.runtime.instrument.count_law import CountLaw, count_chances
+from pans.runtime.instrument.click_law import CountLaw, click_probability, count_chances, object_transmission
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate import Conditions, evaluate
 from pans.trainer.evaluate.accuracy import law_of

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the train extra")
 pytest.importorskip("onnx", reason="needs the train extra")
 
 from pans.runtime.bundle.model import load_bundle
-from pans.runtime.instrument.count_law import CountLaw
+from pans.runtime.instrument.click_law import CountLaw
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.evaluate.accuracy import evaluate_exactly, light_of
 from pans.trainer.export.writer import export_trained

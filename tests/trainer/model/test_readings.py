@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the train extra")
 
 from pans.runtime.errors import PlanError, UsageError
-from pans.runtime.instrument.count_law import CountLaw, count_chances
+from pans.runtime.instrument.click_law import CountLaw, count_chances
 from pans.runtime.instrument.profile import load_profile
 from pans.trainer.model.estimators import Numbers, cross_entropy, readings_of
 from pans.trainer.model.heads import MlpHead
